@@ -1,0 +1,26 @@
+# make demo   generates a scene, judges it and explores it; the results are in out/demo
+# make test   every check: lint, format, types, tests
+# Both make their own environment in .venv first.
+
+PYTHON ?= python3
+PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
+
+.PHONY: demo test
+
+demo: .venv/installed
+	.venv/bin/drake-clutter demo --seed 0 --out out/demo
+
+test: .venv/installed
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+	.venv/bin/pytest
+
+.venv/locked: requirements.lock
+	$(PYTHON) -m venv --clear .venv
+	$(PIP) install -r requirements.lock
+	touch $@
+
+.venv/installed: .venv/locked pyproject.toml
+	$(PIP) install --no-deps --no-build-isolation --editable .
+	touch $@

@@ -1,0 +1,242 @@
+"""The SDF model of an object class: exact inertia, hydroelastic collision geometry, textured visual."""
+
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import coacd
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from drake_clutter.assets.gltf import box_surface, cylinder_surface, embedded_gltf, mesh_surface
+from drake_clutter.assets.textures import draw_texture, png_bytes
+from drake_clutter.catalogue import CATALOGUE_FILE, ObjectClass, Shape, load_catalogue
+from drake_clutter.config import SettleConfig
+from drake_clutter.files import InputError, write_text
+from drake_clutter.resources import shipped_path
+
+_SHIPPED_PACKAGE = "drake_clutter_objects"
+_BUILT = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
+_DISSIPATION = 10.0  # s/m, Hunt-Crossley: objects settle without bouncing
+# A rim of this many edges per radius gives a 32-sided prism at any size, the one the catalogue's corners describe.
+_HINTS_PER_RADIUS = 5
+# Few pieces rather than close ones, since every piece costs simulation time: CoACD's own defaults give the example's mug 48.
+_COACD = {"threshold": 0.06, "mcts_iterations": 20, "mcts_nodes": 10, "mcts_max_depth": 2, "resolution": 1000, "seed": 1}
+_CONVEX_VOLUME_RATIO = 0.999
+
+_PACKAGE = """<?xml version="1.0"?>
+<package format="2">
+  <name>{name}</name>
+  <version>0.0.0</version>
+  <description>{description}</description>
+  <maintainer email="nobody@example.com">drake_clutter authors</maintainer>
+  <license>BSD-3-Clause</license>
+</package>
+"""
+
+_MODEL = """<?xml version="1.0"?>
+<!-- Built by drake_clutter.assets from {catalogue}; size and mass: {source}. -->
+<sdf version="1.10" xmlns:drake="drake.mit.edu">
+  <model name="{name}">
+    <link name="body">
+      <inertial>
+        <pose>{com} 0 0 0</pose>
+        <mass>{mass!r}</mass>
+        <inertia>
+          <ixx>{ixx!r}</ixx>
+          <iyy>{iyy!r}</iyy>
+          <izz>{izz!r}</izz>
+          <ixy>{ixy!r}</ixy>
+          <ixz>{ixz!r}</ixz>
+          <iyz>{iyz!r}</iyz>
+        </inertia>
+      </inertial>
+      <visual name="visual">
+        <geometry>
+          <mesh>
+            <uri>visual.gltf</uri>
+          </mesh>
+        </geometry>
+      </visual>
+{collisions}    </link>
+  </model>
+</sdf>
+"""
+
+_COLLISION = """      <collision name="{name}">
+        <geometry>
+          {geometry}
+        </geometry>
+        <drake:proximity_properties>
+          <drake:compliant_hydroelastic/>
+          <drake:hydroelastic_modulus>{modulus:g}</drake:hydroelastic_modulus>
+          <drake:mesh_resolution_hint>{hint:.6g}</drake:mesh_resolution_hint>
+          <drake:hunt_crossley_dissipation>{dissipation:g}</drake:hunt_crossley_dissipation>
+          <drake:mu_static>{friction:g}</drake:mu_static>
+          <drake:mu_dynamic>{friction:g}</drake:mu_dynamic>
+        </drake:proximity_properties>
+      </collision>
+"""
+
+
+@dataclass(frozen=True)
+class _Inertial:
+    """Centre of mass p_OBcm: (3,) m and inertia about it, expressed in O: (3, 3) kg m^2."""
+
+    com: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+
+
+def _centred_mesh(path: Path) -> trimesh.Trimesh:
+    mesh = trimesh.load_mesh(path)
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    return mesh
+
+
+def _inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
+    """Of a solid of uniform density."""
+    mass = object_class.mass
+    x, y, z = object_class.size
+    if mesh is not None:
+        density = mass / mesh.volume
+        return _Inertial(np.asarray(mesh.center_mass, float), np.asarray(mesh.moment_inertia, float) * density / mesh.density)
+    if object_class.shape is Shape.BOX:
+        moments = mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
+    else:
+        radius = x / 2
+        across = mass / 12 * (3 * radius**2 + z**2)
+        moments = np.array([across, across, mass / 2 * radius**2])
+    return _Inertial(np.zeros(3), np.diag(moments))
+
+
+def _convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Convex hulls that together cover the mesh (CoACD, Wei et al. 2022); one for a convex mesh."""
+    if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
+        return [mesh.convex_hull]
+    coacd.set_log_level("error")
+    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD)
+    low, high = mesh.bounds
+    # Clipped: what stacks on an object relies on its pieces ending where its bounding box does.
+    return [trimesh.Trimesh(np.clip(vertices, low, high), faces).convex_hull for vertices, faces in pieces]
+
+
+def _obj_text(mesh: trimesh.Trimesh) -> str:
+    lines = ["v {:.7f} {:.7f} {:.7f}".format(*vertex) for vertex in mesh.vertices]
+    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
+    return "\n".join(lines) + "\n"
+
+
+def _collision(name: str, geometry: str, hint: float) -> str:
+    settle = SettleConfig()
+    return _COLLISION.format(
+        name=name,
+        geometry=geometry,
+        modulus=settle.hydroelastic_modulus,
+        friction=settle.friction,
+        dissipation=_DISSIPATION,
+        hint=hint,
+    )
+
+
+def _collisions(object_class: ObjectClass, pieces: int) -> str:
+    x, y, z = object_class.size
+    if object_class.shape is Shape.BOX:
+        return _collision("box", f"<box><size>{x!r} {y!r} {z!r}</size></box>", max(x, y, z))
+    if object_class.shape is Shape.CYLINDER:
+        radius = x / 2
+        geometry = f"<cylinder><radius>{radius!r}</radius><length>{z!r}</length></cylinder>"
+        return _collision("cylinder", geometry, radius / _HINTS_PER_RADIUS)
+    names = [f"convex_{index:03d}" for index in range(pieces)]
+    return "".join(_collision(name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z)) for name in names)
+
+
+def _asset_files(object_class: ObjectClass) -> dict[str, str]:
+    """Contents of every file of a class, by name."""
+    mesh = _centred_mesh(object_class.mesh) if object_class.mesh else None
+    texture = draw_texture(object_class)
+    if mesh is not None:
+        surface = mesh_surface(mesh, texture.regions["side"])
+    elif object_class.shape is Shape.BOX:
+        surface = box_surface(object_class.size, texture.regions)
+    else:
+        surface = cylinder_surface(object_class.size, texture.regions)
+    pieces = _convex_pieces(mesh) if mesh is not None else []
+    files = {f"convex_{index:03d}.obj": _obj_text(piece) for index, piece in enumerate(pieces)}
+    files["visual.gltf"] = embedded_gltf(surface, png_bytes(texture.image))
+    inertial = _inertial(object_class, mesh)
+    files["model.sdf"] = _MODEL.format(
+        name=object_class.name,
+        catalogue=CATALOGUE_FILE,
+        source=_comment_text(object_class.source or "not stated"),
+        com=" ".join(repr(float(value)) for value in inertial.com),
+        mass=object_class.mass,
+        collisions=_collisions(object_class, len(pieces)),
+        **{f"i{'xyz'[i]}{'xyz'[j]}": float(inertial.inertia[i, j]) for i in range(3) for j in range(i, 3)},
+    )
+    return files
+
+
+def _comment_text(text: str) -> str:
+    return re.sub(r"-{2,}", "-", text).rstrip("-")  # XML comments may not hold two hyphens
+
+
+def build_class(object_class: ObjectClass, folder: Path) -> Path:
+    """Builds one class into `<folder>/<class>/`, replacing an earlier build.
+
+    Returns:
+        The folder that it made; it holds `model.sdf`, `visual.gltf` and a mesh's `convex_000.obj`, ...
+
+    Raises:
+        InputError: the folder holds files that no build makes, or its label cannot be drawn.
+    """
+    target = folder / object_class.name
+    if target.exists():
+        strangers = (
+            [entry.name for entry in target.iterdir() if not _BUILT.fullmatch(entry.name)] if target.is_dir() else [target.name]
+        )
+        if strangers:
+            raise InputError(f"{target}: holds {sorted(strangers)[0]}; allowed is a folder that only `assets build` fills")
+    files = _asset_files(object_class)
+    staged = folder / f".{object_class.name}.{secrets.token_hex(4)}"
+    staged.mkdir(parents=True)
+    try:
+        for name, text in files.items():
+            (staged / name).write_text(text, encoding="utf-8")
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(staged, target)
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+    return target
+
+
+def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]:
+    """Builds the classes of an asset folder's own catalogue, and its `package.xml`.
+
+    Args:
+        folder: holds `catalogue.yaml`.
+        names: the classes to build; None for all.
+
+    Returns:
+        The folders made, one per class, in the catalogue's order.
+
+    Raises:
+        InputError: a broken catalogue, a class that it does not hold, or a folder that may not be written.
+    """
+    folder = folder.resolve()
+    own = {name: entry for name, entry in load_catalogue(folder).classes.items() if entry.folder.parent == folder}
+    unknown = sorted(set(names or ()) - set(own))
+    if unknown:
+        raise InputError(f"{folder / CATALOGUE_FILE}: classes: no {unknown[0]}; allowed are {', '.join(own)}")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{folder}: is not writable; give an asset folder that you may write")
+    built = [build_class(entry, folder) for name, entry in own.items() if names is None or name in names]
+    package = _SHIPPED_PACKAGE if folder == shipped_path("sdf_assets") else folder.name
+    description = "Object classes of drake_clutter: one folder per class."
+    write_text(folder / "package.xml", _PACKAGE.format(name=escape(package), description=description))
+    return built

@@ -1,0 +1,150 @@
+"""Visual geometry with texture coordinates, written as a self-contained glTF 2.0 file.
+
+Texture coordinates follow glTF: (0, 0) is the picture's upper left corner, (1, 1) its lower right one. A region
+(u0, v0, u1, v1) is a rectangle of the picture.
+"""
+
+import base64
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+Region = tuple[float, float, float, float]
+Floats = NDArray[np.float64]
+
+_SEGMENTS = 48
+# Which way a face's picture runs to the right and up, in O; their cross product is the outward normal.
+_FACES = {
+    "front": ((0, 1, 0), (0, 0, 1)),
+    "back": ((0, -1, 0), (0, 0, 1)),
+    "right": ((-1, 0, 0), (0, 0, 1)),
+    "left": ((1, 0, 0), (0, 0, 1)),
+    "top": ((0, 1, 0), (-1, 0, 0)),
+    "bottom": ((0, 1, 0), (1, 0, 0)),
+}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A textured triangle mesh in O.
+
+    Attributes:
+        points: (V, 3) m.
+        normals: (V, 3) unit vectors.
+        uv: (V, 2) texture coordinates.
+        triangles: (F, 3) indices of points, counter-clockwise seen from outside.
+    """
+
+    points: Floats
+    normals: Floats
+    uv: Floats
+    triangles: NDArray[np.int64]
+
+
+def _joined(parts: list[Surface]) -> Surface:
+    starts = np.cumsum([0] + [len(part.points) for part in parts[:-1]])
+    return Surface(
+        np.vstack([part.points for part in parts]),
+        np.vstack([part.normals for part in parts]),
+        np.vstack([part.uv for part in parts]),
+        np.vstack([part.triangles + start for part, start in zip(parts, starts, strict=True)]),
+    )
+
+
+def box_surface(size: tuple[float, float, float], regions: dict[str, Region]) -> Surface:
+    """A box of `size` (3,) m; `regions` names the picture of front (+x), back, right (+y), left, top (+z) and bottom."""
+    half = np.asarray(size) / 2
+    parts = []
+    for face, (right, up) in _FACES.items():
+        u0, v0, u1, v1 = regions[face]
+        normal = np.cross(right, up)
+        corners = np.array([normal + i * np.array(right) + j * np.array(up) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        uv = np.array([[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
+        parts.append(Surface(corners * half, np.tile(normal, (4, 1)), uv, np.array([[0, 1, 2], [0, 2, 3]])))
+    return _joined(parts)
+
+
+def cylinder_surface(size: tuple[float, float, float], regions: dict[str, Region]) -> Surface:
+    """A cylinder of `size` (diameter, diameter, height) m; `regions` names the picture of side, top and bottom.
+
+    The side's picture starts at -y and runs counter-clockwise seen from above, so that +x lies at a quarter of its width.
+    """
+    half = np.asarray(size) / 2
+    turned = np.linspace(0, 1, _SEGMENTS + 1)
+    angle = 2 * math.pi * (turned - 0.25)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    u0, v0, u1, v1 = regions["side"]
+    u = u0 + (u1 - u0) * turned
+    upright = [np.column_stack([ring, np.full(len(ring), z)]) for z in (-1.0, 1.0)]
+    normals = np.column_stack([ring, np.zeros(len(ring))])
+    uv = np.vstack([np.column_stack([u, np.full(len(u), v)]) for v in (v1, v0)])
+    low = np.arange(_SEGMENTS)
+    high = low + len(ring)
+    quads = np.vstack([np.column_stack([low, low + 1, high + 1]), np.column_stack([low, high + 1, high])])
+    parts = [Surface(np.vstack(upright) * half, np.vstack([normals, normals]), uv, quads)]
+    for face in ("top", "bottom"):
+        right, up = (np.array(axis) for axis in _FACES[face])
+        u0, v0, u1, v1 = regions[face]
+        disc = np.vstack([[0, 0], ring[:-1]])
+        points = np.cross(right, up) + disc[:, :1] * right + disc[:, 1:] * up
+        uv = np.column_stack([u0 + (u1 - u0) * (1 + disc[:, 0]) / 2, v1 + (v0 - v1) * (1 + disc[:, 1]) / 2])
+        fan = np.array([[0, 1 + i, 1 + (i + 1) % _SEGMENTS] for i in range(_SEGMENTS)])
+        parts.append(Surface(points * half, np.tile(np.cross(right, up), (len(points), 1)), uv, fan))
+    return _joined(parts)
+
+
+def mesh_surface(mesh: trimesh.Trimesh, region: Region) -> Surface:
+    """A user's mesh in O; its texture runs with the height, from the bottom of `region` to its top."""
+    shaded = trimesh.graph.smooth_shade(mesh, angle=math.radians(30))
+    points = np.asarray(shaded.vertices, float)
+    low, high = mesh.bounds[:, 2]
+    u0, v0, u1, v1 = region
+    v = v1 + (v0 - v1) * (points[:, 2] - low) / (high - low)
+    uv = np.column_stack([np.full(len(points), (u0 + u1) / 2), v])
+    return Surface(points, np.asarray(shaded.vertex_normals, float), uv, np.asarray(shaded.faces, np.int64))
+
+
+def _data_uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
+    """The surface with its PNG texture as the text of one glTF file that refers to no other file."""
+    y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF's up is y, and Drake turns it back to z
+    arrays: list[tuple[NDArray[Any], str, int]] = [
+        ((surface.points @ y_up.T).astype("<f4"), "VEC3", 34962),
+        ((surface.normals @ y_up.T).astype("<f4"), "VEC3", 34962),
+        (surface.uv.astype("<f4"), "VEC2", 34962),
+        (surface.triangles.reshape(-1).astype("<u4"), "SCALAR", 34963),
+    ]
+    views, accessors, buffer = [], [], b""
+    for index, (array, kind, target) in enumerate(arrays):
+        data = array.tobytes()
+        views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": target})
+        accessor = {"bufferView": index, "componentType": 5125 if kind == "SCALAR" else 5126, "count": len(array), "type": kind}
+        if index == 0:
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        accessors.append(accessor)
+        buffer += data
+    document = {
+        "asset": {"version": "2.0", "generator": "drake_clutter"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}],
+        "materials": [
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 0.8}}
+        ],
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "images": [{"uri": _data_uri("image/png", texture_png)}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"uri": _data_uri("application/octet-stream", buffer), "byteLength": len(buffer)}],
+    }
+    return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"

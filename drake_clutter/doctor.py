@@ -1,0 +1,151 @@
+"""Tells what this machine can do of what drake_clutter needs, and how to mend what is missing.
+
+Each probe runs in a process of its own and imports what it needs there, so that a crash or a broken library is a finding.
+"""
+
+import os
+import platform
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+_PROBE_TIMEOUT = 120.0  # s; the first rendering on a machine compiles shaders
+_NEEDED_MEMORY = 4.0  # GiB
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding.
+
+    Attributes:
+        name: what was looked at.
+        ok: whether it is there and works.
+        detail: what was found.
+        remedy: how to mend it; empty when it is ok.
+    """
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+
+
+class MissingError(RuntimeError):
+    """What a probe found is not enough; the message is the finding."""
+
+
+def checks() -> list[Check]:
+    """Looks at everything; takes some seconds."""
+    return [
+        _tried(probe_drake, "pip install drake; on Debian: apt-get install libglib2.0-0"),
+        _tried(probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"),
+        _tried(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
+        _tried(probe_torch, "needed by the learned agents: pip install 'drake-clutter[train]'"),
+        _tried(probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"),
+        _tried(probe_machine, f"use fewer workers; one may take {_NEEDED_MEMORY:g} GiB"),
+    ]
+
+
+def probe_drake() -> str:
+    """The versions of Drake and Python."""
+    from importlib.metadata import version
+
+    import pydrake.multibody.plant  # noqa: F401
+
+    return f"Drake {version('drake')}, Python {platform.python_version()}"
+
+
+def probe_rendering() -> str:
+    """Renders the depth of a 1 m cube whose face is 2 m ahead, at 64 x 48 pixels, without a screen."""
+    import numpy as np
+    from pydrake.geometry import (
+        Box,
+        ClippingRange,
+        DepthRange,
+        DepthRenderCamera,
+        GeometryId,
+        MakeRenderEngineVtk,
+        PerceptionProperties,
+        RenderCameraCore,
+        RenderEngineVtkParams,
+        RenderLabel,
+    )
+    from pydrake.math import RigidTransform
+    from pydrake.systems.sensors import CameraInfo, ImageDepth32F
+
+    engine = MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL"))
+    properties = PerceptionProperties()
+    properties.AddProperty("label", "id", RenderLabel(1))
+    X_WO = RigidTransform(np.array([0.0, 0.0, 2.5]))  # the camera is at W and looks along z
+    engine.RegisterVisual(GeometryId.get_new_id(), Box(1.0, 1.0, 1.0), properties, X_WO, needs_updates=False)
+    core = RenderCameraCore("probe", CameraInfo(64, 48, 0.8), ClippingRange(0.1, 10.0), RigidTransform())
+    image = ImageDepth32F(64, 48)
+    engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(0.1, 9.0)), image)
+    depth = float(image.data[24, 32, 0])
+    if abs(depth - 2.0) > 0.001:
+        raise MissingError(f"a face 2 m ahead is rendered at {depth:g} m")
+    return "VTK over EGL renders"
+
+
+def probe_solvers() -> str:
+    """The solvers that planning and equilibria use."""
+    from pydrake.solvers import ClarabelSolver, IpoptSolver, SnoptSolver
+
+    solvers = {"SNOPT": SnoptSolver(), "IPOPT": IpoptSolver(), "Clarabel": ClarabelSolver()}
+    missing = [name for name, solver in solvers.items() if not (solver.available() and solver.enabled())]
+    if missing:
+        raise MissingError(f"{', '.join(missing)} not available")
+    return ", ".join(solvers)
+
+
+def probe_torch() -> str:
+    """The version of PyTorch and what it computes on."""
+    import torch
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device, computes on the CPU"
+    return f"PyTorch {torch.__version__}, {device}"
+
+
+def probe_assets() -> str:
+    """Every shipped object class has a model."""
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.resources import shipped_path
+
+    catalogue = load_catalogue()
+    unbuilt = [name for name, object_class in catalogue.classes.items() if not object_class.sdf_path.is_file()]
+    if unbuilt:
+        raise MissingError(f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}")
+    return f"{len(catalogue.classes)} object classes in {shipped_path('sdf_assets')}"
+
+
+def probe_machine() -> str:
+    """Cores that this process may use, and memory."""
+    cores = len(os.sched_getaffinity(0))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    found = f"{cores} cores, {memory:.1f} GiB of memory"
+    if memory < _NEEDED_MEMORY:
+        raise MissingError(found)
+    return found
+
+
+def _tried(probe: Callable[[], str], remedy: str) -> Check:
+    """Runs a probe, which is a function of this module, in a new Python process."""
+    name = probe.__name__.removeprefix("probe_")
+    code = f"from drake_clutter import doctor; print(doctor.{probe.__name__}())"
+    try:
+        run = subprocess.run(
+            [sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_PROBE_TIMEOUT
+        )
+    except subprocess.TimeoutExpired:
+        return Check(name, False, f"no answer in {_PROBE_TIMEOUT:g} s", remedy)
+    if run.returncode == 0:
+        return Check(name, True, _last_line(run.stdout))
+    if run.returncode < 0:
+        return Check(name, False, f"died of {signal.Signals(-run.returncode).name} {_last_line(run.stderr)}".rstrip(), remedy)
+    return Check(name, False, _last_line(run.stderr).removeprefix("drake_clutter.doctor.MissingError: "), remedy)
+
+
+def _last_line(text: str) -> str:
+    return text.strip().rpartition("\n")[2]

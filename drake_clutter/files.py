@@ -1,0 +1,60 @@
+"""Writing files and folders so that an interrupted or failed run leaves nothing half-written."""
+
+import json
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+class InputError(ValueError):
+    """A file, option or value that a user gave and that cannot be used; the message says what is allowed."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; renames it to `path` when the block ends without an error."""
+    # The random part keeps two processes apart; the suffix stays, for writers that choose a format by it.
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes `text` to `path` in one step."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as indented JSON to `path` in one step; NaN and infinity are errors."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def output_directory(path: Path, *, may_hold: frozenset[str] = frozenset()) -> Path:
+    """Makes an output folder.
+
+    Args:
+        path: the folder; made, with its parents, if it is not there.
+        may_hold: names that may already be inside, e.g. from an earlier run that is now resumed.
+
+    Raises:
+        InputError: not a folder, not writable, or holding something else than `may_hold`.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"--out {path}: is a file; give a folder that is new or empty") from error
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be made ({error.strerror}); give a folder that you may write") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"--out {path}: is not writable; give a folder that you may write")
+    strangers = sorted(entry.name for entry in path.iterdir() if entry.name not in may_hold)
+    if strangers:
+        raise InputError(f"--out {path}: is not empty (holds {strangers[0]}); give a folder that is new or empty")
+    return path

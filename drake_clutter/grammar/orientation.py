@@ -1,0 +1,84 @@
+"""The ten terminal orientations: how an object rests, and its yaw about the tray's z axis."""
+
+from enum import Enum
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.catalogue import ObjectClass, Shape
+
+
+class Rest(Enum):
+    """Which of an object's axes points up, by its extent."""
+
+    FLAT = "flat"  # the shortest
+    SIDE = "side"  # the middle one
+    UPRIGHT = "upright"  # the longest
+
+
+class Orientation(Enum):
+    """A terminal edge of the grammar: the orientation of the object it leads to (SPEC section 2).
+
+    The value's first part is the rest, its second the yaw in degrees. At yaw 0 the longer horizontal axis lies along the
+    tray's x.
+    """
+
+    FLAT_0 = ("flat", 0)
+    FLAT_30 = ("flat", 30)
+    FLAT_60 = ("flat", 60)
+    FLAT_90 = ("flat", 90)
+    FLAT_120 = ("flat", 120)
+    FLAT_150 = ("flat", 150)
+    UPRIGHT_0 = ("upright", 0)
+    UPRIGHT_90 = ("upright", 90)
+    SIDE_0 = ("side", 0)
+    SIDE_90 = ("side", 90)
+
+    @property
+    def rest(self) -> Rest:
+        """Which axis points up."""
+        return Rest(self.value[0])
+
+    @property
+    def yaw(self) -> float:
+        """Radians."""
+        return float(np.radians(self.value[1]))
+
+
+def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
+    """Indices of O's axes that lie along the tray's x, and point up."""
+    short, middle, long = (int(axis) for axis in np.argsort(object_class.size, kind="stable"))
+    if object_class.always_upright:
+        rest = Rest.UPRIGHT
+    return {Rest.FLAT: (long, short), Rest.SIDE: (long, middle), Rest.UPRIGHT: (middle, long)}[rest]
+
+
+@lru_cache(maxsize=4096)
+def _rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
+    along_x, up = _resting_axes(object_class, orientation.rest)
+    R_AO = np.zeros((3, 3))  # A: the tray's axes before the yaw
+    R_AO[0, along_x] = R_AO[2, up] = 1.0
+    R_AO[1] = np.cross(R_AO[2], R_AO[0])
+    cosine, sine = np.cos(orientation.yaw), np.sin(orientation.yaw)
+    R_TO = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ R_AO
+    R_TO.setflags(write=False)
+    return R_TO
+
+
+def resting_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
+    """R_TO, (3, 3): the rotation of an object of the class in the tray frame when it rests in the orientation."""
+    return _rotation(object_class, orientation)
+
+
+def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[int, ...]:
+    """Equal for two orientations exactly when objects of the class look the same in both (up to the class's symmetry)."""
+    R_TO = resting_rotation(object_class, orientation)
+    if object_class.shape is Shape.CYLINDER:
+        axis = R_TO[:, 2]
+        described = np.outer(axis, axis)  # the axis up to its sign
+    elif object_class.shape is Shape.BOX:
+        described = R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T  # the box's moments name it
+    else:
+        described = R_TO
+    return tuple(int(value) for value in np.round(described * 1e6).ravel())

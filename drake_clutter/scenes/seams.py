@@ -1,0 +1,182 @@
+"""What crosses the three seams: verdicts, moves and outcomes, observations; and the protocols of the parts that are exchanged."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.catalogue import ObjectClass
+from drake_clutter.config import CameraConfig
+from drake_clutter.scenes.scene import TRAY, Pose, Scene
+
+
+class InstabilityReason(Enum):
+    """Why a scene is not stable."""
+
+    TOPPLED = "toppled"
+    SLID = "slid"
+    LEFT_TRAY = "left the tray"
+    NOT_AT_REST = "not at rest in time"
+
+
+@dataclass(frozen=True)
+class Instability:
+    """The object that did not stay, and how.
+
+    Attributes:
+        reason: toppled (turned past the limit), slid (moved past it, not turned), left the tray, or still moving at the end.
+        object: its name.
+        displacement: m, of its origin.
+        tilt: rad, see `tilt_between`.
+    """
+
+    reason: InstabilityReason
+    object: str
+    displacement: float
+    tilt: float
+
+    def __str__(self) -> str:
+        return f"{self.object} {self.reason.value} ({1000 * self.displacement:.0f} mm, {math.degrees(self.tilt):.0f} deg)"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a judge says of a scene.
+
+    Attributes:
+        instability: None for a stable scene.
+        settled: X_TO of every object after settling, by name. Of an unstable scene: as far as it was followed.
+        visible_share: of its unoccluded pixels, what the camera sees of each object, 0 to 1, by name; empty if unstable.
+        hidden: the objects whose visible share is below the config's threshold, in the scene's order; empty if unstable.
+    """
+
+    instability: Instability | None
+    settled: Mapping[str, Pose]
+    visible_share: Mapping[str, float]
+    hidden: tuple[str, ...]
+
+    @property
+    def stable(self) -> bool:
+        """Whether nothing moved or turned past the limits, left the tray, or was still moving."""
+        return self.instability is None
+
+
+class SceneJudge(Protocol):
+    """Says whether a scene is stable and what it hides."""
+
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
+        """The verdict; `rng` draws the random offsets that no exact balance survives."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """Pick one object, put it on another or on the tray.
+
+    Attributes:
+        pick: the object's name.
+        place: the name of the object to put it on, or `TRAY`.
+    """
+
+    pick: str
+    place: str = TRAY
+
+    def __str__(self) -> str:
+        return f"{self.pick} -> {self.place}"
+
+
+class MoveResult(Enum):
+    """How a move ended."""
+
+    PLACED = "placed"
+    COLLAPSED = "collapsed"
+    NO_FREE_SPOT = "no free spot"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the objects were at a time.
+
+    Attributes:
+        time: s since the move began.
+        poses: X_TO by name.
+    """
+
+    time: float
+    poses: Mapping[str, Pose]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a move led to.
+
+    Attributes:
+        result: placed, collapsed, or why it could not be carried out.
+        scene: the scene afterwards; the scene before, if the move could not be carried out.
+        instability: what did not stay, when it collapsed.
+        motion: the objects' motion, for pictures.
+    """
+
+    result: MoveResult
+    scene: Scene
+    instability: Instability | None = None
+    motion: tuple[Frame, ...] = ()
+
+
+@dataclass(frozen=True)
+class Detection:
+    """An object that the detector reports.
+
+    Attributes:
+        name: the same object keeps its name from image to image.
+        object_class: its class.
+        X_TO: its pose in the tray frame.
+        mask: (height, width) bool, its pixels.
+    """
+
+    name: str
+    object_class: ObjectClass
+    X_TO: Pose
+    mask: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the camera has shown at one time; it holds nothing that is hidden.
+
+    Attributes:
+        depth: (height, width) m along the camera's axis, inf where nothing is seen.
+        detections: V_t, the objects that can be detected now.
+        camera: intrinsics and altitude.
+        tray_side: m.
+    """
+
+    depth: NDArray[np.float32]
+    detections: tuple[Detection, ...]
+    camera: CameraConfig
+    tray_side: float
+
+    def __getitem__(self, name: str) -> Detection:
+        """The detection of a name.
+
+        Raises:
+            KeyError: the object is not in view.
+        """
+        for detection in self.detections:
+            if detection.name == name:
+                return detection
+        raise KeyError(f"object {name!r} is not in view; in view are {', '.join(d.name for d in self.detections)}")
+
+
+class MoveExecutor(Protocol):
+    """Carries moves out."""
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        """What the move leads to. `observation` decides where the object lands, `rng` draws what chance decides.
+
+        Raises:
+            KeyError: the move names an object that is not in view.
+        """

@@ -1,0 +1,173 @@
+"""The overhead camera: rendered images of a scene, and the share of each object that it sees."""
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    FrameId,
+    MakeRenderEngineVtk,
+    QueryObject,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import CameraInfo
+
+from drake_clutter.catalogue import ObjectClass
+from drake_clutter.config import CameraConfig
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
+
+_RENDERER = "vtk"
+_NO_OBJECT = -1
+
+
+@dataclass(frozen=True)
+class Images:
+    """What the camera renders of a scene.
+
+    Attributes:
+        color: (height, width, 3) uint8, sRGB.
+        depth: (height, width) float32, m along the camera's axis, inf where nothing is seen.
+        label: (height, width) int, the object's index in the scene, -1 for the tray and the background.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    label: NDArray[np.int64]
+
+
+class OverheadCamera:
+    """Renders scenes with one rendering engine that is kept alive, its objects moved from scene to scene.
+
+    Camera frame C: origin at the config's altitude over the tray's centre, z down along the optical axis, x along the tray's x.
+    """
+
+    def __init__(self, config: CameraConfig) -> None:
+        self.config = config
+        self._counts: Counter[ObjectClass] = Counter()
+        self._tray_side = 0.0
+        core = RenderCameraCore(
+            _RENDERER,
+            CameraInfo(config.width, config.height, np.radians(config.fov_y_deg)),
+            ClippingRange(0.05, 20.0),
+            RigidTransform(),
+        )
+        self._color_camera = ColorRenderCamera(core, False)
+        self._depth_camera = DepthRenderCamera(core, DepthRange(0.1, 10.0))
+        self._X_TC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.0, 0.0, config.altitude])
+        # Behind the camera.
+        self._X_T_parked = RigidTransform([0.0, 0.0, config.altitude + 5.0])
+
+    def _build(self, counts: Counter[ObjectClass], tray_side: float) -> None:
+        builder = DiagramBuilder()
+        names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
+        self._scene_plant: ScenePlant = add_scene_plant(builder, names, tray_side, 0.01, visuals=True)
+        self._scene_plant.plant.Finalize()
+        self._scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._counts, self._tray_side = counts, tray_side
+
+    def _show(self, scene: Scene, shown: Collection[str]) -> dict[int, int]:
+        """Puts the named objects of the scene before the camera, and no others.
+
+        Returns:
+            The index in the scene of each object shown, by its render label.
+        """
+        needed = Counter(o.object_class for o in scene.objects)
+        if scene.tray_side != self._tray_side or any(needed[c] > self._counts[c] for c in needed):
+            # Half as many again are made, so that scene after scene does not mean engine after engine.
+            grown = Counter({c: n + (n + 1) // 2 for c, n in needed.items() if n > self._counts[c]})
+            self._build(self._counts | grown, scene.tray_side)
+        plant = self._scene_plant.plant
+        context = plant.GetMyMutableContextFromRoot(self._context)
+        free: dict[ObjectClass, int] = defaultdict(int)
+        labels = {}
+        poses = {name: self._X_T_parked for name in self._scene_plant.bodies}
+        for index, scene_object in enumerate(scene.objects):
+            name = f"{scene_object.object_class.name}.{free[scene_object.object_class]}"
+            free[scene_object.object_class] += 1
+            if scene_object.name in shown:
+                poses[name] = rigid_transform(scene_object.X_TO)
+                labels[int(self._scene_plant.bodies[name].index())] = index
+        for name, X_TO in poses.items():
+            plant.SetFreeBodyPose(context, self._scene_plant.bodies[name], X_TO)
+        return labels
+
+    def _label_image(self, labels: Mapping[int, int]) -> NDArray[np.int64]:
+        image = self._query().RenderLabelImage(self._color_camera, self._world_frame(), self._X_TC)
+        lookup = np.full(2**15, _NO_OBJECT)
+        lookup[list(labels)] = list(labels.values())
+        return lookup[image.data[..., 0]]
+
+    def _query(self) -> QueryObject:
+        scene_graph = self._scene_plant.scene_graph
+        return scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(self._context))
+
+    def _world_frame(self) -> FrameId:
+        return self._scene_plant.scene_graph.world_frame_id()
+
+    def render(self, scene: Scene, X_TC: Pose | None = None) -> Images:
+        """The three images of a scene.
+
+        Args:
+            scene: what to render.
+            X_TC: another place to look from, for pictures; None for the overhead camera's own.
+        """
+        labels = self._show(scene, scene.names)
+        X = self._X_TC if X_TC is None else rigid_transform(X_TC)
+        color = self._query().RenderColorImage(self._color_camera, self._world_frame(), X)
+        depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), X)
+        return Images(color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels))
+
+    def label(self, scene: Scene) -> NDArray[np.int64]:
+        """The label image alone, see `Images`."""
+        return self._label_image(self._show(scene, scene.names))
+
+    def visible_shares(self, scene: Scene) -> dict[str, float]:
+        """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
+
+        An object that is out of the camera's frame is not hidden: its share is 1.
+        """
+        seen = np.bincount(self.label(scene).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+        alone = np.zeros(len(scene.objects), int)
+        for together in self._apart_in_image(scene):
+            labels = self._show(scene, {scene.objects[i].name for i in together})
+            counts = np.bincount(self._label_image(labels).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+            alone[together] = counts[together]
+        return {o.name: float(seen[i] / alone[i]) if alone[i] else 1.0 for i, o in enumerate(scene.objects)}
+
+    def hidden(self, shares: Mapping[str, float]) -> tuple[str, ...]:
+        """The names whose visible share is below the config's threshold, in order."""
+        return tuple(name for name, share in shares.items() if share < self.config.hidden_below)
+
+    def project(self, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixel coordinates (N, 2), right and down, of points (N, 3) m in the tray frame."""
+        distance = self.config.altitude - p_T[:, 2:]
+        u_v = self.config.focal_length * np.column_stack([p_T[:, 0], -p_T[:, 1]]) / distance
+        return u_v + np.array([self.config.width / 2 - 0.5, self.config.height / 2 - 0.5])
+
+    def _apart_in_image(self, scene: Scene) -> list[list[int]]:
+        """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""
+        corners = [self.project(o.corners_T) for o in scene.objects]
+        lower, upper = [c.min(axis=0) - 2 for c in corners], [c.max(axis=0) + 2 for c in corners]
+        overlapping = nx.Graph()
+        overlapping.add_nodes_from(range(len(corners)))
+        for i in range(len(corners)):
+            for j in range(i):
+                if (np.minimum(upper[i], upper[j]) > np.maximum(lower[i], lower[j])).all():
+                    overlapping.add_edge(i, j)
+        groups: dict[int, list[int]] = defaultdict(list)
+        for index, colour in nx.greedy_color(overlapping).items():
+            groups[colour].append(index)
+        return [sorted(group) for group in groups.values()]

@@ -1,0 +1,56 @@
+"""The judge that every published number comes from: settled in hydroelastic contact, seen by the rendered camera."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drake_clutter.catalogue import ObjectClass
+from drake_clutter.config import ClutterConfig
+from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import Verdict
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.settle import Settled, jittered, settle
+
+TOUCHING_MARGIN = 0.003
+"""m; objects further apart than this, random offsets included, settle without each other."""
+
+
+class DrakeJudge:
+    """Settles a scene and looks at it (a `SceneJudge`).
+
+    Stacks that cannot touch are settled apart. The first that falls decides, since a scene is stable only if all are; what
+    a falling stack would do to its neighbours changes no verdict.
+    """
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._config = config
+        self._camera = OverheadCamera(config.camera)
+        self._singles: dict[tuple[ObjectClass, float, float, tuple[float, ...]], Settled] = {}
+
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
+        """The verdict. See `SceneJudge.judge`."""
+        config = self._config.settle
+        settled: dict[str, Pose] = dict(scene.poses)
+        for group in touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN):
+            result = self._settle_single(group[0], scene.tray_side) if len(group) == 1 else settle(group, scene.tray_side, config)
+            settled |= result.poses
+            if result.instability is not None:
+                return Verdict(result.instability, settled, {}, ())
+        return self.look(scene.at(settled))
+
+    def _settle_single(self, single: SceneObject, tray_side: float) -> Settled:
+        """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
+        x, y, z = single.X_TO.translation
+        key = (single.object_class, tray_side, z, single.X_TO.quaternion)
+        if key not in self._singles:
+            self._singles[key] = settle([replace(single, X_TO=single.X_TO.moved((-x, -y, 0.0)))], tray_side, self._config.settle)
+        centred = self._singles[key]
+        poses = {single.name: pose.moved((x, y, 0.0)) for pose in centred.poses.values()}
+        instability = replace(centred.instability, object=single.name) if centred.instability else None
+        return Settled(instability, poses, ())
+
+    def look(self, scene: Scene) -> Verdict:
+        """The verdict on a scene that is known to be at rest: what it hides."""
+        shares = self._camera.visible_shares(scene)
+        return Verdict(None, scene.poses, shares, self._camera.hidden(shares))

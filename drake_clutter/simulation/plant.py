@@ -1,0 +1,112 @@
+"""A scene as a MultibodyPlant diagram: the tray welded to the world, every object a free body."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.scenes.scene import Pose, SceneObject
+ROLLING_STOPS_WITHIN = 0.05
+"""s, time constant with which a free cylinder that may lie stops rolling: a real marker has a clip and a soft barrel, while
+an ideal cylinder rocks on the facets of its contact mesh for seconds. The damping is far too weak to hold up a fall."""
+
+
+def rigid_transform(pose: Pose) -> RigidTransform:
+    """The pose as Drake's type."""
+    return RigidTransform(RotationMatrix(pose.rotation), pose.p)
+
+
+def pose_of(X_AB: RigidTransform) -> Pose:
+    """Drake's type as a pose."""
+    return Pose.of(X_AB.rotation().matrix(), X_AB.translation())
+
+
+@lru_cache(maxsize=256)
+def physics_sdf(path: Path) -> str:
+    """The SDF model at `path` without its visuals, URIs made absolute: reading a textured mesh costs 30 times the rest."""
+    ElementTree.register_namespace("drake", "drake.mit.edu")  # else the prefix is renamed, and Drake no longer knows it
+    root = ElementTree.parse(path).getroot()
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    for uri in root.iter("uri"):
+        uri.text = (path.parent / (uri.text or "")).as_uri()
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+@dataclass(frozen=True)
+class ScenePlant:
+    """A plant with objects on a tray, not finalized.
+
+    Attributes:
+        plant: the world frame W is the tray frame T.
+        scene_graph: Drake's geometry engine.
+        bodies: the free body of each object, by name.
+    """
+
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    bodies: dict[str, RigidBody]
+
+    def set_poses(self, context: Context, objects: Sequence[SceneObject]) -> None:
+        """Puts the objects at their X_TO, in the plant's context; velocities are untouched."""
+        for scene_object in objects:
+            self.plant.SetFreeBodyPose(context, self.bodies[scene_object.name], rigid_transform(scene_object.X_TO))
+
+    def poses(self, context: Context) -> dict[str, Pose]:
+        """X_TO by name, from the plant's context."""
+        return {name: pose_of(body.EvalPoseInWorld(context)) for name, body in self.bodies.items()}
+
+    def speeds(self, context: Context) -> dict[str, float]:
+        """Speed of each object's origin, m/s, by name."""
+        return {
+            name: float(np.linalg.norm(body.EvalSpatialVelocityInWorld(context).translational())) for name, body in self.bodies.items()
+        }
+
+
+def add_scene_plant(
+    builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, time_step: float, *, visuals: bool
+) -> ScenePlant:
+    """Adds a plant with the tray and the named objects to a diagram.
+
+    Args:
+        builder: the diagram's.
+        objects: (name, class) of each.
+        tray_side: m, inner side of the tray.
+        time_step: s; hydroelastic contact, lagged approximation, as DRAKE_NOTES found to be the truth.
+        visuals: whether the textured meshes are read, for cameras and Meshcat; slow.
+    """
+    config = MultibodyPlantConfig(
+        time_step=time_step, contact_model="hydroelastic_with_fallback", discrete_contact_approximation="lagged"
+    )
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    (tray,) = Parser(plant).AddModelsFromString(tray_sdf(tray_side), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
+    bodies = {}
+    for name, object_class in objects:
+        parser = Parser(plant, model_name_prefix=name)
+        if visuals:
+            (instance,) = parser.AddModels(str(object_class.sdf_path))
+        else:
+            (instance,) = parser.AddModelsFromString(physics_sdf(object_class.sdf_path), "sdf")
+        bodies[name] = plant.GetBodyByName("body", instance)
+        if object_class.shape is Shape.CYLINDER and not object_class.always_upright:
+            radius = object_class.size[0] / 2
+            rolling_inertia = 1.5 * object_class.mass * radius**2  # of a solid cylinder about its line of contact
+            plant.AddJoint(
+                QuaternionFloatingJoint(
+                    f"{name}_floating", plant.world_frame(), bodies[name].body_frame(), rolling_inertia / ROLLING_STOPS_WITHIN
+                )
+            )
+    return ScenePlant(plant, scene_graph, bodies)

@@ -1,0 +1,157 @@
+"""The shipped catalogue, and what the reader says to a broken one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from drake_clutter.catalogue import PairArrangement, Shape, load_catalogue
+from drake_clutter.files import InputError
+
+BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
+
+
+def user_catalogue(folder: Path, text: str) -> Path:
+    """A folder with `text` as its catalogue."""
+    (folder / "catalogue.yaml").write_text(text)
+    return folder
+
+
+def test_shipped_sets() -> None:
+    catalogue = load_catalogue()
+    ycb7, pantry14 = catalogue.object_set("ycb7"), catalogue.object_set("pantry14")
+    assert pantry14[:7] == ycb7
+    assert {entry.name for entry in pantry14} == set(catalogue.classes)
+    # 3 structure rules, a single per class, a rule per pair, 10 orientations: the paper's 30 and 49.
+    assert [13 + sum(1 + len(entry.pairs) for entry in entries) for entries in (ycb7, pantry14)] == [30, 49]
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "size", "mass"),
+    [
+        ("cracker_box", Shape.BOX, (0.060, 0.160, 0.230), 0.411),
+        ("sugar_box", Shape.BOX, (0.038, 0.089, 0.175), 0.514),
+        ("pudding_box", Shape.BOX, (0.035, 0.110, 0.089), 0.187),
+        ("gelatin_box", Shape.BOX, (0.028, 0.085, 0.073), 0.097),
+        ("master_chef_can", Shape.CYLINDER, (0.102, 0.102, 0.139), 0.414),
+        ("tomato_soup_can", Shape.CYLINDER, (0.066, 0.066, 0.101), 0.349),
+        ("large_marker", Shape.CYLINDER, (0.018, 0.018, 0.121), 0.0158),
+        ("pringles_can", Shape.CYLINDER, (0.075, 0.075, 0.250), 0.205),
+    ],
+)
+def test_ycb_measures(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> None:
+    entry = load_catalogue().classes[name]
+    assert entry.shape is shape
+    assert entry.size == pytest.approx(size)
+    assert entry.mass == pytest.approx(mass)
+    assert "YCB" in entry.source
+
+
+def test_cans_stand_and_pairs_follow_the_grammar() -> None:
+    classes = load_catalogue().classes
+    assert {name for name, entry in classes.items() if entry.always_upright} == {
+        "master_chef_can",
+        "tomato_soup_can",
+        "pringles_can",
+    }
+    assert classes["cracker_box"].pairs == (PairArrangement.LYING, PairArrangement.STANDING)
+    assert classes["large_marker"].pairs == (PairArrangement.LYING,)
+    assert classes["tomato_soup_can"].pairs == (PairArrangement.STANDING,)
+
+
+@pytest.mark.parametrize("name", list(load_catalogue().classes))
+def test_corners_span_the_size(name: str) -> None:
+    entry = load_catalogue().classes[name]
+    assert np.ptp(entry.corners, axis=0) == pytest.approx(entry.size)
+    assert entry.corners.min(axis=0) == pytest.approx(-entry.corners.max(axis=0))
+
+
+def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
+    user_catalogue(tmp_path, f"classes:\n  brick: {{{BOX}}}\nobject_sets:\n  mixed: [sugar_box, brick]\n")
+    catalogue = load_catalogue(tmp_path)
+    assert [entry.name for entry in catalogue.object_set("mixed")] == ["sugar_box", "brick"]
+    assert catalogue.classes["brick"].folder == tmp_path.resolve() / "brick"
+    assert catalogue.folders[1] == tmp_path.resolve()
+
+
+@pytest.mark.parametrize(
+    ("entry", "complaint"),
+    [
+        (
+            "brick: {shape: pyramid, size_mm: [10, 10, 10], mass_g: 5}",
+            r"classes\.brick\.shape: 'pyramid'; allowed are box, cylinder, mesh",
+        ),
+        ("brick: {shape: box, size_mm: [10, 20], mass_g: 5}", r"classes\.brick\.size_mm: .*three numbers from 3 to 1000"),
+        ("brick: {shape: box, size_mm: [10, -20, 30], mass_g: 5}", r"classes\.brick\.size_mm"),
+        ("brick: {shape: box, size_mm: [10, .nan, 30], mass_g: 5}", r"classes\.brick\.size_mm"),
+        ("brick: {shape: cylinder, size_mm: [10, 20, 30], mass_g: 5}", r"classes\.brick\.size_mm: .*diameter, twice"),
+        ("brick: {shape: box, size_mm: [10, 20, 30]}", r"classes\.brick\.mass_g: nan; allowed is more than 0"),
+        ("brick: {shape: box, size_mm: [10, 20, 30], mass_g: 0}", r"classes\.brick\.mass_g: 0"),
+        (f"brick: {{{BOX}, pairs: [leaning]}}", r"classes\.brick\.pairs: .*allowed are lying, standing"),
+        (f"brick: {{{BOX}, pairs: [lying, lying]}}", r"classes\.brick\.pairs: .*once"),
+        (f"brick: {{{BOX}, colour: red}}", "colour"),
+        (f"Brick: {{{BOX}}}", r"classes\.Brick: bad class name"),
+        (f"tray: {{{BOX}}}", r"classes\.tray: bad class name"),
+        (f"sugar_box: {{{BOX}}}", r"classes\.sugar_box: is shipped already"),
+        ("brick: {shape: mesh, mass_g: 5}", r"classes\.brick: a mesh class has `mesh`"),
+        (f"brick: {{{BOX}, mesh: brick.stl}}", r"classes\.brick: a mesh class has `mesh`"),
+        ("brick: {shape: mesh, mesh: brick.stl, mass_g: 5}", r"classes\.brick\.mesh: no file"),
+    ],
+)
+def test_bad_class(tmp_path: Path, entry: str, complaint: str) -> None:
+    user_catalogue(tmp_path, f"classes:\n  {entry}\n")
+    with pytest.raises(InputError, match=complaint) as caught:
+        load_catalogue(tmp_path)
+    assert str(tmp_path / "catalogue.yaml") in str(caught.value)
+
+
+@pytest.mark.parametrize("members", ["[sugar_box, teapot]", "[sugar_box, sugar_box]", "[]"])
+def test_bad_object_set(tmp_path: Path, members: str) -> None:
+    user_catalogue(tmp_path, f"object_sets:\n  tea: {members}\n")
+    with pytest.raises(InputError, match=r"object_sets\.tea: .*allowed is a list, without repeats, of cracker_box"):
+        load_catalogue(tmp_path)
+
+
+def test_unknown_object_set() -> None:
+    with pytest.raises(InputError, match=r"'ycb8' is unknown; known are ycb7, pantry14"):
+        load_catalogue().object_set("ycb8")
+
+
+def test_no_catalogue(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no such file; a catalogue is a folder that holds catalogue\.yaml"):
+        load_catalogue(tmp_path)
+
+
+def test_catalogue_that_is_not_yaml(tmp_path: Path) -> None:
+    user_catalogue(tmp_path, "classes: [unclosed")
+    with pytest.raises(InputError, match=r"catalogue\.yaml"):
+        load_catalogue(tmp_path)
+
+
+def test_bad_meshes(tmp_path: Path) -> None:
+    user_catalogue(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
+    block = trimesh.creation.box((0.05, 0.05, 0.05))
+    opened = trimesh.Trimesh(block.vertices, block.faces[:-1])
+    inverted = trimesh.Trimesh(block.vertices, block.faces[:, ::-1], process=False)
+    in_millimetres = trimesh.creation.box((50, 50, 50))
+    for mesh, complaint in (
+        (opened, "not watertight"),
+        (inverted, "not watertight"),
+        (in_millimetres, r"allowed are 0\.003 to 1 m"),
+    ):
+        mesh.export(tmp_path / "block.stl")
+        with pytest.raises(InputError, match=complaint):
+            load_catalogue(tmp_path)
+    (tmp_path / "block.stl").write_text("no mesh")
+    with pytest.raises(InputError, match=r"classes\.block\.mesh"):
+        load_catalogue(tmp_path)
+
+
+def test_mesh_without_assets(tmp_path: Path) -> None:
+    user_catalogue(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
+    trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "block.stl")
+    block = load_catalogue(tmp_path).classes["block"]
+    assert block.size == pytest.approx((0.05, 0.06, 0.07))
+    with pytest.raises(InputError, match="run `drake-clutter assets build"):
+        _ = block.convex_pieces

@@ -1,0 +1,47 @@
+"""The doctor finds this machine fit, and what is broken becomes a finding with a remedy."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from drake_clutter import doctor
+from drake_clutter.doctor import Check
+
+
+@pytest.fixture
+def torch_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that takes the place of PyTorch in new processes."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path / "torch.py"
+
+
+def test_this_machine_is_fit() -> None:
+    found = {check.name: check for check in doctor.checks()}
+    assert list(found) == ["drake", "rendering", "solvers", "torch", "assets", "machine"]
+    assert [check for check in found.values() if not check.ok] == []
+    assert all(check.detail and not check.remedy for check in found.values())
+    assert "SNOPT" in found["solvers"].detail
+
+
+def test_a_broken_library_is_a_finding(torch_is: Path) -> None:
+    torch_is.write_text("raise ImportError('broken')")
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "ImportError: broken", "mend it")
+
+
+def test_a_crash_is_a_finding(torch_is: Path) -> None:
+    torch_is.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "died of SIGSEGV", "mend it")
+
+
+def test_a_hang_is_a_finding(torch_is: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch_is.write_text("import time\ntime.sleep(60)")
+    monkeypatch.setattr(doctor, "_PROBE_TIMEOUT", 1.0)
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "no answer in 1 s", "mend it")
+
+
+def test_missing_models_are_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    catalogue = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
+    monkeypatch.setattr("drake_clutter.catalogue.load_catalogue", lambda: catalogue)
+    with pytest.raises(doctor.MissingError, match="1 of 1 object classes have no model, the first is crate"):
+        doctor.probe_assets()

@@ -1,0 +1,85 @@
+"""What is shipped can be installed: source archive, then wheel, then an empty environment, used from another directory."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+WHERE = "from drake_clutter.resources import shipped_path as s; print(s('sdf_assets/catalogue.yaml')); print(s('models'))"
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Runs a command as a user would, with nothing of this test's environment on Python's path; returns what it prints."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    result = subprocess.run(command, cwd=cwd, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
+    return result.stdout
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the source archive and not from the checkout: so the archive is complete, too."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="session")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty environment into which pip installed the wheel with its base dependencies, in the locked versions."""
+    folder = tmp_path_factory.mktemp("installed")
+    python = folder / "bin" / "python"
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder)
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "--quiet"]
+    run(*pip, "install", "--no-compile", "--constraint", ROOT / "requirements.lock", wheel, cwd=folder)
+    run(*pip, "check", cwd=folder)
+    return folder
+
+
+def test_the_wheel_holds_one_package(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.partition("/")[0] for name in names} == {"drake_clutter", "drake_clutter-0.1.0.dist-info"}
+    for folder in ("models", "sdf_assets"):
+        here = {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.is_file()}
+        assert here
+        assert here == {name.split("_shipped/")[1] for name in names if name.startswith(f"drake_clutter/_shipped/{folder}/")}
+    assert "drake_clutter/py.typed" in names
+
+
+def test_the_lock_satisfies_the_wheel(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = Parser().parsestr(archive.read("drake_clutter-0.1.0.dist-info/METADATA").decode())
+    locked = {line.partition("==")[0].lower() for line in (ROOT / "requirements.lock").read_text().splitlines()}
+    required = {value.partition(">=")[0].lower() for value in metadata.get_all("Requires-Dist", []) if "'scale'" not in value}
+    assert required <= locked
+    assert not any(name.startswith("nvidia") for name in locked)
+
+
+def test_the_installed_package_works_from_anywhere(installed: Path, tmp_path: Path) -> None:
+    python = installed / "bin" / "python"
+    for line in run(python, "-c", WHERE, cwd=tmp_path).splitlines():
+        assert Path(line).is_relative_to(installed)
+    assert "doctor" in run(installed / "bin" / "drake-clutter", "--help", cwd=tmp_path)
+
+
+def test_the_installed_package_renders_and_finds_its_assets(installed: Path, tmp_path: Path) -> None:
+    """Without the extras: PyTorch is the one thing that the doctor misses."""
+    command = installed / "bin" / "drake-clutter"
+    result = subprocess.run([command, "doctor", "--json"], cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    checks = json.loads(result.stdout)
+    assert [check["name"] for check in checks if not check["ok"]] == ["torch"], result.stderr
+    (assets,) = (check for check in checks if check["name"] == "assets")
+    assert str(installed) in assets["detail"]
+
+
+def test_the_editable_package_works_from_anywhere(tmp_path: Path) -> None:
+    """The environment that `make test` makes."""
+    for line in run(sys.executable, "-c", WHERE, cwd=tmp_path).splitlines():
+        assert Path(line).is_relative_to(ROOT)

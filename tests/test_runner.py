@@ -1,0 +1,171 @@
+"""Mapping over processes: order, equality for any number of workers, and every way of ending early."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing import active_children
+from pathlib import Path
+
+import pytest
+
+from drake_clutter.runner import item_rng, map_ordered
+
+
+class Noisy:
+    """Draws a number for an item; the first items take longest, so that later ones overtake them."""
+
+    def __call__(self, item: int) -> tuple[int, float]:
+        time.sleep(0.02 if item % 4 == 0 else 0.0)
+        return item, item_rng(7, item).normal()
+
+
+class CountsFactories:
+    """Leaves a file per worker made, named by its process."""
+
+    def __init__(self, folder: Path) -> None:
+        (folder / f"{os.getpid()}").touch(exist_ok=False)
+
+    def __call__(self, item: int) -> int:
+        return os.getpid()
+
+
+def fail_at(bad: int, item: int) -> int:
+    if item == bad:
+        raise LookupError(f"item {item}")
+    return item
+
+
+def failing_worker(bad: int) -> Callable[[int], int]:
+    return partial(fail_at, bad)
+
+
+def broken_factory() -> Callable[[int], int]:
+    raise LookupError("no worker")
+
+
+def sleep_or_die(item: float) -> float:
+    if item < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(item)
+    return item
+
+
+def make_sleeper() -> Callable[[float], float]:
+    return sleep_or_die
+
+
+def thread_setting(item: int) -> str | None:
+    return os.environ.get("OMP_NUM_THREADS")
+
+
+def make_thread_setting() -> Callable[[int], str | None]:
+    return thread_setting
+
+
+def test_order_and_results_do_not_depend_on_the_number_of_workers() -> None:
+    alone = list(map_ordered(Noisy, range(30), workers=1))
+    assert [item for item, _ in alone] == list(range(30))
+    assert list(map_ordered(Noisy, range(30), workers=2)) == alone
+    assert list(map_ordered(Noisy, iter(range(30)), workers=3)) == alone
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_worker_is_made_per_process(workers: int, tmp_path: Path) -> None:
+    used = set(map_ordered(partial(CountsFactories, tmp_path), range(20), workers=workers))
+    assert {int(file.name) for file in tmp_path.iterdir()} == used
+    assert 1 <= len(used) <= workers
+    assert (os.getpid() in used) == (workers == 1)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_no_items(workers: int) -> None:
+    assert list(map_ordered(broken_factory, [], workers=workers)) == []
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_exception_comes_in_its_place(workers: int) -> None:
+    results = map_ordered(partial(failing_worker, 3), range(10), workers=workers)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(LookupError, match="item 3"):
+        next(results)
+    assert not active_children()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_exception_in_the_factory_is_told(workers: int) -> None:
+    with pytest.raises(LookupError, match="no worker"):
+        next(map_ordered(broken_factory, range(3), workers=workers))
+
+
+def test_closing_midway_does_not_wait() -> None:
+    results = map_ordered(make_sleeper, [0.0, *[60.0] * 100], workers=2)
+    assert next(results) == 0.0
+    start = time.monotonic()
+    results.close()
+    assert time.monotonic() - start < 10
+    assert not active_children()
+
+
+def test_ctrl_c_ends_every_process() -> None:
+    code = """
+from test_runner import make_sleeper, map_ordered
+for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
+    print(result, flush=True)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"0.0\n"
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        _, errors = process.communicate(timeout=10)  # returns when the last process that holds the pipes has ended
+    assert errors.rstrip().endswith(b"KeyboardInterrupt")
+
+
+def test_a_killed_process_is_an_error() -> None:
+    with pytest.raises(BrokenProcessPool, match=r"was killed after [01] results.*fewer workers"):
+        list(map_ordered(make_sleeper, [0.0, -1.0, 0.0, 60.0], workers=2))
+    assert not active_children()
+
+
+def test_reads_only_a_few_items_ahead() -> None:
+    read = []
+
+    def endless() -> Iterator[int]:
+        item = 0
+        while True:
+            read.append(item)
+            yield item
+            item += 1
+
+    results = map_ordered(Noisy, endless(), workers=2)
+    for _ in range(5):
+        next(results)
+    results.close()
+    assert len(read) <= 5 + 8
+
+
+def test_processes_get_one_thread_each_and_this_one_keeps_its_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert list(map_ordered(make_thread_setting, range(2), workers=2)) == ["1", "1"]
+    assert "OMP_NUM_THREADS" not in os.environ
+
+
+def test_workers_below_one_are_refused_at_once() -> None:
+    with pytest.raises(ValueError, match="workers: 0"):
+        map_ordered(Noisy, [], workers=0)
+
+
+def test_item_rng() -> None:
+    draws = {item_rng(*path).integers(2**62) for path in [(0,), (0, 0), (0, 1), (0, 0, 0), (1,), (1, 0), (0, 1, 0)]}
+    assert len(draws) == 7
+    assert item_rng(3, 4).normal() == item_rng(3, 4).normal()
