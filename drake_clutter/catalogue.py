@@ -148,7 +148,9 @@ class ObjectClass:
             return (np.vstack([np.column_stack([ring, np.full(len(ring), z)]) for z in (-half[2], half[2])]),)
         pieces = sorted(self.folder.glob("convex_*.obj"))
         if not pieces:
-            raise InputError(f"{self.folder}: class {self.name} has no assets; run `drake-clutter assets build {self.folder.parent}`")
+            raise InputError(
+                f"{self.folder}: class {self.name} has no assets; run `drake-clutter assets build {self.folder.parent}`"
+            )
         return tuple(np.asarray(trimesh.load_mesh(piece).vertices, float) for piece in pieces)
 
     @cached_property
@@ -193,13 +195,17 @@ def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
         raise InputError(f"{where}.mesh: {path} is not watertight; give a closed surface with outward normals")
     x, y, z = (float(extent) for extent in mesh.extents)
     if not 0.003 <= min(x, y, z) <= max(x, y, z) <= 1.0:
-        raise InputError(f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; allowed are 0.003 to 1 m a side (units are metres)")
+        raise InputError(
+            f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; allowed are 0.003 to 1 m a side (units are metres)"
+        )
     return x, y, z
 
 
 def _checked_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
     if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
-        raise InputError(f"{where}: bad class name; allowed are lower-case letters, digits and _, and none of {', '.join(sorted(_GRAMMAR_WORDS))}")
+        raise InputError(
+            f"{where}: bad class name; allowed are lower-case letters, digits and _, and none of {', '.join(sorted(_GRAMMAR_WORDS))}"
+        )
     try:
         shape = Shape(entry.shape)
     except ValueError:

@@ -37,10 +37,10 @@ class LayoutConfig:
 class SettleConfig:
     """How Drake settles a scene and what counts as stable (SPEC section 6; DRAKE_NOTES "Verdicts").
 
+    Contact properties belong to the assets: see `drake_clutter.assets.contact`.
+
     Attributes:
         time_step: s.
-        hydroelastic_modulus: Pa, of every object.
-        friction: Coulomb coefficient, of every surface.
         jitter: m, radius of the disc from which each object's random xy offset is drawn.
         max_displacement: m, a stable object's origin moves less.
         max_tilt_deg: deg, a stable object turns less (a body of revolution: its axis).
@@ -50,8 +50,6 @@ class SettleConfig:
     """
 
     time_step: float = 0.002
-    hydroelastic_modulus: float = 1e8
-    friction: float = 0.5
     jitter: float = 0.001
     max_displacement: float = 0.010
     max_tilt_deg: float = 8.0

@@ -4,4 +4,13 @@ from drake_clutter.grammar.grammar import Derivation, NodeBudget, SceneGrammar, 
 from drake_clutter.grammar.graph import ClutterGraph, canonical_form
 from drake_clutter.grammar.orientation import Orientation, resting_rotation
 
-__all__ = ["ClutterGraph", "Derivation", "NodeBudget", "Orientation", "SceneGrammar", "canonical_form", "resting_rotation", "uniform_choice"]
+__all__ = [
+    "ClutterGraph",
+    "Derivation",
+    "NodeBudget",
+    "Orientation",
+    "SceneGrammar",
+    "canonical_form",
+    "resting_rotation",
+    "uniform_choice",
+]

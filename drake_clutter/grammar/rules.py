@@ -116,7 +116,9 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
                 )
             )
     rules += [
-        ProductionRule(f"orient_{orientation.name.lower()}", unoriented, {"parent": KEEP, "child": KEEP}, {("parent", "child"): orientation})
+        ProductionRule(
+            f"orient_{orientation.name.lower()}", unoriented, {"parent": KEEP, "child": KEEP}, {("parent", "child"): orientation}
+        )
         for orientation in Orientation
     ]
     return tuple(rules)

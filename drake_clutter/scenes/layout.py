@@ -40,7 +40,9 @@ class LayoutFailure:
         return f"{self.reason.value}: {self.amount:.3g}, at most {self.limit:.3g}"
 
 
-def _resting_at(node: int, object_class: ObjectClass, orientation: Orientation, xy: NDArray[np.float64], floor: float) -> SceneObject:
+def _resting_at(
+    node: int, object_class: ObjectClass, orientation: Orientation, xy: NDArray[np.float64], floor: float
+) -> SceneObject:
     """The object in its resting pose, centred over xy (m, tray frame), its lowest point at height `floor` (m)."""
     R_TO = resting_rotation(object_class, orientation)
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
@@ -111,7 +113,11 @@ def _place(half_sizes: NDArray[np.float64], config: LayoutConfig, rng: np.random
 
 
 def lay_out(
-    derivation: Derivation, classes: Mapping[str, ObjectClass], config: LayoutConfig, rng: np.random.Generator, seed: int | None = None
+    derivation: Derivation,
+    classes: Mapping[str, ObjectClass],
+    config: LayoutConfig,
+    rng: np.random.Generator,
+    seed: int | None = None,
 ) -> Scene | LayoutFailure:
     """A scene from a terminal graph.
 

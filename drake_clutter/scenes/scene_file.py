@@ -199,7 +199,9 @@ def _verdict(item: _Reader, scene: Scene) -> Verdict:
     shares = {name: reader.number() for name, reader in fields["visible_share"].entries().items()}
     hidden = tuple(reader.text() for reader in fields["hidden"].items())
     if strangers := (settled.keys() | shares.keys() | set(hidden)) - set(scene.names):
-        raise InputError(f"{item.where}: {sorted(strangers)[0]!r} is no object of the scene; allowed are {', '.join(scene.names)}")
+        raise InputError(
+            f"{item.where}: {sorted(strangers)[0]!r} is no object of the scene; allowed are {', '.join(scene.names)}"
+        )
     return Verdict(instability, settled, shares, hidden)
 
 
@@ -246,9 +248,5 @@ def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
 
 def save_scene(path: Path, scene: Scene, verdict: Verdict | None = None) -> None:
     """Writes a scene file in one step."""
-    text = yaml.dump(
-        scene_fields(scene, verdict), Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=160
-    )
+    text = yaml.dump(scene_fields(scene, verdict), Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=160)
     write_text(path, text)
-
-

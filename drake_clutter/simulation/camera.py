@@ -13,6 +13,7 @@ from pydrake.geometry import (
     DepthRange,
     DepthRenderCamera,
     FrameId,
+    LightParameter,
     MakeRenderEngineVtk,
     QueryObject,
     RenderCameraCore,
@@ -28,6 +29,11 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
 
 _RENDERER = "vtk"
+# Two lamps beside the camera; the second keeps what turns away from the first from going black.
+_LIGHTS = [
+    LightParameter(type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4),
+    LightParameter(type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9),
+]
 _NO_OBJECT = -1
 
 
@@ -73,7 +79,9 @@ class OverheadCamera:
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, tray_side, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
-        self._scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
+        self._scene_plant.scene_graph.AddRenderer(
+            _RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL", lights=_LIGHTS))
+        )
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._counts, self._tray_side = counts, tray_side

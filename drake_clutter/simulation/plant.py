@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from drake_clutter.assets.tray import tray_sdf
 from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.scenes.scene import Pose, SceneObject
+
 ROLLING_STOPS_WITHIN = 0.05
 """s, time constant with which a free cylinder that may lie stops rolling: a real marker has a clip and a soft barrel, while
 an ideal cylinder rocks on the facets of its contact mesh for seconds. The damping is far too weak to hold up a fall."""
@@ -71,7 +72,8 @@ class ScenePlant:
     def speeds(self, context: Context) -> dict[str, float]:
         """Speed of each object's origin, m/s, by name."""
         return {
-            name: float(np.linalg.norm(body.EvalSpatialVelocityInWorld(context).translational())) for name, body in self.bodies.items()
+            name: float(np.linalg.norm(body.EvalSpatialVelocityInWorld(context).translational()))
+            for name, body in self.bodies.items()
         }
 
 

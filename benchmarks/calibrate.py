@@ -1,0 +1,76 @@
+"""RG's row of the paper's Table I under a config: stability and hidden objects by size, judged by Drake.
+
+python benchmarks/calibrate.py --count 1000 --workers 2 --out benchmarks/results/calibration.json
+"""
+
+import subprocess
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator, summarise
+from drake_clutter.config import config_yaml, load_config
+from drake_clutter.files import write_json
+from drake_clutter.runner import map_ordered
+
+PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
+"""Stability rate and mean hidden objects of RG by nodes (Table I)."""
+THRESHOLDS = (0.10, 0.20, 0.25, 0.30, 0.35, 0.40)
+
+
+def commit() -> str:
+    """The commit that is checked out, marked if files differ from it."""
+    return subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True).stdout.strip()
+
+
+class _Size:
+    """Makes the worker of a job; picklable."""
+
+    def __init__(self, job: GenerationJob) -> None:
+        self.job = job
+
+    def __call__(self) -> SceneGenerator:
+        return SceneGenerator(self.job)
+
+
+def main(
+    count: Annotated[int, typer.Option(help="Scenes of each size.")] = 150,
+    seed: int = 0,
+    workers: int = 1,
+    objects: str = "ycb7",
+    nodes: Annotated[list[int] | None, typer.Option(help="Sizes; the paper's four if not given.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML with fields to put over the defaults.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
+) -> None:
+    """Prints the table, and hidden objects by threshold, and writes both with what is needed to repeat them."""
+    world = load_config(config)
+    rows: list[dict[str, Any]] = []
+    for size in nodes or PAPER_RG:
+        job = GenerationJob("random", objects, None, size, seed, world)
+        start = time.monotonic()
+        scenes = map_ordered(_Size(job), range(count), workers=workers)
+        made = list(track(scenes, f"{size} nodes", total=count, console=Console(stderr=True)))
+        row = summarise(job, [(m.scene, m.verdict) for m in made])
+        shares = [m.verdict.visible_share.values() for m in made if m.verdict.stable]
+        row["hidden_by_threshold"] = {str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS}
+        failures = sum((m.layout_failures for m in made), start=type(made[0].layout_failures)())
+        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start}
+        rows.append(row)
+    table = Table("nodes", "stable", "paper", "hidden", "paper", *(f"< {t:g}" for t in THRESHOLDS), "s")
+    for row in rows:
+        paper = PAPER_RG.get(row["nodes"], (float("nan"),) * 2)
+        cells = [f"{row['stability_rate']:.3f}", f"{paper[0]:.2f}", f"{row['hidden_mean']:.2f}", f"{paper[1]:.2f}"]
+        cells += [f"{h:.2f}" for h in row["hidden_by_threshold"].values()]
+        table.add_row(str(row["nodes"]), *cells, f"{row['seconds']:.0f}")
+    Console().print(table)
+    if out is not None:
+        write_json(out, {"commit": commit(), "workers": workers, "config": config_yaml(world), "rows": rows})
+
+
+if __name__ == "__main__":
+    typer.run(main)

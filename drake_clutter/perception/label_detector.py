@@ -1,0 +1,42 @@
+"""The perfect detector: it reads the rendered labels."""
+
+from dataclasses import dataclass
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.seams import Detection, Observation
+from drake_clutter.simulation.camera import Images, OverheadCamera
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look at a scene.
+
+    Attributes:
+        observation: what an explorer may know.
+        images: what the camera rendered.
+        visible_share: the truth behind it, by name: of each object's unoccluded pixels, the share that is seen.
+    """
+
+    observation: Observation
+    images: Images
+    visible_share: dict[str, float]
+
+
+class LabelDetector:
+    """Detects every object that is not hidden, with its true class and pose."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        self.camera = OverheadCamera(config)
+
+    def look(self, scene: Scene) -> Look:
+        """What the camera shows of a scene."""
+        images = self.camera.render(scene)
+        shares = self.camera.visible_shares(scene)
+        hidden = self.camera.hidden(shares)
+        detections = tuple(
+            Detection(o.name, o.object_class, o.X_TO, images.label == index)
+            for index, o in enumerate(scene.objects)
+            if o.name not in hidden
+        )
+        return Look(Observation(images.depth, detections, self.camera.config, scene.tray_side), images, shares)

@@ -1,0 +1,70 @@
+"""Moves by teleport: the picked object appears at its place, Drake settles what the move touched."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
+from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle import Settled, jittered, settle
+
+_AFTERMATH_TIME_STEP = 0.005
+"""s; what a fall does to the rest of the scene decides nothing any more, it is only shown."""
+
+
+class SettleExecutor:
+    """Carries out a move at fidelity `settle` (a `MoveExecutor`).
+
+    A scene collapses when, after the move, any object but the picked one has moved or turned past the limits that define
+    "stable", or the picked one past them from where it was let go. Less than that is harmless settling. What the picked
+    object carried falls. Only the groups of objects that touch the picked one before or after the move are settled; if one
+    of them falls, the whole scene is settled again, so that neighbours are hit as they would be.
+    """
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._config = config
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        """See `MoveExecutor.execute`."""
+        X_TO = choose_placement(observation, move, self._config.exploration, rng)
+        if X_TO is None:
+            return Outcome(MoveResult.NO_FREE_SPOT, scene)
+        settle_config = self._config.settle
+        (released,) = jittered([replace(scene[move.pick], X_TO=X_TO)], settle_config.jitter, rng)
+        moved = scene.at({move.pick: released.X_TO})
+
+        left_behind = next(
+            group for group in touching_groups(scene.objects, TOUCHING_MARGIN) if move.pick in {o.name for o in group}
+        )
+        touched = {o.name for o in left_behind}
+        settled = []
+        for group in touching_groups(moved.objects, TOUCHING_MARGIN):
+            if touched.isdisjoint(o.name for o in group):
+                continue
+            settled.append(settle(group, scene.tray_side, settle_config, record=True))
+            if settled[-1].instability is not None:
+                coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
+                whole = settle(moved.objects, scene.tray_side, coarse, record=True, follow_falls=True)
+                instability = whole.instability or settled[-1].instability
+                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), instability, whole.motion)
+        return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, _together(moved.poses, settled))
+
+
+def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:
+    return {name: pose for result in settled for name, pose in result.poses.items()}
+
+
+def _together(start: dict[str, Pose], settled: Sequence[Settled]) -> tuple[Frame, ...]:
+    """The motions of groups that settled apart, as one motion of the whole scene; a group that has ended stays."""
+    longest = max((result.motion for result in settled), key=len)
+    poses, frames = dict(start), []
+    for index, frame in enumerate(longest):
+        for result in settled:
+            poses |= result.motion[min(index, len(result.motion) - 1)].poses
+        frames.append(Frame(frame.time, dict(poses)))
+    return tuple(frames)

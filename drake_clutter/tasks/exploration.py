@@ -1,0 +1,101 @@
+"""Scene exploration (SPEC section 4): find every hidden object by moving what is in view."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from drake_clutter.config import ExplorationConfig
+from drake_clutter.perception.label_detector import LabelDetector, Look
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.seams import Move, MoveExecutor, MoveResult, Observation, Outcome
+
+
+class EpisodeEnd(Enum):
+    """Why an episode is over."""
+
+    ALL_FOUND = "all found"
+    COLLAPSED = "collapsed"
+    OUT_OF_MOVES = "out of moves"
+    GAVE_UP = "gave up"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One move and what came of it.
+
+    Attributes:
+        move: what was tried.
+        outcome: how it went.
+        look: what the camera showed afterwards.
+        newly_found: objects detected for the first time, in the scene's order.
+        reward: r_d per newly found object, plus the penalty if the scene collapsed.
+    """
+
+    move: Move
+    outcome: Outcome
+    look: Look
+    newly_found: tuple[str, ...]
+    reward: float
+
+
+def legal_moves(observation: Observation) -> list[Move]:
+    """Every (x, y) with x in V_t, y in V_t or the tray, y != x; it says nothing of what is hidden."""
+    names = [detection.name for detection in observation.detections]
+    return [Move(x, y) for x in names for y in (TRAY, *names) if y != x]
+
+
+class ExplorationTask:
+    """An episode: V_t what is in view, K_t what has ever been in view.
+
+    Over when every object is known, when the scene collapses (nothing found by that move counts), or after the config's
+    number of moves; a move that could not be carried out counts as one.
+    """
+
+    def __init__(
+        self, scene: Scene, executor: MoveExecutor, detector: LabelDetector, config: ExplorationConfig, max_moves: int
+    ) -> None:
+        """Starts an episode on a scene at rest."""
+        self._executor, self._detector, self._config, self._max_moves = executor, detector, config, max_moves
+        self.start = self.scene = scene
+        self.first_look = self.look = detector.look(scene)
+        self.known: tuple[str, ...] = tuple(d.name for d in self.look.observation.detections)
+        self.hidden_at_start: tuple[str, ...] = tuple(name for name in scene.names if name not in self.known)
+        self.steps: list[Step] = []
+
+    @property
+    def end(self) -> EpisodeEnd | None:
+        """Why the episode is over, or None while it goes on."""
+        if self.steps and self.steps[-1].outcome.result is MoveResult.COLLAPSED:
+            return EpisodeEnd.COLLAPSED
+        if len(self.known) == len(self.scene.objects):
+            return EpisodeEnd.ALL_FOUND
+        return EpisodeEnd.OUT_OF_MOVES if len(self.steps) >= self._max_moves else None
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """The objects that were hidden at the start and are known now."""
+        return tuple(name for name in self.hidden_at_start if name in self.known)
+
+    def step(self, move: Move, rng: np.random.Generator) -> Step:
+        """Carries a move out and looks.
+
+        Raises:
+            KeyError: the move names an object that is not in view.
+            ValueError: the move puts an object on itself, or the episode is over.
+        """
+        if self.end is EpisodeEnd.COLLAPSED:
+            raise ValueError("the scene has collapsed; no move is allowed")
+        if move.place == move.pick:
+            raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
+        outcome = self._executor.execute(self.scene, self.look.observation, move, rng)
+        collapsed = outcome.result is MoveResult.COLLAPSED
+        self.scene = outcome.scene
+        if outcome.result is not MoveResult.NO_FREE_SPOT:
+            self.look = self._detector.look(self.scene)
+        seen = {d.name for d in self.look.observation.detections}
+        newly = () if collapsed else tuple(name for name in self.scene.names if name in seen and name not in self.known)
+        self.known += newly
+        reward = self._config.detection_reward * len(newly) + (self._config.collapse_penalty if collapsed else 0.0)
+        self.steps.append(Step(move, outcome, self.look, newly, reward))
+        return self.steps[-1]
