@@ -204,7 +204,8 @@ def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
 def _checked_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
     if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
         raise InputError(
-            f"{where}: bad class name; allowed are lower-case letters, digits and _, and none of {', '.join(sorted(_GRAMMAR_WORDS))}"
+            f"{where}: bad class name; allowed are lower-case letters, digits and _, and none of "
+            + ", ".join(sorted(_GRAMMAR_WORDS))
         )
     try:
         shape = Shape(entry.shape)
@@ -271,7 +272,8 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
                 raise InputError(
-                    f"{path}: object_sets.{set_name}: {unknown or members}; allowed is a list, without repeats, of {', '.join(classes)}"
+                    f"{path}: object_sets.{set_name}: {unknown or members}; allowed is a list, without repeats, of "
+                    + ", ".join(classes)
                 )
             object_sets[set_name] = tuple(members)
     return Catalogue(classes, object_sets, folders)

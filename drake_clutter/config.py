@@ -44,7 +44,9 @@ class SettleConfig:
         jitter: m, radius of the disc from which each object's random xy offset is drawn.
         max_displacement: m, a stable object's origin moves less.
         max_tilt_deg: deg, a stable object turns less (a body of revolution: its axis).
-        max_time: s simulated; what still moves then is "not at rest".
+        max_time: s simulated.
+        rest_drift: m, what went further in the last 0.5 s is "not at rest". Contact chatter and a marker that rocks on the
+            facets of its contact mesh stay below it.
         calm_speed: m/s; calm_displacement: m; calm_tilt_deg: deg. A stack is calm while every object is below all three.
         calm_samples: calm samples in a row, 0.1 s apart, that end the simulation early.
     """
@@ -54,6 +56,7 @@ class SettleConfig:
     max_displacement: float = 0.010
     max_tilt_deg: float = 8.0
     max_time: float = 2.0
+    rest_drift: float = 0.0025
     calm_speed: float = 0.0005
     calm_displacement: float = 0.001
     calm_tilt_deg: float = 0.3

@@ -48,10 +48,10 @@ class ClutterGraph:
         graph = cls()
         for node, kind in nodes.items():
             graph.nx.add_node(node, kind=kind)
-        for (parent, child), kind in edges.items():
+        for (parent, child), edge_kind in edges.items():
             if parent not in nodes or child not in nodes:
                 raise ValueError(f"edges: {parent} -> {child} joins a node that is not there")
-            graph.nx.add_edge(parent, child, kind=kind)
+            graph.nx.add_edge(parent, child, kind=edge_kind)
         if len(graph.breadth_first()) != len(nodes) or not nx.is_directed_acyclic_graph(graph.nx):
             raise ValueError("edges: allowed is an acyclic graph in which the tray leads to every node")
         return graph
@@ -102,10 +102,9 @@ def canonical_form(graph: ClutterGraph, classes: Mapping[str, ObjectClass]) -> s
         children = []
         for child in graph.children(node):
             edge, kind = graph.edge_kind(node, child), graph.kind(child)
-            if isinstance(edge, Orientation) and kind in classes:
-                label = str(symmetry_key(classes[kind], edge))
-            else:  # into an end or a dummy: it says nothing that its neighbours do not
-                label = ""
+            # An edge into an end or a dummy says nothing that its neighbours do not.
+            oriented = isinstance(edge, Orientation) and kind in classes
+            label = str(symmetry_key(classes[kind], Orientation(edge))) if oriented else ""
             children.append(label + describe(child))
         return f"{graph.kind(node)}({','.join(sorted(children))})"
 

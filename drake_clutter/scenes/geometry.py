@@ -40,7 +40,7 @@ def _distinct_directions(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     first = np.argmax(np.abs(unit) > 1e-6, axis=1)
     unit = unit * np.sign(unit[np.arange(len(unit)), first])[:, None]
     _, index = np.unique(np.round(unit, 6), axis=0, return_index=True)
-    return unit[np.sort(index)]
+    return np.asarray(unit[np.sort(index)])
 
 
 _polytopes: dict[ObjectClass, tuple[_Polytope, ...]] = {}

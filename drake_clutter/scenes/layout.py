@@ -40,13 +40,11 @@ class LayoutFailure:
         return f"{self.reason.value}: {self.amount:.3g}, at most {self.limit:.3g}"
 
 
-def _resting_at(
-    node: int, object_class: ObjectClass, orientation: Orientation, xy: NDArray[np.float64], floor: float
-) -> SceneObject:
-    """The object in its resting pose, centred over xy (m, tray frame), its lowest point at height `floor` (m)."""
+def _resting_at(node: int, object_class: ObjectClass, orientation: Orientation, floor: float) -> SceneObject:
+    """The object in its resting pose, centred over the tray's centre, its lowest point at height `floor` (m)."""
     R_TO = resting_rotation(object_class, orientation)
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
-    return SceneObject(f"{object_class.name}_{node}", object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest)), node)
+    return SceneObject(f"{object_class.name}_{node}", object_class, Pose.of(R_TO, (0.0, 0.0, floor - lowest)), node)
 
 
 def _stack(graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: list[int], config: LayoutConfig) -> list[SceneObject]:
@@ -55,11 +53,9 @@ def _stack(graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: list
     floor, level = 0.0, bottom
     parent = ClutterGraph.TRAY_NODE
     while level:
-        resting = []
-        for node in level:
-            orientation = graph.edge_kind(parent, node)
-            assert isinstance(orientation, Orientation), "layout needs a terminal graph"
-            resting.append(_resting_at(node, classes[graph.kind(node)], orientation, np.zeros(2), floor))
+        orientation = graph.edge_kind(parent, level[0])  # a pair's two are alike
+        assert isinstance(orientation, Orientation), "layout needs a terminal graph"
+        resting = [_resting_at(node, classes[graph.kind(node)], orientation, floor) for node in level]
         if len(resting) == 2:
             gap = config.lying_gap if orientation.rest is Rest.FLAT else config.standing_gap
             aside = np.array([0.0, (resting[0].bounds_T[1][1] - resting[0].bounds_T[0][1] + gap) / 2, 0.0])

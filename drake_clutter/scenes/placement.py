@@ -37,7 +37,7 @@ class _Grid:
     @staticmethod
     def over(tray_side: float) -> "_Grid":
         count = int(tray_side / CELL)
-        return _Grid((np.arange(count) - (count - 1) / 2) * CELL)
+        return _Grid(np.asarray((np.arange(count) - (count - 1) / 2) * CELL, float))
 
     def points(self, height: float) -> NDArray[np.float64]:
         """(n * n, 3) m, the cells' centres at a height, x varying slowest."""
@@ -70,7 +70,7 @@ def seen_through(
     """
     rows, columns = _pixels(observation, p_T)
     free = observation.depth[rows, columns] >= observation.camera.altitude - p_T[:, 2]
-    return free if ignored is None else free & ~ignored[rows, columns]
+    return np.asarray(free if ignored is None else free & ~ignored[rows, columns])
 
 
 def _turned(pose: Pose, yaw: float) -> NDArray[np.float64]:
@@ -86,7 +86,7 @@ def _footprint(corners_xy: NDArray[np.float64], clearance: float) -> NDArray[np.
     lines = ConvexHull(corners_xy).equations
     outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) + lines[:, 2:]).max(axis=0)
     # Half a cell more: no part of the footprint lies in a cell that is not looked at.
-    return (outside.reshape(x.shape) <= clearance + CELL / 2).astype(float)
+    return np.asarray((outside.reshape(x.shape) <= clearance + CELL / 2).astype(float))
 
 
 def _clear_of(blocked: NDArray[np.bool_], footprint: NDArray[np.float64]) -> NDArray[np.bool_]:

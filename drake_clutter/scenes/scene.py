@@ -41,7 +41,7 @@ class Pose:
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
         """R_AB, (3, 3)."""
-        return Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix()
+        return np.asarray(Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix())
 
     @property
     def p(self) -> NDArray[np.float64]:

@@ -101,7 +101,7 @@ class OverheadCamera:
         context = plant.GetMyMutableContextFromRoot(self._context)
         free: dict[ObjectClass, int] = defaultdict(int)
         labels = {}
-        poses = {name: self._X_T_parked for name in self._scene_plant.bodies}
+        poses = dict.fromkeys(self._scene_plant.bodies, self._X_T_parked)
         for index, scene_object in enumerate(scene.objects):
             name = f"{scene_object.object_class.name}.{free[scene_object.object_class]}"
             free[scene_object.object_class] += 1
@@ -116,7 +116,7 @@ class OverheadCamera:
         image = self._query().RenderLabelImage(self._color_camera, self._world_frame(), self._X_TC)
         lookup = np.full(2**15, _NO_OBJECT)
         lookup[list(labels)] = list(labels.values())
-        return lookup[image.data[..., 0]]
+        return np.asarray(lookup[image.data[..., 0]])
 
     def _query(self) -> QueryObject:
         scene_graph = self._scene_plant.scene_graph
@@ -163,7 +163,7 @@ class OverheadCamera:
         """Pixel coordinates (N, 2), right and down, of points (N, 3) m in the tray frame."""
         distance = self.config.altitude - p_T[:, 2:]
         u_v = self.config.focal_length * np.column_stack([p_T[:, 0], -p_T[:, 1]]) / distance
-        return u_v + np.array([self.config.width / 2 - 0.5, self.config.height / 2 - 0.5])
+        return np.asarray(u_v + np.array([self.config.width / 2 - 0.5, self.config.height / 2 - 0.5]))
 
     def _apart_in_image(self, scene: Scene) -> list[list[int]]:
         """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""

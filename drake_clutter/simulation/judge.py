@@ -44,11 +44,12 @@ class DrakeJudge:
         x, y, z = single.X_TO.translation
         key = (single.object_class, tray_side, z, single.X_TO.quaternion)
         if key not in self._singles:
-            self._singles[key] = settle([replace(single, X_TO=single.X_TO.moved((-x, -y, 0.0)))], tray_side, self._config.settle)
-        centred = self._singles[key]
-        poses = {single.name: pose.moved((x, y, 0.0)) for pose in centred.poses.values()}
-        instability = replace(centred.instability, object=single.name) if centred.instability else None
-        return Settled(instability, poses, ())
+            centred = replace(single, X_TO=single.X_TO.moved((-x, -y, 0.0)))
+            self._singles[key] = settle([centred], tray_side, self._config.settle)
+        settled = self._singles[key]
+        (pose,) = settled.poses.values()
+        instability = replace(settled.instability, object=single.name) if settled.instability else None
+        return Settled(instability, {single.name: pose.moved((x, y, 0.0))}, ())
 
     def look(self, scene: Scene) -> Verdict:
         """The verdict on a scene that is known to be at rest: what it hides."""

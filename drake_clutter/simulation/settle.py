@@ -15,6 +15,8 @@ from drake_clutter.simulation.plant import add_scene_plant
 
 SAMPLE_PERIOD = 0.1
 """s between two looks at whether the objects have fallen or come to rest."""
+REST_SAMPLES = 5
+"""Samples over which what is at rest may not drift."""
 FRAME_PERIOD = 1 / 30
 
 
@@ -44,7 +46,7 @@ def jittered(objects: Sequence[SceneObject], radius: float, rng: np.random.Gener
 
 
 def _fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleConfig) -> Instability | None:
-    displacement = float(np.linalg.norm(after.p - before.X_TO.p))
+    displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
     x, y, z = after.translation
     if max(abs(x), abs(y)) > tray_side / 2 or z < 0:
@@ -83,19 +85,19 @@ def settle(
     scene_plant.set_poses(context, objects)
     simulator.Initialize()
 
-    motion = [Frame(0.0, {o.name: o.X_TO for o in objects})] if record else []
-    # Half a step is added so that rounding never leaves a step out.
-    half_step = config.time_step / 2
-    calm_samples, instability = 0, None
+    history = [{o.name: o.X_TO for o in objects}]
+    motion = [Frame(0.0, history[0])] if record else []
     may_end_early = not _may_creep(objects)
-    previous = {o.name: o.X_TO for o in objects}
+    calm_samples, instability = 0, None
     for sample in range(1, math.ceil(config.max_time / SAMPLE_PERIOD) + 1):
         if record:
             for part in range(1, round(SAMPLE_PERIOD / FRAME_PERIOD)):
                 simulator.AdvanceTo((sample - 1) * SAMPLE_PERIOD + part * FRAME_PERIOD)
                 motion.append(Frame(simulator.get_context().get_time(), scene_plant.poses(context)))
-        simulator.AdvanceTo(sample * SAMPLE_PERIOD + half_step)
+        # Half a step is added so that rounding never leaves a step out.
+        simulator.AdvanceTo(sample * SAMPLE_PERIOD + config.time_step / 2)
         poses, speeds = scene_plant.poses(context), scene_plant.speeds(context)
+        history.append(poses)
         if record:
             motion.append(Frame(sample * SAMPLE_PERIOD, poses))
         if instability is None:
@@ -103,25 +105,35 @@ def settle(
             instability = max(fallen, key=lambda f: f.displacement, default=None)
             if instability is not None and not follow_falls:
                 return Settled(instability, poses, tuple(motion))
-        reference = previous if instability else {o.name: o.X_TO for o in objects}
+        reference = history[-2] if instability else history[0]
         calm = all(
             speeds[o.name] < config.calm_speed
-            and float(np.linalg.norm(poses[o.name].p - reference[o.name].p)) < config.calm_displacement
+            and _distance(poses[o.name], reference[o.name]) < config.calm_displacement
             and tilt_between(o.object_class, reference[o.name], poses[o.name]) < math.radians(config.calm_tilt_deg)
             for o in objects
         )
-        previous = poses
         calm_samples = calm_samples + 1 if calm else 0
         if calm_samples >= config.calm_samples and (may_end_early or instability):
             return Settled(instability, poses, tuple(motion))
-    if instability is None and not all(speed < 10 * config.calm_speed for speed in speeds.values()):
-        name = max(speeds, key=lambda n: speeds[n])
-        start = next(o for o in objects if o.name == name)
-        displacement = float(np.linalg.norm(poses[name].p - start.X_TO.p))
-        instability = Instability(
-            InstabilityReason.NOT_AT_REST, name, displacement, tilt_between(start.object_class, start.X_TO, poses[name])
-        )
+    if instability is None:
+        instability = _still_moving(objects, poses, history[max(0, len(history) - 1 - REST_SAMPLES)], config)
     return Settled(instability, poses, tuple(motion))
+
+
+def _distance(X_TA: Pose, X_TB: Pose) -> float:
+    return float(np.linalg.norm(X_TA.p - X_TB.p))
+
+
+def _still_moving(
+    objects: Sequence[SceneObject], poses: dict[str, Pose], earlier: dict[str, Pose], config: SettleConfig
+) -> Instability | None:
+    """The object that went furthest since the earlier poses, if further than the config allows one at rest."""
+    furthest = max(objects, key=lambda o: _distance(poses[o.name], earlier[o.name]))
+    pose = poses[furthest.name]
+    if _distance(pose, earlier[furthest.name]) <= config.rest_drift:
+        return None
+    tilt = tilt_between(furthest.object_class, furthest.X_TO, pose)
+    return Instability(InstabilityReason.NOT_AT_REST, furthest.name, _distance(pose, furthest.X_TO), tilt)
 
 
 def _may_creep(objects: Sequence[SceneObject]) -> bool:

@@ -1,0 +1,48 @@
+"""A scene as Drake model directives, with the models that they name."""
+
+import shutil
+from pathlib import Path
+
+from pydrake.common.schema import Transform
+from pydrake.common.yaml import yaml_dump_typed
+from pydrake.multibody.parsing import AddModel, AddWeld, ModelDirective, ModelDirectives
+
+from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.export.parts import classes_of
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.simulation.plant import rigid_transform
+
+PACKAGE = "drake_clutter_scene"
+"""The name of the package that an exported folder is."""
+
+_PACKAGE_XML = f"""<?xml version="1.0"?>
+<package format="2">
+  <name>{PACKAGE}</name>
+  <version>0.0.0</version>
+  <description>A scene exported by drake_clutter.</description>
+  <maintainer email="nobody@example.com">drake_clutter authors</maintainer>
+  <license>BSD-3-Clause</license>
+</package>
+"""
+
+
+def write_dmd(scene: Scene, folder: Path) -> Path:
+    """Writes `scene.dmd.yaml`, `package.xml`, `tray.sdf` and a folder per class; the models are the classes' own."""
+    for object_class in classes_of(scene):
+        shutil.copytree(object_class.folder, folder / object_class.name)
+    (folder / "tray.sdf").write_text(tray_sdf(scene.tray_side), encoding="utf-8")
+    (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
+    directives = [
+        ModelDirective(add_model=AddModel(name=TRAY, file=f"package://{PACKAGE}/tray.sdf")),
+        ModelDirective(add_weld=AddWeld(parent="world", child=f"{TRAY}::tray")),
+    ]
+    for scene_object in scene.objects:
+        model = AddModel(
+            name=scene_object.name,
+            file=f"package://{PACKAGE}/{scene_object.object_class.name}/model.sdf",
+            default_free_body_pose={"body": Transform(rigid_transform(scene_object.X_TO))},
+        )
+        directives.append(ModelDirective(add_model=model))
+    path = folder / "scene.dmd.yaml"
+    yaml_dump_typed(ModelDirectives(directives=directives), filename=str(path))
+    return path

@@ -1,0 +1,75 @@
+"""The folder of an export: written aside, and filled in one go."""
+
+import os
+import re
+import secrets
+import shutil
+from enum import Enum
+from pathlib import Path
+
+from drake_clutter.export.dmd import write_dmd
+from drake_clutter.export.glb import write_glb
+from drake_clutter.export.mjcf import write_mjcf
+from drake_clutter.export.sdf import write_sdf
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import TRAY, Scene
+
+_NAME = re.compile(r"\w([\w. -]*\w)?")
+_RESERVED = re.compile(rf"{TRAY}|world|WorldModelInstance|DefaultModelInstance|__.*__")
+
+
+class ExportFormat(Enum):
+    """What a scene can be exported as."""
+
+    DMD = "dmd"
+    SDF = "sdf"
+    MJCF = "mjcf"
+    GLB = "glb"
+
+
+_WRITERS = {
+    ExportFormat.DMD: write_dmd,
+    ExportFormat.SDF: write_sdf,
+    ExportFormat.MJCF: write_mjcf,
+    ExportFormat.GLB: write_glb,
+}
+
+
+def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
+    """Writes a scene as a folder that refers to nothing outside of it, so that it may be moved or sent.
+
+    The world frame of every format is the tray frame T.
+
+    Args:
+        scene: the scene; the tray and every object at its X_TO are written.
+        format: of which program.
+        out: an existing, empty folder; stays empty when the export fails.
+
+    Returns:
+        The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml` or `scene.glb` in `out`.
+
+    Raises:
+        InputError: an object's name that not every program could take, or a class without built assets.
+    """
+    for name in scene.names:
+        if not _NAME.fullmatch(name) or _RESERVED.fullmatch(name):
+            raise InputError(
+                f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, and . - or blanks "
+                f"between them, and no name that a format reserves ({_RESERVED.pattern.replace('|', ', ')})"
+            )
+    for object_class in {scene_object.object_class for scene_object in scene.objects}:
+        if not object_class.sdf_path.is_file():
+            folder = object_class.folder
+            raise InputError(
+                f"{folder}: class {object_class.name} has no assets; run `drake-clutter assets build {folder.parent}`"
+            )
+    staged = out / f".export.{secrets.token_hex(4)}"
+    staged.mkdir()
+    try:
+        main_file = _WRITERS[format](scene, staged)
+        # The file to open comes last: where it is, the export is complete.
+        for entry in sorted(staged.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
+            os.replace(entry, out / entry.name)
+    finally:
+        shutil.rmtree(staged)
+    return out / main_file.name

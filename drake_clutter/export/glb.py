@@ -1,0 +1,46 @@
+"""A scene as one binary glTF file, for viewers, modelling programs and web pages."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from drake_clutter.export.parts import Z_UP_OF_Y_UP, class_visual, classes_of, tray_boxes
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.simulation.plant import rigid_transform
+
+ROOT = "tray_frame"
+"""The node of the tray frame T."""
+
+
+def _tray(side: float) -> trimesh.Trimesh:
+    boxes = []
+    for tray_box in tray_boxes(side):
+        box = trimesh.creation.box(tray_box.size)
+        box.apply_translation(tray_box.p_TG)
+        box.visual.face_colors = np.round(255 * tray_box.colour).astype(np.uint8)
+        boxes.append(box)
+    return trimesh.util.concatenate(boxes)
+
+
+def write_glb(scene: Scene, folder: Path) -> Path:
+    """Writes `scene.glb`: the tray and every object as a named node below the node `tray_frame`.
+
+    glTF's up is y; `tray_frame` turns T's z there. The pose of an object's node in `tray_frame` is X_TO.
+    """
+    picture = trimesh.Scene()
+    picture.graph.update(frame_to=ROOT, matrix=np.linalg.inv(Z_UP_OF_Y_UP))
+    for object_class in classes_of(scene):
+        picture.geometry[object_class.name] = class_visual(object_class)
+    picture.geometry[TRAY] = _tray(scene.tray_side)
+    picture.graph.update(frame_to=TRAY, frame_from=ROOT, matrix=np.eye(4), geometry=TRAY)
+    for scene_object in scene.objects:
+        picture.graph.update(
+            frame_to=scene_object.name,
+            frame_from=ROOT,
+            matrix=rigid_transform(scene_object.X_TO).GetAsMatrix4(),
+            geometry=scene_object.object_class.name,
+        )
+    path = folder / "scene.glb"
+    path.write_bytes(picture.export(file_type="glb"))
+    return path

@@ -1,0 +1,75 @@
+"""A scene as an MJCF model for MuJoCo."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+from drake_clutter.assets.contact import FRICTION
+from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.export.parts import class_inertial, classes_of, text_of, tray_boxes, write_class_meshes, write_xml
+from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
+
+
+def _add_defaults(root: Element) -> None:
+    default = SubElement(root, "default")
+    # Masses come from the inertials alone; a shell's are found for any mesh, also for one that is not closed.
+    SubElement(default, "mesh", inertia="shell")
+    visual = SubElement(default, "default", {"class": "visual"})
+    SubElement(visual, "geom", type="mesh", group="2", contype="0", conaffinity="0")
+    collision = SubElement(default, "default", {"class": "collision"})
+    # MuJoCo's own torsional and rolling coefficients; a contact has the larger friction of its two geoms.
+    SubElement(collision, "geom", group="3", friction=text_of([FRICTION, 0.005, 0.0001]))
+
+
+def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]) -> None:
+    name = object_class.name
+    SubElement(asset, "texture", name=name, type="2d", file=f"{name}/label.png")
+    SubElement(asset, "material", name=name, texture=name)
+    SubElement(asset, "mesh", name=name, file=f"{name}/visual.obj")
+    for piece in pieces:
+        SubElement(asset, "mesh", name=f"{name}/{piece}", file=f"{name}/{piece}.obj")
+
+
+def _add_tray(worldbody: Element, side: float) -> None:
+    tray = SubElement(worldbody, "body", name=TRAY)
+    for box in tray_boxes(side):
+        geometry = {"type": "box", "size": text_of(box.size / 2), "pos": text_of(box.p_TG), "rgba": text_of(box.colour)}
+        # Seen as well as touched, so it is in the group of the visuals.
+        SubElement(tray, "geom", {"class": "collision", "name": f"{TRAY}/{box.name}", "group": "2"} | geometry)
+
+
+def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[str]) -> None:
+    object_class, X_TO = scene_object.object_class, scene_object.X_TO
+    inertial = class_inertial(object_class)
+    body = SubElement(worldbody, "body", name=scene_object.name, pos=text_of(X_TO.translation), quat=text_of(X_TO.quaternion))
+    SubElement(body, "freejoint", name=scene_object.name)
+    SubElement(body, "inertial", pos=text_of(inertial.com), mass=repr(inertial.mass), fullinertia=text_of(inertial.inertia))
+    SubElement(body, "geom", {"class": "visual", "mesh": object_class.name, "material": object_class.name})
+    x, y, z = object_class.size
+    if object_class.shape is Shape.BOX:
+        geometries = [{"type": "box", "size": text_of([x / 2, y / 2, z / 2])}]
+    elif object_class.shape is Shape.CYLINDER:
+        geometries = [{"type": "cylinder", "size": text_of([x / 2, z / 2])}]
+    else:
+        geometries = [{"type": "mesh", "mesh": f"{object_class.name}/{piece}"} for piece in pieces]
+    for geometry in geometries:
+        SubElement(body, "geom", {"class": "collision"} | geometry)
+
+
+def write_mjcf(scene: Scene, folder: Path) -> Path:
+    """Writes `scene.xml` and a folder of meshes per class. Visuals are in group 2, collision geometry in group 3."""
+    root = Element("mujoco", model="scene")
+    SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
+    _add_defaults(root)
+    asset = SubElement(root, "asset")
+    pieces: Mapping[str, Sequence[str]] = {entry.name: write_class_meshes(entry, folder) for entry in classes_of(scene)}
+    for object_class in classes_of(scene):
+        _add_assets(asset, object_class, pieces[object_class.name])
+    worldbody = SubElement(root, "worldbody")
+    SubElement(worldbody, "light", pos="0 0 2", dir="0 0 -1", directional="true")
+    _add_tray(worldbody, scene.tray_side)
+    for scene_object in scene.objects:
+        _add_object(worldbody, scene_object, pieces[scene_object.object_class.name])
+    path = folder / "scene.xml"
+    write_xml(path, root)
+    return path

@@ -1,0 +1,121 @@
+"""What the formats share: the parts of built class models and of the tray, as data and as files."""
+
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.catalogue import ObjectClass
+from drake_clutter.scenes.scene import Scene
+
+Floats = NDArray[np.float64]
+
+Z_UP_OF_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""(4, 4): points of a glTF file, whose up is y by its specification, in a frame whose up is z."""
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass properties of a body with frame O.
+
+    Attributes:
+        mass: kg.
+        com: (3,) m, p_OBcm.
+        inertia: kg m^2 about the centre of mass, expressed in O: ixx, iyy, izz, ixy, ixz, iyz.
+    """
+
+    mass: float
+    com: tuple[float, ...]
+    inertia: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class TrayBox:
+    """One of the boxes that make the tray.
+
+    Attributes:
+        name: unique in the tray.
+        size: (3,) m.
+        p_TG: (3,) m, its centre; its axes are T's.
+        colour: (4,) red, green, blue, alpha in 0 to 1.
+    """
+
+    name: str
+    size: Floats
+    p_TG: Floats
+    colour: Floats
+
+
+def classes_of(scene: Scene) -> list[ObjectClass]:
+    """The classes in a scene, each once, by name."""
+    return sorted({scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name)
+
+
+def text_of(numbers: Iterable[float]) -> str:
+    """Numbers with all their digits, separated by blanks."""
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def write_xml(path: Path, root: ElementTree.Element) -> None:
+    """Writes an indented XML document."""
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def class_inertial(object_class: ObjectClass) -> Inertial:
+    """The mass properties in the class's built model."""
+    inertial = ElementTree.parse(object_class.sdf_path).find("model/link/inertial")
+    assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
+    moments = (float(inertial.findtext(f"inertia/{entry}", "nan")) for entry in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    com = (float(value) for value in inertial.findtext("pose", "").split()[:3])
+    return Inertial(float(inertial.findtext("mass", "nan")), tuple(com), tuple(moments))
+
+
+def class_visual(object_class: ObjectClass) -> trimesh.Trimesh:
+    """The class's textured mesh in O."""
+    (mesh,) = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
+    mesh.apply_transform(Z_UP_OF_Y_UP)
+    return mesh
+
+
+def tray_boxes(side: float) -> list[TrayBox]:
+    """The boxes of a tray of inner side `side`, m."""
+    boxes = []
+    for visual in ElementTree.fromstring(tray_sdf(side)).iter("visual"):
+        pose, size, colour = (
+            np.array([float(value) for value in visual.findtext(path, "").split()])
+            for path in ("pose", "geometry/box/size", "material/diffuse")
+        )
+        boxes.append(TrayBox(visual.get("name", ""), size, pose[:3], colour))
+    return boxes
+
+
+def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:
+    """Writes the class's meshes to `<folder>/<class>/`: `visual.obj` with its MTL and PNG, and the convex pieces.
+
+    Simulators other than Drake read no glTF.
+
+    Returns:
+        The names of the convex pieces without `.obj`, in order; none for a box or a cylinder.
+    """
+    target = folder / object_class.name
+    target.mkdir()
+    visual = class_visual(object_class)
+    # Full white, or simulators that multiply the texture by the material's colour show it dark.
+    visual.visual.material = trimesh.visual.material.SimpleMaterial(
+        image=visual.visual.material.baseColorTexture.convert("RGB"), diffuse=[255] * 4, name="label"
+    )
+    text, files = trimesh.exchange.obj.export_obj(visual, include_normals=True, return_texture=True, mtl_name="visual.mtl")
+    for name, data in files.items():
+        (target / name).write_bytes(data)
+    (target / "visual.obj").write_text(text, encoding="utf-8")
+    pieces = sorted(object_class.folder.glob("convex_*.obj"))
+    for piece in pieces:
+        shutil.copyfile(piece, target / piece.name)
+    return [piece.stem for piece in pieces]

@@ -1,0 +1,52 @@
+"""A scene as one SDFormat world, for PyBullet, Gazebo and Drake."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from pydrake.math import RollPitchYaw
+
+from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.export.parts import classes_of, text_of, write_class_meshes, write_xml
+from drake_clutter.scenes.scene import TRAY, Pose, Scene
+from drake_clutter.simulation.plant import rigid_transform
+
+_DRAKE = "drake.mit.edu"
+
+
+def _model(text: str, name: str) -> ElementTree.Element:
+    model = ElementTree.fromstring(text).find("model")
+    assert model is not None
+    model.set("name", name)
+    return model
+
+
+def _pose_text(pose: Pose) -> str:
+    X_AB = rigid_transform(pose)
+    return text_of([*X_AB.translation(), *RollPitchYaw(X_AB.rotation()).vector()])
+
+
+def write_sdf(scene: Scene, folder: Path) -> Path:
+    """Writes `scene.sdf`, a world in which every object is a model of its own, and a folder of meshes per class."""
+    ElementTree.register_namespace("drake", _DRAKE)  # else the prefix is renamed, and Drake no longer knows it
+    for object_class in classes_of(scene):
+        write_class_meshes(object_class, folder)
+    root = ElementTree.Element("sdf", version="1.10")
+    world = ElementTree.SubElement(root, "world", name="scene")
+    tray = _model(tray_sdf(scene.tray_side), TRAY)
+    static = ElementTree.Element("static")
+    static.text = "1"  # PyBullet knows no "true"
+    tray.insert(0, static)
+    world.append(tray)
+    for scene_object in scene.objects:
+        object_class = scene_object.object_class
+        model = _model(object_class.sdf_path.read_text(encoding="utf-8"), scene_object.name)
+        for uri in model.iter("uri"):
+            # PyBullet reads no glTF.
+            uri.text = f"{object_class.name}/{uri.text}".replace(".gltf", ".obj")
+        pose = ElementTree.Element("pose")
+        pose.text = _pose_text(scene_object.X_TO)
+        model.insert(0, pose)
+        world.append(model)
+    path = folder / "scene.sdf"
+    write_xml(path, root)
+    return path
