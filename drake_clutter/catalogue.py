@@ -35,6 +35,14 @@ class Shape(Enum):
     MESH = "mesh"
 
 
+class Rest(Enum):
+    """Which of an object's axes points up when it rests, by its extent."""
+
+    FLAT = "flat"  # the shortest
+    SIDE = "side"  # the middle one
+    UPRIGHT = "upright"  # the longest
+
+
 class PairArrangement(Enum):
     """How the two objects of a "meta" pair lie beside each other (SPEC section 2)."""
 
@@ -69,7 +77,7 @@ class ClassEntry:
         mass_g: grams.
         source: where size and mass come from.
         pairs: the arrangements in which two of it stand as a pair: lying, standing.
-        always_upright: every orientation puts it on its end (cans).
+        only_rest: flat, side or upright: how it rests in every orientation (cans stand, a marker lies); left out if it may change.
         mesh: a watertight mesh in metres, beside the catalogue; for shape mesh only.
         label: how its texture is drawn.
     """
@@ -79,7 +87,7 @@ class ClassEntry:
     mass_g: float = math.nan
     source: str = ""
     pairs: list[str] = field(default_factory=list)
-    always_upright: bool = False
+    only_rest: str = ""
     mesh: str = ""
     label: Label = field(default_factory=Label)
 
@@ -108,7 +116,7 @@ class ObjectClass:
         mass: kg.
         source: where size and mass come from.
         pairs: the pair arrangements that the grammar has a rule for.
-        always_upright: every orientation puts it on its end.
+        only_rest: how it rests in every orientation, or None if that may change.
         mesh: the user's mesh file, or None.
         label: how its texture is drawn.
         folder: where its built assets lie.
@@ -120,7 +128,7 @@ class ObjectClass:
     mass: float
     source: str
     pairs: tuple[PairArrangement, ...]
-    always_upright: bool
+    only_rest: Rest | None
     mesh: Path | None
     label: Label
     folder: Path
@@ -215,6 +223,9 @@ def _checked_class(name: str, entry: ClassEntry, folder: Path, where: str) -> Ob
         pairs = tuple(PairArrangement(pair) for pair in entry.pairs)
     except ValueError:
         raise InputError(f"{where}.pairs: {entry.pairs}; allowed are {', '.join(p.value for p in PairArrangement)}") from None
+    if entry.only_rest and entry.only_rest not in {rest.value for rest in Rest}:
+        raise InputError(f"{where}.only_rest: {entry.only_rest!r}; allowed are {', '.join(r.value for r in Rest)}, or none")
+    only_rest = Rest(entry.only_rest) if entry.only_rest else None
     if len(set(pairs)) != len(pairs):
         raise InputError(f"{where}.pairs: {entry.pairs}; each arrangement may stand once")
     if not 0 < entry.mass_g < 20_000:
@@ -231,9 +242,7 @@ def _checked_class(name: str, entry: ClassEntry, folder: Path, where: str) -> Ob
         size = (x, y, z)
         if shape is Shape.CYLINDER and x != y:
             raise InputError(f"{where}.size_mm: {entry.size_mm}; a cylinder's first two sizes are its diameter, twice")
-    return ObjectClass(
-        name, shape, size, entry.mass_g / 1000, entry.source, pairs, entry.always_upright, mesh, entry.label, folder / name
-    )
+    return ObjectClass(name, shape, size, entry.mass_g / 1000, entry.source, pairs, only_rest, mesh, entry.label, folder / name)
 
 
 def _read(folder: Path) -> CatalogueFile:

@@ -17,10 +17,10 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.assets import MOTIFS, build_assets, build_class
-from drake_clutter.assets.textures import draw_texture
-from drake_clutter.catalogue import ObjectClass, Shape, load_catalogue
 from drake_clutter.assets.contact import FRICTION, HYDROELASTIC_MODULUS
+from drake_clutter.assets.textures import draw_texture
 from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.catalogue import ObjectClass, Rest, Shape, load_catalogue
 from drake_clutter.config import CameraConfig, LayoutConfig
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
@@ -90,7 +90,7 @@ def test_shipped_model(entry: ObjectClass) -> None:
     if entry.shape is Shape.CYLINDER:
         # Drake puts ceil(circumference / hint) edges around, at any size.
         edges = math.ceil(math.pi * x / contact.GetProperty("hydroelastic", "resolution_hint"))
-        assert edges == (16 if entry.always_upright else 32)
+        assert edges == (16 if entry.only_rest is Rest.UPRIGHT else 32)
 
 
 @pytest.mark.parametrize("entry", CLASSES.values(), ids=list(CLASSES))

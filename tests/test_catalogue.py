@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_clutter.catalogue import PairArrangement, Shape, load_catalogue
+from drake_clutter.catalogue import PairArrangement, Rest, Shape, load_catalogue
 from drake_clutter.files import InputError
 
 BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
@@ -50,7 +50,7 @@ def test_ycb_measures(name: str, shape: Shape, size: tuple[float, float, float],
 
 def test_cans_stand_and_pairs_follow_the_grammar() -> None:
     classes = load_catalogue().classes
-    assert {name for name, entry in classes.items() if entry.always_upright} == {
+    assert {name for name, entry in classes.items() if entry.only_rest is Rest.UPRIGHT} == {
         "master_chef_can",
         "tomato_soup_can",
         "pringles_can",

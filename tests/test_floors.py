@@ -13,12 +13,12 @@ FLOORS = {
     0: {"assets", "catalogue", "config", "files", "resources", "runner"},
     1: {"grammar"},
     2: {"scenes"},
-    3: {"simulation"},
+    3: {"export", "simulation"},
     4: {"arm", "perception"},
     5: {"tasks"},
     6: {"agents"},
     7: {"systems"},
-    8: {"cli", "doctor", "reports"},
+    8: {"cli", "commands", "doctor", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts)

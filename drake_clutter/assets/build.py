@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drake_clutter.assets.contact import proximity_properties
 from drake_clutter.assets.gltf import box_surface, cylinder_surface, embedded_gltf, mesh_surface
 from drake_clutter.assets.textures import draw_texture, png_bytes
-from drake_clutter.catalogue import CATALOGUE_FILE, ObjectClass, Shape, load_catalogue
+from drake_clutter.catalogue import CATALOGUE_FILE, ObjectClass, Rest, Shape, load_catalogue
 from drake_clutter.files import InputError, write_text
 from drake_clutter.resources import shipped_path
 
@@ -134,7 +134,9 @@ def _collisions(object_class: ObjectClass, pieces: int) -> str:
     if object_class.shape is Shape.CYLINDER:
         radius = x / 2
         geometry = f"<cylinder><radius>{radius!r}</radius><length>{z!r}</length></cylinder>"
-        return _collision("cylinder", geometry, radius * (_STANDING_HINT if object_class.always_upright else _LYING_HINT))
+        return _collision(
+            "cylinder", geometry, radius * (_STANDING_HINT if object_class.only_rest is Rest.UPRIGHT else _LYING_HINT)
+        )
     names = [f"convex_{index:03d}" for index in range(pieces)]
     return "".join(_collision(name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z)) for name in names)
 

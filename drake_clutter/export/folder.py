@@ -8,14 +8,15 @@ from enum import Enum
 from pathlib import Path
 
 from drake_clutter.export.dmd import write_dmd
-from drake_clutter.export.glb import write_glb
+from drake_clutter.export.glb import ROOT, write_glb
 from drake_clutter.export.mjcf import write_mjcf
+from drake_clutter.export.parts import classes_of
 from drake_clutter.export.sdf import write_sdf
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import TRAY, Scene
 
 _NAME = re.compile(r"\w([\w. -]*\w)?")
-_RESERVED = re.compile(rf"{TRAY}|world|WorldModelInstance|DefaultModelInstance|__.*__")
+_RESERVED = re.compile(rf"{TRAY}|{ROOT}|world|WorldModelInstance|DefaultModelInstance|__.*__")
 
 
 class ExportFormat(Enum):
@@ -57,7 +58,7 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
                 f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, and . - or blanks "
                 f"between them, and no name that a format reserves ({_RESERVED.pattern.replace('|', ', ')})"
             )
-    for object_class in {scene_object.object_class for scene_object in scene.objects}:
+    for object_class in classes_of(scene):
         if not object_class.sdf_path.is_file():
             folder = object_class.folder
             raise InputError(

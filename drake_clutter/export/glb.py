@@ -13,14 +13,17 @@ ROOT = "tray_frame"
 """The node of the tray frame T."""
 
 
-def _tray(side: float) -> trimesh.Trimesh:
-    boxes = []
+def _add_tray(picture: trimesh.Scene, side: float) -> None:
+    picture.graph.update(frame_to=TRAY, frame_from=ROOT, matrix=np.eye(4))
     for tray_box in tray_boxes(side):
         box = trimesh.creation.box(tray_box.size)
-        box.apply_translation(tray_box.p_TG)
-        box.visual.face_colors = np.round(255 * tray_box.colour).astype(np.uint8)
-        boxes.append(box)
-    return trimesh.util.concatenate(boxes)
+        # glTF takes for metal whatever does not say otherwise.
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=tray_box.colour, metallicFactor=0.0, roughnessFactor=0.8)
+        box.visual = trimesh.visual.TextureVisuals(material=material)
+        name = f"{TRAY}/{tray_box.name}"
+        picture.geometry[name] = box
+        matrix = trimesh.transformations.translation_matrix(tray_box.p_TG)
+        picture.graph.update(frame_to=name, frame_from=TRAY, matrix=matrix, geometry=name)
 
 
 def write_glb(scene: Scene, folder: Path) -> Path:
@@ -32,8 +35,7 @@ def write_glb(scene: Scene, folder: Path) -> Path:
     picture.graph.update(frame_to=ROOT, matrix=np.linalg.inv(Z_UP_OF_Y_UP))
     for object_class in classes_of(scene):
         picture.geometry[object_class.name] = class_visual(object_class)
-    picture.geometry[TRAY] = _tray(scene.tray_side)
-    picture.graph.update(frame_to=TRAY, frame_from=ROOT, matrix=np.eye(4), geometry=TRAY)
+    _add_tray(picture, scene.tray_side)
     for scene_object in scene.objects:
         picture.graph.update(
             frame_to=scene_object.name,

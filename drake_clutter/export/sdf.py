@@ -13,10 +13,25 @@ from drake_clutter.simulation.plant import rigid_transform
 _DRAKE = "drake.mit.edu"
 
 
+def _use_standard_friction(collision: ElementTree.Element) -> None:
+    """Drake's own friction element moves to the standard one, which Drake reads too; it refuses to have both."""
+    properties = collision.find(f"{{{_DRAKE}}}proximity_properties")
+    assert properties is not None
+    surface = ElementTree.SubElement(collision, "surface")
+    ode = ElementTree.SubElement(ElementTree.SubElement(surface, "friction"), "ode")
+    for drake_name, name in (("mu_static", "mu"), ("mu_dynamic", "mu2")):
+        element = properties.find(f"{{{_DRAKE}}}{drake_name}")
+        assert element is not None
+        properties.remove(element)
+        ElementTree.SubElement(ode, name).text = element.text
+
+
 def _model(text: str, name: str) -> ElementTree.Element:
     model = ElementTree.fromstring(text).find("model")
     assert model is not None
     model.set("name", name)
+    for collision in model.iter("collision"):
+        _use_standard_friction(collision)
     return model
 
 

@@ -6,15 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, Shape
-
-
-class Rest(Enum):
-    """Which of an object's axes points up, by its extent."""
-
-    FLAT = "flat"  # the shortest
-    SIDE = "side"  # the middle one
-    UPRIGHT = "upright"  # the longest
+from drake_clutter.catalogue import ObjectClass, Rest, Shape
 
 
 class Orientation(Enum):
@@ -49,8 +41,7 @@ class Orientation(Enum):
 def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
     """Indices of O's axes that lie along the tray's x, and point up."""
     short, middle, long = (int(axis) for axis in np.argsort(object_class.size, kind="stable"))
-    if object_class.always_upright:
-        rest = Rest.UPRIGHT
+    rest = object_class.only_rest or rest
     return {Rest.FLAT: (long, short), Rest.SIDE: (long, middle), Rest.UPRIGHT: (middle, long)}[rest]
 
 

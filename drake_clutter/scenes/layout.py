@@ -7,11 +7,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalogue import ObjectClass, Rest
 from drake_clutter.config import LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, Orientation, resting_rotation
 from drake_clutter.grammar.graph import DUMMY, END
-from drake_clutter.grammar.orientation import Rest
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 
 

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_clutter.assets.tray import tray_sdf
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalogue import ObjectClass, Rest, Shape
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_STOPS_WITHIN = 0.05
@@ -103,7 +103,7 @@ def add_scene_plant(
         else:
             (instance,) = parser.AddModelsFromString(physics_sdf(object_class.sdf_path), "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
-        if object_class.shape is Shape.CYLINDER and not object_class.always_upright:
+        if object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
             radius = object_class.size[0] / 2
             rolling_inertia = 1.5 * object_class.mass * radius**2  # of a solid cylinder about its line of contact
             plant.AddJoint(

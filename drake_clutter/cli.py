@@ -1,0 +1,322 @@
+"""The command line. Drake is imported by the commands that need it, so that `doctor` runs where Drake is broken."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterable
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from drake_clutter.files import InputError, output_directory
+
+if TYPE_CHECKING:
+    from drake_clutter.scenes.scene_file import SceneFile
+    from drake_clutter.tasks.exploration import Step
+
+app = typer.Typer(
+    help="Clutter that is generated, judged, looked at and searched, on Drake.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+assets_app = typer.Typer(help="Build the models of object classes.", no_args_is_help=True)
+app.add_typer(assets_app, name="assets")
+
+_err = Console(stderr=True)
+_out = Console()
+
+
+class GeneratorName(Enum):
+    """Agents that generate scenes."""
+
+    RANDOM = "random"
+
+
+class ExplorerName(Enum):
+    """Agents that explore scenes."""
+
+    RANDOM = "random"
+    LARGEST_FIRST = "largest-first"
+    LARGEST_CLEAR = "largest-clear"
+
+
+class Fidelity(Enum):
+    """How moves are carried out."""
+
+    SETTLE = "settle"
+
+
+class Format(Enum):
+    """Formats that a scene can be exported to."""
+
+    DMD = "dmd"
+    SDF = "sdf"
+    MJCF = "mjcf"
+    GLB = "glb"
+
+
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A scene file.")]
+OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; new or empty.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same result.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
+CatalogueOption = Annotated[
+    Path | None, typer.Option("--catalogue", metavar="DIR", help="An asset folder with object classes of your own.")
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="YAML with the config's fields that differ from the defaults.")
+]
+ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")]
+NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
+
+
+def main() -> None:
+    """The console script: a user's mistake is one line and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        _err.print(f"[red]error[/red] {_plain(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        _err.print("stopped; what was finished is kept")
+        sys.exit(130)
+
+
+def _plain(text: str) -> str:
+    return text.replace("[", "\\[")
+
+
+def _print(fields: dict[str, Any], as_json: bool, title: str) -> None:
+    if as_json:
+        print(json.dumps(fields, indent=2))
+        return
+    table = Table("", "", title=title, show_header=False)
+    for key, value in fields.items():
+        if isinstance(value, float):
+            value = f"{value:.4g}"
+        elif isinstance(value, list | tuple) and value and isinstance(value[0], float):
+            value = " to ".join(f"{v:.4g}" for v in value)
+        elif isinstance(value, list | tuple):
+            value = ", ".join(str(v) for v in value) or "none"
+        elif isinstance(value, dict):
+            value = ", ".join(f"{v} {k}" for k, v in value.items()) or "none"
+        table.add_row(key.replace("_", " "), _plain(str(value)))
+    _out.print(table)
+
+
+def _load(scene: Path, catalogue: Path | None) -> "SceneFile":
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.scenes.scene_file import load_scene
+
+    return load_scene(scene, load_catalogue(catalogue))
+
+
+def _report(step: "Step") -> None:
+    found = f", found {', '.join(step.newly_found)}" if step.newly_found else ""
+    why = f" ({step.outcome.instability})" if step.outcome.instability else ""
+    _err.print(f"{step.move}: {step.outcome.result.value}{why}{found}", highlight=False)
+
+
+@app.command()
+def generate(
+    out: OutOption,
+    agent: Annotated[GeneratorName, typer.Option(help="Who chooses the rules.")] = GeneratorName.RANDOM,
+    objects: ObjectsOption = "ycb7",
+    nodes: NodesOption = 25,
+    count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
+    seed: SeedOption = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Local processes; the result is the same for any number.")] = 1,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Generate scenes, settle them in Drake and say which are stable and what they hide. A run that was stopped goes on."""
+    from drake_clutter.agents.generation import GenerationJob
+    from drake_clutter.commands import generate as command
+    from drake_clutter.config import load_config
+
+    job = GenerationJob(agent.value, objects, catalogue, nodes, seed, load_config(config))
+    columns = (TextColumn("scenes"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_err) as bar:
+
+        def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
+            return bar.track(made, total=total, completed=done)
+
+        summary = command.generate(job, count, out, workers, progress)
+    shown = {key: value for key, value in summary.items() if key != "config"}
+    _print(summary if as_json else shown, as_json, f"{out}")
+
+
+@app.command()
+def explore(
+    scene: SceneArgument,
+    out: OutOption,
+    agent: Annotated[ExplorerName, typer.Option(help="Who chooses the moves.")] = ExplorerName.LARGEST_CLEAR,
+    fidelity: Annotated[Fidelity, typer.Option(help="settle: objects are teleported, Drake settles what a move touched.")] = (
+        Fidelity.SETTLE
+    ),
+    max_moves: Annotated[int, typer.Option(min=1, help="Moves after which the search ends.")] = 10,
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Search a scene for what it hides; writes episode.json and a page, index.html."""
+    from drake_clutter.commands import explore as command
+    from drake_clutter.config import load_config
+
+    world, file = load_config(config), _load(scene, catalogue)
+    output_directory(out)
+    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, max_moves, seed, world, _report)
+    fields = command.write_episode(out, task, f"{agent.value} explores {scene.name}", agent.value, seed)
+    _print_episode(fields, as_json, out)
+
+
+def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
+    if as_json:
+        _print(fields, True, "")
+        return
+    shown = {key: fields[key] for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")}
+    _print(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
+
+
+@app.command()
+def move(
+    scene: SceneArgument,
+    out: OutOption,
+    pick: Annotated[str | None, typer.Option(help="Name of the object to pick.")] = None,
+    place: Annotated[str | None, typer.Option(help="Name of the object to put it on, or tray.")] = None,
+    moves: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}.")] = None,
+    fidelity: Annotated[Fidelity, typer.Option(help="settle: objects are teleported, Drake settles what a move touched.")] = (
+        Fidelity.SETTLE
+    ),
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
+    from drake_clutter.commands import explore as command
+    from drake_clutter.config import load_config
+    from drake_clutter.scenes.seams import Move
+
+    if (moves is None) == (pick is None) or (pick is None) != (place is None):
+        raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
+    chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
+    world, file = load_config(config), _load(scene, catalogue)
+    output_directory(out)
+    task = command.carry_out(command.at_rest(file.scene, world, seed), chosen, seed, world, _report)
+    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", seed)
+    _print_episode(fields, as_json, out)
+
+
+@app.command()
+def demo(
+    out: OutOption,
+    seed: SeedOption = 0,
+    nodes: NodesOption = 25,
+    as_json: JsonOption = False,
+) -> None:
+    """Generate a random scene that hides something, search it, and write a page to watch."""
+    from drake_clutter.commands import explore as command
+    from drake_clutter.config import ClutterConfig
+    from drake_clutter.scenes.scene_file import save_scene
+
+    world = ClutterConfig()
+    output_directory(out)
+    with _err.status("generating a stable scene that hides something"):
+        made = command.demo_scene(seed, nodes, world)
+    save_scene(out / "scene.yaml", made.scene, made.verdict)
+    start = made.scene.at(made.verdict.settled)
+    agent = ExplorerName.LARGEST_CLEAR.value
+    task = command.explore(start, agent, world.exploration.max_moves, seed, world, _report)
+    fields = command.write_episode(out, task, f"A random scene of {nodes} nodes, explored", agent, seed)
+    _print_episode(fields, as_json, out)
+
+
+@app.command()
+def view(
+    scene: SceneArgument,
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page instead of showing it live.")] = None,
+    laid_out: Annotated[bool, typer.Option("--laid-out", help="Show the objects as laid out, not as settled.")] = False,
+    catalogue: CatalogueOption = None,
+) -> None:
+    """Show a scene in the browser (Meshcat), or write it to one HTML file."""
+    from drake_clutter.reports.recording import serve, write_recording
+    from drake_clutter.scenes.seams import Frame
+
+    file = _load(scene, catalogue)
+    shown = file.scene if laid_out else file.settled_scene
+    if html is not None:
+        try:
+            write_recording(html, shown, [Frame(0.0, shown.poses)])
+        except OSError as error:
+            raise InputError(f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write") from error
+        _out.print(f"wrote {html}")
+        return
+    meshcat = serve(shown)
+    _out.print(f"{scene} is at {meshcat.web_url()}; Ctrl-C ends it")
+    while True:
+        typer.pause("")
+
+
+@app.command()
+def render(scene: SceneArgument, out: OutOption, catalogue: CatalogueOption = None, config: ConfigOption = None) -> None:
+    """Render what the overhead camera sees: color.png, depth.png (16 bit, 0.1 mm), label.png, visible.json, picture.png."""
+    from drake_clutter.commands.render import render_scene
+    from drake_clutter.config import load_config
+
+    world, file = load_config(config), _load(scene, catalogue)
+    output_directory(out)
+    shares = render_scene(file.settled_scene, world, out)
+    _print({name: round(share, 3) for name, share in shares.items()}, False, "visible share")
+
+
+@app.command()
+def export(
+    scene: SceneArgument,
+    out: OutOption,
+    format: Annotated[Format, typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer.")],
+    laid_out: Annotated[bool, typer.Option("--laid-out", help="Export the objects as laid out, not as settled.")] = False,
+    catalogue: CatalogueOption = None,
+) -> None:
+    """Export a scene to a self-contained folder."""
+    from drake_clutter.export import ExportFormat, export_scene
+
+    file = _load(scene, catalogue)
+    output_directory(out)
+    _out.print(f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}")
+
+
+@app.command()
+def doctor(as_json: JsonOption = False) -> None:
+    """Say what of Drake, EGL, solvers, torch and cores is there, and how to mend what is not."""
+    from drake_clutter.doctor import checks
+
+    found = checks()
+    if as_json:
+        print(json.dumps([dataclasses.asdict(check) for check in found], indent=2))
+    else:
+        table = Table("", "check", "found", "how to mend it")
+        for check in found:
+            remedy = "" if check.ok else _plain(check.remedy)
+            table.add_row("[green]ok" if check.ok else "[red]no", check.name, _plain(check.detail), remedy)
+        _out.print(table)
+    if not all(check.ok for check in found):
+        raise typer.Exit(1)
+
+
+@assets_app.command("build")
+def build(
+    folder: Annotated[Path, typer.Argument(help="An asset folder: it holds catalogue.yaml.")],
+    only: Annotated[list[str] | None, typer.Option("--class", help="Build this class alone; may be repeated.")] = None,
+) -> None:
+    """Build SDF models, collision pieces and textures of a catalogue's classes."""
+    from drake_clutter.assets import build_assets
+
+    for built in build_assets(folder, only):
+        _out.print(f"built {built}")

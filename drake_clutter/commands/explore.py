@@ -1,0 +1,149 @@
+"""`drake-clutter explore`, `move`, `demo`: moves in a scene, with `episode.json` and a page to watch."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drake_clutter.agents.exploration import EXPLORATION_AGENTS
+from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, write_json
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.reports.episode_page import write_episode_page
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.scenes.seams import Move
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
+
+Report = Callable[[Step], None]
+
+
+def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
+    """The scene as it settles.
+
+    Raises:
+        InputError: it is not stable, so there is nothing to explore.
+    """
+    verdict = DrakeJudge(config).judge(scene, item_rng(seed))
+    if verdict.instability is not None:
+        raise InputError(f"the scene is not stable: {verdict.instability}; allowed is one that stays as it is when it settles")
+    return scene.at(verdict.settled)
+
+
+def _task(scene: Scene, config: ClutterConfig, max_moves: int) -> ExplorationTask:
+    return ExplorationTask(scene, SettleExecutor(config), LabelDetector(config.camera), config.exploration, max_moves)
+
+
+def explore(scene: Scene, agent_name: str, max_moves: int, seed: int, config: ClutterConfig, report: Report) -> ExplorationTask:
+    """Plays an episode on a scene at rest.
+
+    Args:
+        scene: at rest.
+        agent_name: one of `EXPLORATION_AGENTS`.
+        max_moves: after which it ends.
+        seed: of the agent's and the world's chances.
+        config: the world.
+        report: called after each move.
+    """
+    task, agent, rng = _task(scene, config, max_moves), EXPLORATION_AGENTS[agent_name](), item_rng(seed)
+    while task.end is None:
+        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
+        if move is None:
+            break
+        report(task.step(move, rng))
+    return task
+
+
+def carry_out(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, report: Report) -> ExplorationTask:
+    """Carries a list of moves out, on a scene at rest, until one makes it collapse.
+
+    Raises:
+        InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
+    """
+    task, rng = _task(scene, config, len(moves)), item_rng(seed)
+    for number, move in enumerate(moves, start=1):
+        in_view = [d.name for d in task.look.observation.detections]
+        for role, name, allowed in (("pick", move.pick, in_view), ("place", move.place, [TRAY, *in_view])):
+            if name not in allowed or (role == "place" and name == move.pick):
+                known = "is not in view, or the object itself" if name in (*scene.names, TRAY) else "is not in the scene"
+                raise InputError(f"move {number}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}")
+        report(task.step(move, rng))
+        if task.end is EpisodeEnd.COLLAPSED:
+            break
+    return task
+
+
+def read_moves(path: Path) -> list[Move]:
+    """Moves from a YAML list of `{pick: NAME, place: NAME or tray}`.
+
+    Raises:
+        InputError: the file, the entry and what is allowed.
+    """
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as YAML ({error})") from error
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path}: allowed is a list of {{pick: NAME, place: NAME or {TRAY}}}")
+    moves = []
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict) or set(entry) != {"pick", "place"} or not all(isinstance(v, str) for v in entry.values()):
+            raise InputError(f"{path}[{index}]: {entry!r}; allowed is {{pick: NAME, place: NAME or {TRAY}}}")
+        moves.append(Move(entry["pick"], entry["place"]))
+    return moves
+
+
+def episode_fields(task: ExplorationTask, agent: str, seed: int) -> dict[str, Any]:
+    """The document of `episode.json`."""
+    end = task.end or EpisodeEnd.GAVE_UP
+    moves = []
+    for step in task.steps:
+        instability = step.outcome.instability
+        moves.append(
+            {
+                "move": {"pick": step.move.pick, "place": step.move.place},
+                "outcome": step.outcome.result.value,
+                "instability": str(instability) if instability else None,
+                "newly_found": list(step.newly_found),
+                "visible_share": step.look.visible_share,
+                "reward": step.reward,
+            }
+        )
+    return {
+        "agent": agent,
+        "seed": seed,
+        "fidelity": "settle",
+        "success": end is EpisodeEnd.ALL_FOUND,
+        "ended": end.value,
+        "objects": len(task.scene.objects),
+        "hidden_at_start": list(task.hidden_at_start),
+        "found": list(task.found),
+        "total_reward": sum(step.reward for step in task.steps),
+        "visible_share_at_start": task.first_look.visible_share,
+        "moves": moves,
+    }
+
+
+def write_episode(out: Path, task: ExplorationTask, title: str, agent: str, seed: int) -> dict[str, Any]:
+    """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds."""
+    fields = episode_fields(task, agent, seed)
+    save_scene(out / "after.yaml", task.scene)
+    write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
+    write_json(out / "episode.json", fields)
+    return fields
+
+
+def demo_scene(seed: int, nodes: int, config: ClutterConfig) -> GeneratedScene:
+    """The first stable scene of a seed that hides something an explorer could miss: at least two objects."""
+    generate = SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
+    index = 0
+    while True:
+        made = generate(index)
+        if len(made.verdict.hidden) >= 2:
+            return made
+        index += 1

@@ -1,0 +1,113 @@
+"""`drake-clutter generate`: a batch of scenes, resumable, in parallel, the same for any number of workers."""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator, summarise
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.files import InputError, output_directory, write_json
+from drake_clutter.grammar import NodeBudget
+from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
+from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_file import load_scene, save_scene
+from drake_clutter.scenes.seams import Verdict
+
+JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
+SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"
+
+
+@dataclass(frozen=True)
+class _Factory:
+    """Makes a worker; picklable."""
+
+    job: GenerationJob
+
+    def __call__(self) -> SceneGenerator:
+        return SceneGenerator(self.job)
+
+
+def _job_fields(job: GenerationJob) -> dict[str, Any]:
+    folder = str(job.catalogue_folder.resolve()) if job.catalogue_folder else None
+    return {**asdict(job), "catalogue_folder": folder}
+
+
+def generate(
+    job: GenerationJob, count: int, out: Path, workers: int, progress: Callable[[Iterable[Any], int, int], Iterable[Any]]
+) -> dict[str, Any]:
+    """Writes `scenes/0000.yaml`, ..., `summary.json` and `contact_sheet.png`.
+
+    A folder of the same job is taken up where it was left, and may be extended to a larger count.
+
+    Args:
+        job: what to generate.
+        count: scenes in the folder at the end.
+        out: the folder.
+        workers: local processes.
+        progress: wraps the scenes that are made, given how many are there and how many there will be.
+
+    Returns:
+        The summary.
+
+    Raises:
+        InputError: an option that is not allowed, or a folder that holds something else.
+    """
+    if count < 1:
+        raise InputError(f"--count {count}; allowed is 1 or more")
+    NodeBudget(job.nodes)
+    catalogue = load_catalogue(job.catalogue_folder)
+    for object_class in catalogue.object_set(job.objects):
+        _ = object_class.corners  # says what is missing before anything is written
+    output_directory(out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES}))
+    if (out / JOB_FILE).exists():
+        earlier = json.loads((out / JOB_FILE).read_text())
+        if earlier != json.loads(json.dumps(_job_fields(job))):
+            raise InputError(
+                f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
+            )
+    else:
+        output_directory(out)
+        write_json(out / JOB_FILE, _job_fields(job))
+    (out / SCENES).mkdir(exist_ok=True)
+    paths = [out / SCENES / f"{index:04d}.yaml" for index in range(count)]
+    # Scenes are written in order, so what is there is a beginning.
+    done = next((index for index, path in enumerate(paths) if not path.exists()), count)
+    earlier_run = json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
+    seconds, failures = float(earlier_run.get("seconds", 0.0)), Counter(earlier_run.get("layout_failures", {}))
+
+    start = time.monotonic()
+    made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers)
+    for index, result in enumerate(progress(made, done, count), start=done):
+        failures.update(result.layout_failures)
+        save_scene(paths[index], result.scene, result.verdict)
+        write_json(out / PROGRESS_FILE, {"seconds": seconds + time.monotonic() - start, "layout_failures": dict(failures)})
+    seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
+
+    files = [load_scene(path, catalogue) for path in paths]
+    judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
+    summary = summarise(job, judged)
+    summary |= {"layout_failures": dict(failures), "seconds": round(seconds, 2), "workers": workers, "config": asdict(job.config)}
+    write_json(out / SUMMARY_FILE, summary)
+    write_contact_sheet(out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])])
+    return summary
+
+
+_camera: PictureCamera | None = None
+
+
+def _thumbnail(index: int, scene: Scene, verdict: Verdict) -> tuple[NDArray[np.uint8], str, bool]:
+    """Picture, caption, and whether it is stable. An unstable scene is shown as it was laid out."""
+    global _camera
+    _camera = _camera or PictureCamera()
+    if verdict.instability is None:
+        return _camera.overhead(scene.at(verdict.settled)), f"{index:04d}  hidden {len(verdict.hidden)}", True
+    return _camera.overhead(scene), f"{index:04d}  {verdict.instability.reason.value}: {verdict.instability.object}", False

@@ -1,0 +1,70 @@
+"""Objects and scenes that the tests share; what is costly to make is made once for the whole run."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.grammar import Orientation, SceneGrammar, resting_rotation
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.judge import DrakeJudge
+
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
+
+CATALOGUE = load_catalogue()
+CLASSES = CATALOGUE.classes
+GRAMMARS = {name: SceneGrammar(CATALOGUE.object_set(name)) for name in ("ycb7", "pantry14")}
+
+
+def resting(
+    class_name: str,
+    orientation: Orientation = Orientation.FLAT_0,
+    xy: Sequence[float] = (0.0, 0.0),
+    floor: float = 0.0,
+    name: str = "",
+) -> SceneObject:
+    """An object of a shipped class in a resting pose, centred over xy (m), its lowest point at height `floor` (m)."""
+    object_class = CLASSES[class_name]
+    R_TO = resting_rotation(object_class, orientation)
+    lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
+    return SceneObject(name or class_name, object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest)))
+
+
+def scene_of(*objects: SceneObject, tray_side: float = 0.70) -> Scene:
+    """A scene without a graph."""
+    return Scene(objects, tray_side)
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    """A generator for what a test leaves to chance."""
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="session")
+def config() -> ClutterConfig:
+    """The default world."""
+    return ClutterConfig()
+
+
+@pytest.fixture(scope="session")
+def judge(config: ClutterConfig) -> DrakeJudge:
+    """One judge for all tests: none of its verdicts may depend on the earlier ones."""
+    return DrakeJudge(config)
+
+
+@pytest.fixture(scope="session")
+def detector(config: ClutterConfig) -> LabelDetector:
+    """One detector for all tests, for the same reason."""
+    return LabelDetector(config.camera)
+
+
+@pytest.fixture(scope="session")
+def camera(detector: LabelDetector) -> OverheadCamera:
+    """The detector's camera."""
+    return detector.camera

@@ -1,0 +1,257 @@
+"""Exported folders: moved elsewhere, and read back by the programs that they are for."""
+
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pybullet
+import pytest
+import trimesh
+from conftest import resting, scene_of
+from numpy.typing import NDArray
+from PIL import Image
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.assets import build_assets
+from drake_clutter.assets.contact import FRICTION
+from drake_clutter.catalogue import ObjectClass, load_catalogue
+from drake_clutter.export import ExportFormat, export_scene
+from drake_clutter.files import InputError
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.simulation.plant import rigid_transform
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
+MAIN_FILES = {
+    ExportFormat.DMD: "scene.dmd.yaml",
+    ExportFormat.SDF: "scene.sdf",
+    ExportFormat.MJCF: "scene.xml",
+    ExportFormat.GLB: "scene.glb",
+}
+REFERENCE = re.compile(r'<uri>(.*?)</uri>|file="(.*?)"|^mtllib (.*)$|^map_Kd (.*)$|^ *file: (.*)$', re.MULTILINE)
+BULLET = 1e-5
+
+
+@pytest.fixture(scope="module")
+def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
+    """The example's mesh class, with its origin away from its centre of mass."""
+    folder = tmp_path_factory.mktemp("user") / "custom_class"
+    folder.mkdir()
+    for name in ("catalogue.yaml", "mug.stl"):
+        shutil.copy(EXAMPLE / name, folder)
+    build_assets(folder)
+    return load_catalogue(folder).classes["mug"]
+
+
+@pytest.fixture(scope="module")
+def scene(mug: ObjectClass) -> Scene:
+    """A box that lies on a can (its pitch is a right angle), a can of the same class, a lying marker, a turned mug."""
+    can = resting("tomato_soup_can", Orientation.UPRIGHT_0, (0.1, 0.1))
+    box = resting("sugar_box", xy=(0.1, 0.1), floor=can.top)
+    tilted = Pose.of(Rotation.from_euler("zyx", [0.4, np.pi / 2, 0.0]).as_matrix(), (-0.1, -0.1, 0.009))
+    turned = Pose.of(Rotation.from_euler("z", 2.0).as_matrix(), (0.2, -0.15, mug.size[2] / 2))
+    return scene_of(
+        can,
+        resting("tomato_soup_can", Orientation.UPRIGHT_0, (-0.1, 0.15), name="another can-2.1 ü"),
+        box,
+        SceneObject("marker", resting("large_marker").object_class, tilted),
+        SceneObject("mug", mug, turned),
+        tray_side=0.65,
+    )
+
+
+@pytest.fixture(scope="module", params=ExportFormat, ids=lambda format: format.value)
+def exported(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[ExportFormat, Path]:
+    """The format and the main file of an export that was moved after it was written."""
+    format: ExportFormat = request.param
+    out = tmp_path_factory.mktemp("export") / "before"
+    out.mkdir()
+    main_file = export_scene(scene, format, out)
+    assert main_file == out / MAIN_FILES[format]
+    after = tmp_path_factory.mktemp("moved") / "after"
+    return format, shutil.move(out, after) / main_file.name
+
+
+def X_of(pose: Pose) -> NDArray[np.float64]:
+    """The pose as a matrix, (4, 4)."""
+    return np.asarray(rigid_transform(pose).GetAsMatrix4())
+
+
+def check(scene: Scene, name: str, mass: float | None, X_TO: NDArray[np.float64], tolerance: float = 1e-6) -> None:
+    """Mass (kg) and pose (4, 4) that a program read are the scene's; m and rad."""
+    assert pytest.approx(X_of(scene[name].X_TO), abs=tolerance) == X_TO, name
+    assert mass is None or mass == pytest.approx(scene[name].object_class.mass, abs=1e-6), name
+
+
+def check_in_drake(scene: Scene, main_file: Path, package_xml: Path | None) -> None:
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.001)
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    if package_xml:
+        parser.package_map().AddPackageXml(str(package_xml))
+    parser.AddModels(str(main_file))
+    plant.Finalize()
+    assert plant.num_bodies() == 2 + len(scene.objects)  # the world, the tray
+    assert plant.num_positions() == 7 * len(scene.objects)
+    context = plant.CreateDefaultContext()
+    for name in scene.names:
+        body = plant.GetBodyByName("body", plant.GetModelInstanceByName(name))
+        check(scene, name, body.default_mass(), body.EvalPoseInWorld(context).GetAsMatrix4())
+        inspector = scene_graph.model_inspector()
+        for geometry in plant.GetCollisionGeometriesForBody(body):
+            friction = inspector.GetProximityProperties(geometry).GetProperty("material", "coulomb_friction")
+            assert friction.static_friction() == friction.dynamic_friction() == FRICTION
+            assert inspector.GetProximityProperties(geometry).HasProperty("hydroelastic", "hydroelastic_modulus")
+
+
+@pytest.fixture
+def bullet() -> Iterator[int]:
+    client = pybullet.connect(pybullet.DIRECT)
+    yield client
+    pybullet.disconnect(client)
+
+
+def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
+    bodies = pybullet.loadSDF(str(main_file), physicsClientId=client)
+    names = [pybullet.getBodyInfo(body, physicsClientId=client)[1].decode() for body in bodies]
+    assert names == ["tray", *scene.names]
+    assert pybullet.getDynamicsInfo(bodies[0], -1, physicsClientId=client)[0] == 0  # it is static
+    for body, name in list(zip(bodies, names, strict=True))[1:]:
+        dynamics = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
+        X_OI, X_TI = np.eye(4), np.eye(4)
+        for X, (p, q) in ((X_OI, dynamics[3:5]), (X_TI, pybullet.getBasePositionAndOrientation(body, physicsClientId=client))):
+            X[:3, :3], X[:3, 3] = Rotation.from_quat(q).as_matrix(), p
+        check(scene, name, dynamics[0], X_TI @ np.linalg.inv(X_OI), BULLET)
+        (visual,) = pybullet.getVisualShapeData(body, pybullet.VISUAL_SHAPE_DATA_TEXTURE_UNIQUE_IDS, physicsClientId=client)
+        assert visual[8] >= 0, f"{name} has no texture"
+        low, high = pybullet.getAABB(body, -1, physicsClientId=client)
+        extents = scene[name].bounds_T
+        assert np.all(np.array(low) < extents[0] + BULLET)
+        assert np.all(np.array(high) > extents[1] - BULLET)
+        assert np.all(np.subtract(high, low) < extents[1] - extents[0] + 0.08)  # Bullet's boxes around boxes are wide
+    for _ in range(24):
+        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+        pybullet.stepSimulation(physicsClientId=client)
+    for body, name in list(zip(bodies, names, strict=True))[1:]:
+        assert pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0][2] == pytest.approx(
+            scene[name].X_TO.p[2], abs=0.015
+        )
+
+
+def check_in_mujoco(scene: Scene, main_file: Path) -> None:
+    model = mujoco.MjModel.from_xml_path(str(main_file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.nbody == 2 + len(scene.objects)
+    assert model.nq == 7 * len(scene.objects)
+    assert model.ntex == 4
+    for name in scene.names:
+        body = model.body(name)
+        X_TO = np.eye(4)
+        X_TO[:3, :3], X_TO[:3, 3] = data.body(name).xmat.reshape(3, 3), data.body(name).xpos
+        check(scene, name, float(body.mass[0]), X_TO)
+        geoms = [model.geom(index) for index in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])]
+        visuals = [geom for geom in geoms if geom.group[0] == 2]
+        contacts = [geom for geom in geoms if geom.group[0] == 3]
+        assert [int(geom.contype[0]) for geom in visuals] == [0]
+        assert model.mat_texid[visuals[0].matid[0]].max() >= 0
+        assert len(contacts) == len(scene[name].object_class.convex_pieces)
+        assert all(geom.friction[0] == FRICTION for geom in contacts)
+    com, inertia = model.body("mug").ipos, model.body("mug").inertia
+    assert -0.02 < com[0] < -0.005  # away from the handle
+    assert np.all(inertia > 1e-4)
+    before = data.xpos.copy()
+    mujoco.mj_step(model, data, 200)
+    assert np.abs(data.xpos - before)[:, 2].max() < 0.002
+
+
+def check_in_trimesh(scene: Scene, main_file: Path) -> None:
+    picture = trimesh.load_scene(main_file)
+    assert set(picture.graph.nodes_geometry) == set(scene.names) | {
+        f"tray/{part}" for part in ("floor", "rim_front", "rim_back", "rim_left", "rim_right")
+    }
+    y_up, _ = picture.graph.get("tray_frame")
+    assert y_up @ [0, 0, 1, 0] == pytest.approx([0, 1, 0, 0])
+    for name in scene.names:
+        X_TO, geometry = picture.graph.get(name, "tray_frame")
+        check(scene, name, None, X_TO)
+        mesh = picture.geometry[geometry]
+        assert isinstance(mesh.visual.material.baseColorTexture, Image.Image)
+        low, high = trimesh.bounds.corners(mesh.bounds)[[0, 6]]
+        assert high - low == pytest.approx(scene[name].object_class.size, abs=1e-4)
+    assert picture.bounds[1] - picture.bounds[0] == pytest.approx(
+        np.array([0.666, 0.01 + scene["sugar_box"].top, 0.666]), abs=1e-4
+    )
+
+
+def test_reads_back(exported: tuple[ExportFormat, Path], scene: Scene, bullet: int) -> None:
+    format, main_file = exported
+    if format is ExportFormat.DMD:
+        check_in_drake(scene, main_file, main_file.parent / "package.xml")
+    elif format is ExportFormat.SDF:
+        check_in_drake(scene, main_file, None)
+        check_in_pybullet(scene, main_file, bullet)
+    elif format is ExportFormat.MJCF:
+        check_in_mujoco(scene, main_file)
+    else:
+        check_in_trimesh(scene, main_file)
+
+
+def test_refers_to_nothing_outside(exported: tuple[ExportFormat, Path], scene: Scene) -> None:
+    _, main_file = exported
+    folder = main_file.parent
+    references = 0
+    for file in (file for file in folder.rglob("*") if file.is_file()):
+        assert not file.is_symlink()
+        text = file.read_text(encoding="utf-8", errors="ignore")
+        for groups in REFERENCE.findall(text):
+            (reference,) = (group.strip() for group in groups if group)
+            root = folder if reference.startswith("package://") or file == main_file else file.parent
+            target = root / reference.removeprefix("package://drake_clutter_scene/")
+            assert target.is_file(), f"{file}: {reference}"
+            assert target.resolve().is_relative_to(folder.resolve()), f"{file}: {reference}"
+            references += 1
+        assert "file:" not in text.replace("    file: package:", "")
+        for scene_object in scene.objects:
+            assert str(scene_object.object_class.folder.parent) not in text
+    assert references >= len(scene.objects) or main_file.suffix == ".glb"
+
+
+def test_textures_are_the_labels(exported: tuple[ExportFormat, Path]) -> None:
+    format, main_file = exported
+    pictures = list(main_file.parent.rglob("*.png"))
+    assert len(pictures) == (4 if format in (ExportFormat.SDF, ExportFormat.MJCF) else 0)
+    for picture in pictures:
+        with Image.open(picture) as image:
+            assert len(image.getcolors(1 << 20) or ()) > 20
+
+
+@pytest.mark.parametrize("name", ["tray", "world", "tray_frame", "__can__", "a/b", "../can", "a::b", "can ", "<can>"])
+def test_refuses_names(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(repr(name))):
+        export_scene(scene_of(resting("sugar_box", name=name)), ExportFormat.MJCF, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("format", ExportFormat)
+def test_failure_leaves_an_empty_folder(format: ExportFormat, tmp_path: Path) -> None:
+    sugar = resting("sugar_box")
+    unbuilt = replace(sugar.object_class, name="unbuilt", folder=tmp_path / "unbuilt")
+    out = tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(InputError, match=r"unbuilt has no assets; run `drake-clutter assets build"):
+        export_scene(scene_of(replace(sugar, object_class=unbuilt)), format, out)
+    assert not list(out.iterdir())
+    shutil.copytree(sugar.object_class.folder, unbuilt.folder)
+    (unbuilt.folder / "visual.gltf").unlink()
+    if format is not ExportFormat.DMD:  # which only copies
+        with pytest.raises(Exception, match=r"visual\.gltf"):
+            export_scene(scene_of(sugar, replace(sugar, name="second", object_class=unbuilt)), format, out)
+        assert not list(out.iterdir())

@@ -1,0 +1,205 @@
+"""Penetration against cases computed by hand, against Drake, and against points; groups of objects that may touch."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import CLASSES, resting, rng
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.geometry import deepest_penetration, penetration, touching_groups
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.plant import add_scene_plant
+
+CRACKER, SUGAR = np.array([0.060, 0.160, 0.230]), np.array([0.038, 0.089, 0.175])
+
+
+def turned(class_name: str, axis: str, degrees: float, translation: tuple[float, float, float], name: str = "b") -> SceneObject:
+    """An object turned about one axis of the tray."""
+    rotation = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return SceneObject(name, CLASSES[class_name], Pose.of(rotation, translation))
+
+
+def both_ways(first: SceneObject, second: SceneObject) -> float:
+    """The penetration, which is the same in either order."""
+    depth = penetration(first, second)
+    assert penetration(second, first) == pytest.approx(depth, abs=1e-12)
+    return depth
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("depth", [0.003, 0.0, -0.005])
+def test_two_boxes_side_by_side(axis: int, depth: float) -> None:
+    offset = np.zeros(3)
+    offset[axis] = (CRACKER[axis] + SUGAR[axis]) / 2 - depth
+    first, second = turned("cracker_box", "z", 0, (0, 0, 0)), turned("sugar_box", "z", 0, (0, 0, 0))
+    second = SceneObject("b", second.object_class, second.X_TO.moved(offset))
+    assert both_ways(first, second) == pytest.approx(depth, abs=1e-12)
+
+
+def test_a_box_inside_another_is_as_deep_as_its_way_out() -> None:
+    """The shortest way out of the middle is along the thin sides: half of each."""
+    first, second = turned("cracker_box", "z", 0, (0, 0, 0)), turned("sugar_box", "z", 0, (0, 0, 0))
+    assert both_ways(first, second) == pytest.approx((0.060 + 0.038) / 2)
+
+
+@pytest.mark.parametrize("depth", [0.002, 0.0005, -0.0005])
+def test_edge_on_edge(depth: float) -> None:
+    """Two boxes on their edges, crossed: the lower one's edge along x, the upper one's along y, the middles over each other."""
+    half = math.sqrt(0.5) / 2
+    lower = turned("cracker_box", "x", 45, (0, 0, 0))  # its highest edge is where y = half * (160 - 230 mm)
+    height = half * (0.160 + 0.230) + half * (0.038 + 0.175)
+    upper = turned("sugar_box", "y", 45, (half * (0.175 - 0.038), half * (0.160 - 0.230), height - depth))
+    assert both_ways(lower, upper) == pytest.approx(depth, abs=1e-9)
+
+
+@pytest.mark.parametrize("gap", [0.001, -0.001])
+def test_a_gap_that_the_axis_aligned_boxes_do_not_see(gap: float) -> None:
+    """Two boxes turned by 45 degrees, face to face: their axis-aligned boxes overlap far, they are 1 mm apart."""
+    away = (0.060 + gap) * math.sqrt(0.5)
+    first, second = turned("cracker_box", "z", 45, (0, 0, 0)), turned("cracker_box", "z", 45, (away, away, 0))
+    assert (second.bounds_T[0] < first.bounds_T[1]).all()
+    assert both_ways(first, second) == pytest.approx(-gap, abs=1e-12)
+
+
+@pytest.mark.parametrize("depth", [0.003, 0.0, -0.002])
+def test_a_corner_against_a_face(depth: float) -> None:
+    """A box turned by 45 degrees about z points a corner, half its diagonal away, at another's face."""
+    reach = (0.038 + 0.089) / 2 * math.sqrt(0.5)
+    first = turned("cracker_box", "z", 0, (0, 0, 0))
+    second = turned("sugar_box", "z", 45, (0.030 + reach - depth, 0, 0))
+    assert both_ways(first, second) == pytest.approx(depth, abs=1e-12)
+
+
+@pytest.mark.parametrize("depth", [0.003, 0.0, -0.002])
+def test_a_can_beside_a_box(depth: float) -> None:
+    """Its 32-sided prism has a corner on its x axis."""
+    can = resting("master_chef_can", name="can")
+    box = turned("cracker_box", "z", 0, (0.051 + 0.030 - depth, 0, 0.115))
+    assert both_ways(can, box) == pytest.approx(depth, abs=1e-12)
+
+
+def test_a_turned_can_reads_at_most_half_a_percent_of_its_radius_too_small() -> None:
+    box = turned("cracker_box", "z", 0, (0.051 + 0.030 - 0.003, 0, 0.0))
+    depths = [both_ways(turned("master_chef_can", "z", angle, (0, 0, 0), "can"), box) for angle in np.linspace(0, 12, 25)]
+    assert max(depths) == pytest.approx(0.003)
+    assert 0.003 - 0.005 * 0.051 < min(depths) < 0.003 - 0.004 * 0.051
+
+
+def test_a_can_on_a_can() -> None:
+    lower = resting("tomato_soup_can", name="lower")
+    assert both_ways(lower, resting("tomato_soup_can", floor=0.101, name="upper")) == pytest.approx(0, abs=1e-12)
+    assert both_ways(lower, resting("tomato_soup_can", floor=0.099, name="upper")) == pytest.approx(0.002)
+
+
+def random_pairs(names: tuple[str, str], count: int, reach: float) -> list[tuple[SceneObject, SceneObject]]:
+    """Two objects near each other, turned any way."""
+    generator = rng(1)
+    pairs = []
+    for _ in range(count):
+        poses = [Pose.of(Rotation.random(rng=generator).as_matrix(), generator.uniform(0, reach, 3)) for _ in names]
+        pairs.append(
+            (SceneObject("a", CLASSES[names[0]], poses[0]), SceneObject("b", CLASSES[names[1]], poses[1].moved((0, 0, 1.0))))
+        )
+    return [(a, SceneObject("b", b.object_class, b.X_TO.moved((0, 0, -1.0)))) for a, b in pairs]
+
+
+@pytest.mark.parametrize("names", [("cracker_box", "sugar_box"), ("sugar_box", "pasta_box"), ("gelatin_box", "gelatin_box")])
+def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
+    builder = DiagramBuilder()
+    scene_plant = add_scene_plant(builder, [("a", CLASSES[names[0]]), ("b", CLASSES[names[1]])], 0.7, 0.01, visuals=False)
+    scene_plant.plant.Finalize()
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    context = scene_plant.plant.GetMyContextFromRoot(root)
+    geometries = {
+        int(scene_plant.plant.GetCollisionGeometriesForBody(body)[0].get_value()) for body in scene_plant.bodies.values()
+    }
+    overlapping = apart = 0
+    for a, b in random_pairs(names, 200, 0.15):
+        lifted = [SceneObject(o.name, o.object_class, o.X_TO.moved((0, 0, 1.0))) for o in (a, b)]  # off the tray
+        scene_plant.set_poses(context, lifted)
+        query = scene_plant.scene_graph.get_query_output_port().Eval(scene_plant.scene_graph.GetMyContextFromRoot(root))
+        reported = [
+            pair.depth
+            for pair in query.ComputePointPairPenetration()
+            if {int(pair.id_A.get_value()), int(pair.id_B.get_value())} == geometries
+        ]
+        depth = both_ways(a, b)
+        assert bool(reported) == (depth > 0)
+        if reported:
+            overlapping += 1
+            # Drake's box-box query takes an edge-edge axis only if it is 5 % better than the best face: never less deep.
+            assert depth - 1e-9 <= reported[0] <= 1.05 * depth + 1e-9
+        else:
+            apart += 1
+    assert min(overlapping, apart) > 20
+
+
+@pytest.mark.parametrize("names", [("tomato_soup_can", "cracker_box"), ("large_marker", "large_marker")])
+def test_moving_a_cylinder_out_by_the_depth_parts_it(names: tuple[str, str]) -> None:
+    """Points inside both objects prove an overlap; moved apart along some direction by a bit more than the depth, none is left."""
+    generator = rng(2)
+    overlapping = 0
+    for a, b in random_pairs(names, 40, 0.06):
+        depth = both_ways(a, b)
+        shared = bool(inside(b, a.X_TO.apply(points_inside(a, generator))).any())
+        assert not (shared and depth < 0)
+        if depth > 0.002 and overlapping < 6:
+            overlapping += 1
+            assert parted(a, b, 1.1 * depth)
+            assert not parted(a, b, 0.9 * depth)
+    assert overlapping > 3
+
+
+def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
+    """Whether moving b by the distance (m) parts the two in one of 150 directions, nowhere more than 0.2 rad from the next."""
+    index = np.arange(150)
+    height, angle = 1 - (2 * index + 1) / 150, index * math.pi * (3 - math.sqrt(5))
+    ring = np.sqrt(1 - height**2)
+    directions = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
+    return any(penetration(a, SceneObject("b", b.object_class, b.X_TO.moved(distance * d))) < 0 for d in directions)
+
+
+def points_inside(o: SceneObject, generator: np.random.Generator) -> np.ndarray:
+    """(N, 3) m in O, within the cylinder, a bit inside the prism that stands for it."""
+    radius, half = 0.99 * o.object_class.size[0] / 2, o.object_class.size[2] / 2
+    angle, distance = generator.uniform(0, 2 * math.pi, 2000), radius * np.sqrt(generator.uniform(size=2000))
+    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), generator.uniform(-half, half, 2000)])
+
+
+def inside(o: SceneObject, p_T: np.ndarray) -> np.ndarray:
+    """(N,) whether points in the tray frame lie in a box, or in a cylinder of 99 % the radius."""
+    p_O = (p_T - o.X_TO.p) @ o.X_TO.rotation
+    half = np.asarray(o.object_class.size) / 2
+    if o.object_class.shape.value == "box":
+        return np.asarray((np.abs(p_O) < half).all(axis=1))
+    return np.asarray((np.hypot(p_O[:, 0], p_O[:, 1]) < 0.99 * half[0]) & (np.abs(p_O[:, 2]) < half[2]))
+
+
+def test_deepest_penetration_names_the_two() -> None:
+    a, b, c = (resting("sugar_box", xy=(x, 0), name=name) for name, x in (("a", 0.0), ("b", 0.172), ("c", 0.340)))
+    depth, *names = deepest_penetration([a, b, c])
+    assert depth == pytest.approx(0.007)
+    assert names == ["b", "c"]
+    assert deepest_penetration([a, c])[0] == pytest.approx(-0.165)
+    assert deepest_penetration([a]) == (-np.inf, "", "")
+
+
+def names_of(groups: list[list[SceneObject]]) -> list[list[str]]:
+    return [[o.name for o in group] for group in groups]
+
+
+def test_touching_groups() -> None:
+    """A chain through neighbours within the margin is one group; order is the scene's."""
+    chain = [
+        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=name) for name, x in (("a", 0.0), ("c", 0.1825), ("b", 0.091))
+    ]
+    high = resting("gelatin_box", xy=(0.0, 0.0), floor=0.0405, name="above a")
+    far = resting("gelatin_box", xy=(0.0, 0.3), name="far")
+    groups = touching_groups([*chain, far, high], 0.003)
+    assert names_of(groups) == [["a", "c", "b", "above a"], ["far"]]
+    assert names_of(touching_groups([*chain, far, high], 0.0005)) == [["a"], ["c"], ["b"], ["far"], ["above a"]]
+    assert touching_groups([], 0.003) == []

@@ -1,0 +1,218 @@
+"""From graphs to poses: nothing penetrates, everything rests on what carries it, gaps and caps hold."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CLASSES, GRAMMARS, rng
+
+from drake_clutter.config import LayoutConfig
+from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
+from drake_clutter.grammar.graph import DUMMY
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.geometry import deepest_penetration
+from drake_clutter.scenes.layout import LayoutFailure, LayoutFailureReason, lay_out
+from drake_clutter.scenes.scene import Scene, SceneObject
+
+RANDOM_SCENES = 2000
+"""`benchmarks/check_layout.py` checks 10,000 alike; here they would take minutes."""
+ROUNDING = 1e-9
+
+
+def derived(*rules: str) -> Derivation:
+    return Derivation(GRAMMARS["pantry14"].replay(rules), rules)
+
+
+def laid_out(derivation: Derivation, config: LayoutConfig | None = None, seed: int = 0) -> Scene:
+    scene = lay_out(derivation, CLASSES, config or LayoutConfig(), rng(seed))
+    assert isinstance(scene, Scene), str(scene)
+    return scene
+
+
+def random_layout(index: int) -> Scene | LayoutFailure:
+    """The layout of a random graph of 3 to 25 nodes, of either object set, under a seed of its own."""
+    generator = item_rng(2022, index)
+    grammar = GRAMMARS["ycb7" if index % 2 else "pantry14"]
+    derivation = grammar.derive(NodeBudget(int(generator.integers(3, 26))), uniform_choice(generator))
+    return lay_out(derivation, grammar.classes, LayoutConfig(), generator)
+
+
+def carriers(graph: ClutterGraph, node: int) -> list[int]:
+    """The objects that carry a node: its parent, or the two of a pair; empty for what stands on the tray."""
+    (parent, *_) = graph.nx.predecessors(node)
+    if parent == ClutterGraph.TRAY_NODE:
+        return []
+    return list(graph.nx.predecessors(parent)) if graph.kind(parent) == DUMMY else [parent]
+
+
+def twins(graph: ClutterGraph) -> list[tuple[int, int]]:
+    """The two objects of every pair."""
+    return [
+        (one, other)
+        for node, kind in graph.nx.nodes(data="kind")
+        if kind == DUMMY
+        for one, other in [graph.nx.predecessors(node)]
+    ]
+
+
+def check_scene(scene: Scene, config: LayoutConfig) -> None:
+    """Asserts everything that the layout promises of a scene."""
+    assert scene.graph is not None
+    objects = {o.node: o for o in scene.objects}
+    assert sorted(objects) == sorted(node for node, _ in scene.graph.objects())
+    depth, first, second = deepest_penetration(scene.objects)
+    assert depth <= ROUNDING, f"{first} and {second}"
+    paired = twins(scene.graph)
+    for o in scene.objects:
+        assert o.node is not None
+        below = [objects[node] for node in carriers(scene.graph, o.node)]
+        lower, upper = o.bounds_T
+        assert abs(lower[2] - max((b.top for b in below), default=0.0)) < ROUNDING
+        assert np.abs(o.bounds_T).max(axis=0)[:2].max() <= config.tray_side / 2 - config.stack_gap + ROUNDING
+        assert upper[2] <= config.max_stack_height
+        if below:
+            own = [objects[node] for pair in paired if o.node in pair for node in pair] or [o]
+            middle = np.mean([b.X_TO.p[:2] for b in own], axis=0)
+            assert middle == pytest.approx(np.mean([b.X_TO.p[:2] for b in below], axis=0), abs=ROUNDING)
+    for one, other in paired:
+        a, b = sorted((objects[one], objects[other]), key=lambda o: o.X_TO.p[1])
+        lying = scene.graph.edge_kind(one, scene.graph.children(one)[0]) is Orientation.FLAT_0
+        assert b.bounds_T[0][1] - a.bounds_T[1][1] == pytest.approx(
+            config.lying_gap if lying else config.standing_gap, abs=ROUNDING
+        )
+        assert a.X_TO.p[0] == b.X_TO.p[0]
+    for (lower_a, upper_a), (lower_b, upper_b) in footprints(scene):
+        assert np.maximum(lower_a - upper_b, lower_b - upper_a).max() >= config.stack_gap - ROUNDING
+
+
+def footprints(scene: Scene) -> list[tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]]:
+    """The axis-aligned footprints of every two stacks."""
+    assert scene.graph is not None
+    stack_of: dict[int, int] = {}
+    for node in scene.graph.breadth_first():
+        if node in {o.node for o in scene.objects}:
+            below = carriers(scene.graph, node)
+            pair = next((pair for pair in twins(scene.graph) if node in pair), (node,))
+            stack_of[node] = stack_of[below[0]] if below else min(pair)
+    stacks: dict[int, list[SceneObject]] = {}
+    for o in scene.objects:
+        assert o.node is not None
+        stacks.setdefault(stack_of[o.node], []).append(o)
+    boxes = [
+        (np.min([o.bounds_T[0][:2] for o in s], axis=0), np.max([o.bounds_T[1][:2] for o in s], axis=0)) for s in stacks.values()
+    ]
+    return [(a, b) for index, a in enumerate(boxes) for b in boxes[:index]]
+
+
+def test_random_scenes_keep_every_promise() -> None:
+    results = Counter[str]()
+    for index in range(RANDOM_SCENES):
+        scene = random_layout(index)
+        if isinstance(scene, LayoutFailure):
+            results[scene.reason.name] += 1
+            assert scene.amount > scene.limit or scene.reason is LayoutFailureReason.NO_ROOM
+        else:
+            results["laid out"] += 1
+            check_scene(scene, LayoutConfig())
+    assert results["laid out"] > 0.6 * RANDOM_SCENES
+
+
+def test_a_stack_by_hand() -> None:
+    """Soup can 101 mm, cracker box flat 60 mm, marker 18 mm: the heights add up, the centres lie above each other."""
+    scene = laid_out(
+        derived(
+            *("drop_object", "stack_object", "stack_object", "end"),
+            *("insert_tomato_soup_can", "insert_cracker_box", "insert_large_marker"),
+            *("orient_flat_0", "orient_flat_0", "orient_flat_90"),
+        )
+    )
+    can, box, marker = scene.objects
+    assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx([0.0505, 0.131, 0.170])
+    assert marker.top == pytest.approx(0.179)
+    for o in (box, marker):
+        assert o.X_TO.p[:2] == pytest.approx(can.X_TO.p[:2])
+    assert box.bounds_T[1] - box.bounds_T[0] == pytest.approx([0.230, 0.160, 0.060])
+    assert marker.bounds_T[1] - marker.bounds_T[0] == pytest.approx([0.018, 0.121, 0.018], abs=1e-4)
+    assert [o.name for o in scene.objects] == ["tomato_soup_can_1", "cracker_box_2", "large_marker_3"]
+
+
+@pytest.mark.parametrize(
+    ("rule", "gap", "thickness"),
+    [
+        ("insert_meta_sugar_box_1", 0.002, 0.089),  # lying: 175 along x, 89 across
+        ("insert_meta_sugar_box_2", 0.040, 0.038),  # standing: 89 along x, 38 across
+        ("insert_meta_tomato_soup_can_1", 0.040, 0.066),
+        ("insert_meta_large_marker_1", 0.002, 0.018),
+    ],
+)
+def test_a_pair_by_hand(rule: str, gap: float, thickness: float) -> None:
+    scene = laid_out(derived("drop_object", "stack_object", "end", rule, "insert_gelatin_box", "orient_flat_0"))
+    one, other = (o for o in scene.objects if o.object_class.name != "gelatin_box")
+    carried = scene.objects[-1]
+    assert abs(one.X_TO.p - other.X_TO.p) == pytest.approx([0.0, thickness + gap, 0.0], abs=1e-4)
+    assert carried.X_TO.p[:2] == pytest.approx((one.X_TO.p[:2] + other.X_TO.p[:2]) / 2)
+    assert carried.bounds_T[0][2] == pytest.approx(one.top)
+
+
+def tower(count: int) -> Derivation:
+    """Cracker boxes on end, 230 mm each."""
+    inserted = ["insert_cracker_box"] * count + ["orient_upright_0"] * count
+    return derived("drop_object", *["stack_object"] * (count - 1), "end", *inserted)
+
+
+def test_too_high() -> None:
+    assert laid_out(tower(2)).objects[-1].top == pytest.approx(0.46)
+    failure = lay_out(tower(3), CLASSES, LayoutConfig(), rng())
+    assert failure == LayoutFailure(LayoutFailureReason.TOO_HIGH, pytest.approx(0.69), 0.50)
+    assert str(failure) == "stack too high: 0.69, at most 0.5"
+    lower_cap = lay_out(tower(2), CLASSES, replace(LayoutConfig(), max_stack_height=0.45), rng())
+    assert isinstance(lower_cap, LayoutFailure)
+    assert lower_cap.reason is LayoutFailureReason.TOO_HIGH
+
+
+BOX_ON_TRAY = ("drop_object", "end", "insert_cracker_box", "orient_flat_0")
+
+
+@pytest.mark.parametrize(
+    ("count", "side"),
+    [
+        (1, 0.24),  # 230 mm and two gaps of 10 mm
+        (14, 0.70),  # 14 times 230 mm x 160 mm is more than the tray
+    ],
+)
+def test_no_room(count: int, side: float) -> None:
+    config = replace(LayoutConfig(), tray_side=side, placement_tries=20)
+    failure = lay_out(derived(*BOX_ON_TRAY * count), CLASSES, config, rng())
+    assert isinstance(failure, LayoutFailure)
+    assert failure.reason is LayoutFailureReason.NO_ROOM
+    assert failure.amount == pytest.approx(count * 0.230 * 0.160)
+
+
+def test_the_smallest_tray_that_holds_a_box() -> None:
+    config = replace(LayoutConfig(), tray_side=0.2501)
+    (box,) = laid_out(derived(*BOX_ON_TRAY), config).objects
+    assert abs(box.X_TO.p[0]) <= 0.00005 + ROUNDING
+
+
+def test_the_same_seed_gives_the_same_layout() -> None:
+    derivation = GRAMMARS["ycb7"].derive(NodeBudget(20), uniform_choice(rng(3)))
+    again = GRAMMARS["ycb7"].derive(NodeBudget(20), uniform_choice(rng(3)))
+    assert again.rules == derivation.rules
+    assert laid_out(again, seed=1).objects == laid_out(derivation, seed=1).objects
+    assert laid_out(derivation, seed=2).objects != laid_out(derivation, seed=1).objects
+    assert laid_out(derivation).derivation == derivation.rules
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_stacks_are_spread_over_the_whole_tray(axis: int) -> None:
+    """Uniform over the places that are allowed: the mean and the spread of 400 draws."""
+    derivation = derived("drop_object", "end", "insert_tomato_soup_can", "orient_flat_0")
+    draw: Callable[[int], float] = lambda seed: float(laid_out(derivation, seed=seed).objects[0].X_TO.p[axis])
+    drawn = np.array([draw(seed) for seed in range(400)])
+    reach = 0.35 - 0.010 - 0.033
+    assert abs(drawn).max() <= reach + ROUNDING
+    assert abs(drawn).max() > 0.98 * reach
+    assert abs(drawn.mean()) < 4 * reach / np.sqrt(3 * 400)
+    assert drawn.std() == pytest.approx(reach / np.sqrt(3), rel=0.1)

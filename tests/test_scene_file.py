@@ -1,0 +1,385 @@
+"""Scene files: exact round trips; every broken file is refused with its name and the field."""
+
+import copy
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from conftest import CATALOGUE, CLASSES, GRAMMARS, resting, rng, scene_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drake_clutter.config import LayoutConfig
+from drake_clutter.files import InputError
+from drake_clutter.grammar import NodeBudget, uniform_choice
+from drake_clutter.grammar.graph import OBJECT_SLOT
+from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene_file import SceneFile, load_scene, save_scene, scene_fields
+from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
+
+Path_ = tuple[str | int, ...]
+GONE = object()
+
+
+def random_scene(seed: int, nodes: int = 12) -> Scene:
+    """The first of a seed's random graphs that can be laid out."""
+    generator = rng(seed)
+    while True:
+        derivation = GRAMMARS["pantry14"].derive(NodeBudget(nodes), uniform_choice(generator))
+        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator, seed)
+        if isinstance(scene, Scene):
+            return scene
+
+
+def stable_verdict(scene: Scene) -> Verdict:
+    """Made up, with numbers that take all their digits."""
+    generator = rng(1)
+    settled = {o.name: o.X_TO.moved(generator.normal(size=3) * 1e-5) for o in scene.objects}
+    shares = {name: float(generator.uniform()) for name in scene.names}
+    return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < 0.3))
+
+
+def unstable_verdict(scene: Scene) -> Verdict:
+    instability = Instability(InstabilityReason.LEFT_TRAY, scene.names[-1], 1 / 3, math.pi / 7)
+    return Verdict(instability, scene.poses, {}, ())
+
+
+def reloaded(folder: Path, scene: Scene, verdict: Verdict | None = None) -> SceneFile:
+    path = folder / "scene.yaml"
+    save_scene(path, scene, verdict)
+    return load_scene(path, CATALOGUE)
+
+
+def assert_same(one: Scene, other: Scene) -> None:
+    assert one.objects == other.objects
+    assert (one.tray_side, one.derivation, one.seed) == (other.tray_side, other.derivation, other.seed)
+    assert (one.graph is None) == (other.graph is None)
+    if one.graph is not None and other.graph is not None:
+        assert list(one.graph.nx.nodes(data="kind")) == list(other.graph.nx.nodes(data="kind"))
+        assert list(one.graph.nx.edges(data="kind")) == list(other.graph.nx.edges(data="kind"))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_round_trip_is_exact(seed: int, tmp_path: Path) -> None:
+    scene = random_scene(seed)
+    for verdict in (None, stable_verdict(scene), unstable_verdict(scene)):
+        read = reloaded(tmp_path, scene, verdict)
+        assert_same(read.scene, scene)
+        assert read.verdict == verdict
+        assert read.settled_scene == (read.scene.at(verdict.settled) if verdict else read.scene)
+
+
+def test_poses_of_every_size_survive(tmp_path: Path) -> None:
+    """YAML 1.1 reads 1e-05 as a text; what is written has a point."""
+    objects = [
+        resting("sugar_box", xy=(x, y), floor=z, name=f"box {index}")
+        for index, (x, y, z) in enumerate([(1e-5, -1e-17, 0), (1e22, 1 / 3, 5e-324), (-1e-300, 0.0, 1e16)])
+    ]
+    assert reloaded(tmp_path, scene_of(*objects, tray_side=0.1 + 0.2)).scene == scene_of(*objects, tray_side=0.1 + 0.2)
+
+
+def test_names_are_any_text(tmp_path: Path) -> None:
+    names = ["yes", "1", "a: b", "Dose \N{LATIN SMALL LETTER O WITH DIAERESIS}", "null", "# no", "  spaced  "]
+    scene = scene_of(*(resting("large_marker", xy=(0, 0.03 * k), name=name) for k, name in enumerate(names)))
+    read = reloaded(tmp_path, scene, stable_verdict(scene))
+    assert read.scene.names == tuple(names)
+    assert read.verdict == stable_verdict(scene)
+
+
+def test_a_file_by_hand(tmp_path: Path) -> None:
+    """What a person would write: no graph, no node, whole numbers, a rounded quaternion."""
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+version: 1
+objects:
+  - name: box
+    class: sugar_box
+    X_TO: {translation: [0, 0, 0.0875], quaternion: [0.7071, 0, 0, 0.7071]}
+  - name: can
+    class: tomato_soup_can
+    X_TO: {translation: [0.2, 0, 0.0505], quaternion: [1, 0, 0, 0]}
+""")
+    read = load_scene(path, CATALOGUE)
+    box, can = read.scene.objects
+    assert box.X_TO.quaternion == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
+    assert math.hypot(*box.X_TO.quaternion) == pytest.approx(1, abs=1e-15)
+    assert Pose((0.2, 0.0, 0.0505)) == can.X_TO
+    assert (read.verdict, read.scene.graph, read.scene.seed, read.scene.derivation) == (None, None, None, ())
+    assert read.scene.tray_side == 0.70
+    assert read.settled_scene is read.scene or read.settled_scene == read.scene
+
+
+def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
+    scene = random_scene(2)
+    save_scene(tmp_path / "one.yaml", scene, stable_verdict(scene))
+    read = load_scene(tmp_path / "one.yaml", CATALOGUE)
+    save_scene(tmp_path / "two.yaml", read.scene, read.verdict)
+    assert (tmp_path / "one.yaml").read_bytes() == (tmp_path / "two.yaml").read_bytes()
+
+
+# --- What is refused ---
+
+SCENE = random_scene(1)
+DOCUMENT = scene_fields(SCENE, stable_verdict(SCENE))
+UNSTABLE = scene_fields(SCENE, unstable_verdict(SCENE))
+
+
+def changed(document: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
+    """A copy of the document with one value replaced, or taken out."""
+    result = copy.deepcopy(document)
+    at: Any = result
+    for key in path[:-1]:
+        at = at[key]
+    if value is GONE:
+        del at[path[-1]]
+    else:
+        at[path[-1]] = value
+    return result
+
+
+def written(folder: Path, document: Any) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(yaml.dump(document, sort_keys=False))
+    return path
+
+
+def object_node() -> int:
+    """Index of the first object in the graph's list of nodes."""
+    return next(index for index, node in enumerate(DOCUMENT["graph"]["nodes"]) if node["kind"] in CLASSES)
+
+
+X_TO: Path_ = ("objects", 0, "X_TO")
+NODE: Path_ = ("graph", "nodes", object_node())
+EDGE: Path_ = ("graph", "edges", 0)
+REFUSED: list[tuple[Path_, Any, str]] = [
+    (("version",), 2, "version: 2; allowed is 1"),
+    (("version",), "1", "version: '1'; allowed is an integer"),
+    (("version",), True, "version: True"),
+    (("version",), GONE, "version is missing"),
+    (("camera",), 1, "'camera' is unknown; allowed are version, objects, tray"),
+    (("tray",), 0.7, "tray: 0.7; allowed is a mapping with side"),
+    (("tray", "side"), 0, "tray.side: 0; allowed is 0.1 to 2"),
+    (("tray", "side"), math.nan, "tray.side: nan"),
+    (("seed",), 1.5, "seed: 1.5; allowed is an integer"),
+    (("objects",), GONE, "objects is missing"),
+    (("objects",), [], "objects: []; allowed is a list of at least one object"),
+    (("objects",), None, "objects: None; allowed is a list"),
+    (("objects",), {"a": 1}, "objects: {'a': 1}; allowed is a list"),
+    (("objects", 0), "box", "objects[0]: 'box'; allowed is a mapping"),
+    (("objects", 1, "class"), "teapot", "objects[1].class: 'teapot'; allowed is one of cracker_box"),
+    (("objects", 1, "class"), GONE, "objects[1]: class is missing"),
+    (("objects", 1, "class"), 3, "objects[1].class: 3; allowed is a text"),
+    (("objects", 1, "name"), GONE, "objects[1]: name is missing"),
+    (("objects", 1, "name"), "", "objects[1].name: ''; allowed is a text"),
+    (("objects", 1, "name"), None, "objects[1].name: None"),
+    (("objects", 1, "name"), "tray", "objects[1].name: 'tray'; allowed is any name but tray"),
+    (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is there twice"),
+    (("objects", 1, "colour"), "red", "objects[1]: 'colour' is unknown"),
+    (("objects", 1, "node"), "1", "objects[1].node: '1'; allowed is an integer"),
+    (("objects", 1, "node"), True, "objects[1].node: True; allowed is an integer"),
+    (("objects", 1, "node"), 99, "allowed is a structure node, or the class of the object that names this node"),
+    (X_TO, GONE, "objects[0]: X_TO is missing"),
+    (X_TO, [0, 0, 0], "objects[0].X_TO: [0, 0, 0]; allowed is a mapping with translation, quaternion"),
+    ((*X_TO, "translation"), GONE, "objects[0].X_TO: translation is missing"),
+    ((*X_TO, "translation"), [0, 0], "X_TO.translation: [0, 0]; allowed is a list of 3 finite numbers"),
+    ((*X_TO, "translation"), [0, 0, 0, 0], "X_TO.translation: [0, 0, 0, 0]"),
+    ((*X_TO, "translation"), "0 0 0", "X_TO.translation: '0 0 0'"),
+    ((*X_TO, "translation", 1), math.nan, "X_TO.translation[1]: nan; allowed is a finite number"),
+    ((*X_TO, "translation", 2), math.inf, "X_TO.translation[2]: inf"),
+    ((*X_TO, "translation", 0), "0.1", "X_TO.translation[0]: '0.1'; allowed is a finite number"),
+    ((*X_TO, "translation", 0), True, "X_TO.translation[0]: True"),
+    ((*X_TO, "quaternion"), [1, 0, 0], "X_TO.quaternion: [1, 0, 0]; allowed is a list of 4"),
+    ((*X_TO, "quaternion"), [0, 0, 0, 0], "allowed is w, x, y, z of length 1 (this one's is 0)"),
+    ((*X_TO, "quaternion"), [0.71, 0.71, 0, 0], "(this one's is 1.00409)"),
+    ((*X_TO, "quaternion", 3), -math.inf, "X_TO.quaternion[3]: -inf"),
+    (("graph",), [], "graph: []; allowed is a mapping with nodes, edges"),
+    (("graph", "nodes"), GONE, "graph: nodes is missing"),
+    (("graph", "nodes", 0), GONE, "graph.nodes: allowed is exactly one tray"),
+    (("graph", "nodes", 0, "id"), "0", "graph.nodes[0].id: '0'; allowed is an integer"),
+    (NODE, GONE, "graph.nodes: the node of"),
+    ((*NODE, "kind"), "teapot", "kind: 'teapot'; allowed is a structure node, or the class"),
+    ((*NODE, "kind"), "tray", "allowed is exactly one tray"),
+    ((*NODE, "id"), 0, "allowed is an id that no other node has"),
+    ((*NODE, "colour"), 1, "'colour' is unknown"),
+    (("graph", "edges"), [], "allowed is an acyclic graph in which the tray leads to every node"),
+    ((*EDGE, "kind"), "flat_45", "graph.edges[0].kind: 'flat_45'; allowed is one of primitive, flat_0"),
+    ((*EDGE, "kind"), 0, "graph.edges[0].kind: 0; allowed is a text"),
+    ((*EDGE, "child"), GONE, "graph.edges[0]: child is missing"),
+    ((*EDGE, "child"), 99, "joins a node that is not there"),
+    ((*EDGE, "child"), 0, "acyclic"),
+    (("derivation",), "drop_object", "derivation: 'drop_object'; allowed is a list"),
+    (("derivation", 1), 3, "derivation[1]: 3; allowed is a text"),
+    (("verdict",), "stable", "verdict: 'stable'; allowed is a mapping"),
+    (("verdict", "stable"), GONE, "verdict: stable is missing"),
+    (("verdict", "stable"), False, "verdict.instability: is missing"),
+    (("verdict", "hidden"), ["ghost"], "verdict: 'ghost' is no object of the scene"),
+    (("verdict", "hidden"), "none", "verdict.hidden: 'none'; allowed is a list"),
+    (("verdict", "visible_share", "ghost"), 0.5, "verdict: 'ghost' is no object of the scene"),
+    (("verdict", "visible_share", SCENE.names[0]), "all", f"verdict.visible_share.{SCENE.names[0]}: 'all'"),
+    (("verdict", "settled", "ghost"), {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]}, "'ghost' is no object"),
+    (("verdict", "settled", SCENE.names[0]), None, f"verdict.settled.{SCENE.names[0]}: None; allowed is a mapping"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), REFUSED, ids=[message[:40] for _, _, message in REFUSED])
+def test_a_broken_field_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
+    file = written(tmp_path, changed(DOCUMENT, path, value))
+    with pytest.raises(InputError) as refusal:
+        load_scene(file, CATALOGUE)
+    assert str(refusal.value).startswith(str(file))
+    assert message in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("verdict", "instability", "reason"), "bored", "verdict.instability.reason: 'bored'; allowed is one of toppled, slid"),
+        (("verdict", "instability", "tilt"), "much", "verdict.instability.tilt: 'much'; allowed is a finite number"),
+        (("verdict", "instability", "displacement"), math.inf, "verdict.instability.displacement: inf"),
+        (("verdict", "instability", "object"), GONE, "verdict.instability: object is missing"),
+        (("verdict", "instability"), None, "verdict.instability: None; allowed is a mapping"),
+    ],
+)
+def test_a_broken_instability_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
+    file = written(tmp_path, changed(UNSTABLE, path, value))
+    with pytest.raises(InputError) as refusal:
+        load_scene(file, CATALOGUE)
+    assert str(refusal.value).startswith(f"{file}.{message}")
+
+
+def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> None:
+    """1 mm is allowed, as settled objects press on each other and hand-written poses are rounded."""
+    for gap, allowed in ((0.0, True), (-0.0009, True), (-0.0011, False), (-0.020, False)):
+        scene = scene_of(resting("sugar_box", name="below"), resting("pudding_box", floor=0.038 + gap, name="above"))
+        save_scene(tmp_path / "scene.yaml", scene)
+        if allowed:
+            assert load_scene(tmp_path / "scene.yaml", CATALOGUE).scene == scene
+        else:
+            with pytest.raises(InputError, match=rf"objects: below and above overlap by {-1000 * gap:.1f} mm; allowed is 1 mm"):
+                load_scene(tmp_path / "scene.yaml", CATALOGUE)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n\n",
+        b"null\n",
+        b"[1, 2]\n",
+        b"just words",
+        b"\x89PNG\r\n\x1a\n\x00\xff",
+        b"\xff\xfe\x00",
+        b"a: b: c",
+        b"a: [1, 2",
+        b"\t",
+    ],
+    ids=lambda content: repr(content)[:20],
+)
+def test_what_is_no_document_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as refusal:
+        load_scene(path, CATALOGUE)
+    assert str(refusal.value).startswith(str(path))
+
+
+def test_no_file_and_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"missing\.yaml: cannot be read \(No such file"):
+        load_scene(tmp_path / "missing.yaml", CATALOGUE)
+    with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)"):
+        load_scene(tmp_path, CATALOGUE)
+
+
+def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
+    """At every length: what is not refused holds whole objects, and from the first one on."""
+    path = tmp_path / "scene.yaml"
+    save_scene(path, SCENE, stable_verdict(SCENE))
+    whole = path.read_text()
+    refused = 0
+    for length in np.linspace(0, len(whole) - 2, 150).astype(int):
+        path.write_text(whole[:length])
+        try:
+            read = load_scene(path, CATALOGUE)
+        except InputError as refusal:
+            assert str(refusal).startswith(str(path))
+            refused += 1
+        else:
+            assert read.scene.objects == SCENE.objects[: len(read.scene.objects)]
+    assert refused > 120
+
+
+# --- Fuzz ---
+
+
+def places(value: Any, at: Path_ = ()) -> Iterator[Path_]:
+    """The paths of all values in a document."""
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield (*at, key)
+        yield from places(item, (*at, key))
+
+
+PLACES = list(places(DOCUMENT))
+STRANGE = [GONE, None, True, False, 0, -1, 7, 10**9, 0.5, -0.0, math.nan, math.inf, -math.inf, 1e308, 1e-320, "", "tray", "end"]
+STRANGE += [
+    SCENE.names[0],
+    "flat_0",
+    OBJECT_SLOT,
+    "sugar_box",
+    [],
+    {},
+    [[]],
+    [1, 2, 3],
+    [1, 0, 0, 0],
+    {"a": 1},
+    {1: 2},
+    "\0",
+    "x" * 200,
+]
+
+
+def loads_or_is_refused(path: Path) -> bool:
+    try:
+        load_scene(path, CATALOGUE)
+    except InputError as refusal:
+        assert str(refusal).startswith(str(path))
+        return False
+    return True
+
+
+@pytest.fixture(scope="module")
+def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file to be overwritten again and again."""
+    return tmp_path_factory.mktemp("fuzz") / "scene.yaml"
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
+@settings(max_examples=400)
+@given(changes=st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE)), min_size=1, max_size=3))
+def test_any_value_anywhere_loads_or_is_refused(fuzzed: Path, changes: list[tuple[Path_, Any]]) -> None:
+    document = DOCUMENT
+    for path, value in changes:
+        try:
+            document = changed(document, path, value)
+        except (KeyError, IndexError, TypeError):  # an earlier change took the place away
+            continue
+    fuzzed.write_text(yaml.dump(document, sort_keys=False))
+    loads_or_is_refused(fuzzed)
+
+
+WHOLE = yaml.dump(DOCUMENT, sort_keys=False, default_flow_style=None, width=160)
+
+
+@settings(max_examples=300)
+@given(
+    start=st.integers(0, len(WHOLE)),
+    taken=st.integers(0, 40),
+    inserted=st.text(alphabet="0123456789.-:,[]{}'\"&*!|>%@?#\n\t abcez\x00é", max_size=6),
+)
+def test_any_edit_of_the_text_loads_or_is_refused(fuzzed: Path, start: int, taken: int, inserted: str) -> None:
+    fuzzed.write_text(WHOLE[:start] + inserted + WHOLE[start + taken :], encoding="utf-8")
+    loads_or_is_refused(fuzzed)

@@ -1,0 +1,234 @@
+"""Settling and judging small scenes whose outcome is known from statics; determinism; when the simulation ends."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CLASSES, resting, rng, scene_of
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.config import ClutterConfig, SettleConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
+from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
+from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.settle import Settled, jittered, settle
+
+UPRIGHT = Orientation.UPRIGHT_0
+# Cracker boxes lie 230 mm along x, 60 mm high; a sugar box is 175 mm long, so it overhangs by half when shifted by 115 mm.
+BELOW = resting("cracker_box", name="below")
+STANDING_PAIR = [resting("sugar_box", UPRIGHT, (0.0, y), name=name) for name, y in (("left", -0.039), ("right", 0.039))]
+MARKER_PAIR = [resting("large_marker", xy=(0.0, y), name=name) for name, y in (("left", -0.010), ("right", 0.010))]
+
+STABLE: dict[str, list[SceneObject]] = {
+    "box on box": [BELOW, resting("sugar_box", floor=0.060, name="above")],
+    "overhang of less than half": [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
+    "a box bridges a standing pair": [*STANDING_PAIR, resting("cracker_box", floor=0.175, name="above")],
+    "a marker that lies": [resting("large_marker", name="marker")],
+    "a pair of markers bears a box": [*MARKER_PAIR, resting("gelatin_box", floor=0.018, name="above")],
+}
+FALLING: dict[str, tuple[list[SceneObject], InstabilityReason, str]] = {
+    "overhang of more than half": (
+        [BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="above")],
+        *(InstabilityReason.TOPPLED, "above"),
+    ),
+    "a marker falls through the gap of a pair": (
+        [*STANDING_PAIR, resting("large_marker", floor=0.175, name="above")],
+        *(InstabilityReason.SLID, "above"),
+    ),
+    "a lying marker rolls away under a box": (
+        [resting("large_marker", name="below"), resting("gelatin_box", floor=0.018, name="above")],
+        *(InstabilityReason.TOPPLED, "above"),
+    ),
+    "a box on its shelf above nothing": ([resting("gelatin_box", floor=0.2, name="above")], InstabilityReason.SLID, "above"),
+    "a stack beside the tray": (
+        [resting("cracker_box", xy=(0.6, 0.0), name="a"), resting("sugar_box", xy=(0.6, 0.0), floor=0.060, name="b")],
+        *(InstabilityReason.LEFT_TRAY, "a"),
+    ),
+    "a high tower on a narrow foot": (
+        [
+            resting("large_marker", UPRIGHT, name="foot"),
+            resting("cracker_box", UPRIGHT, (0.012, 0.0), floor=0.121, name="above"),
+        ],
+        *(InstabilityReason.TOPPLED, "above"),
+    ),
+}
+
+
+@pytest.mark.parametrize("objects", STABLE.values(), ids=list(STABLE))
+def test_what_stands(objects: list[SceneObject], judge: DrakeJudge) -> None:
+    scene = scene_of(*objects)
+    verdict = judge.judge(scene, rng())
+    assert verdict.stable, str(verdict.instability)
+    assert set(verdict.settled) == set(verdict.visible_share) == set(scene.names)
+    for o in objects:
+        assert np.linalg.norm(verdict.settled[o.name].p - o.X_TO.p) < 0.003
+    assert [name for name, share in verdict.visible_share.items() if share < 0.30] == list(verdict.hidden)
+
+
+@pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
+def test_what_falls(objects: list[SceneObject], reason: InstabilityReason, name: str, judge: DrakeJudge) -> None:
+    verdict = judge.judge(scene_of(*objects), rng())
+    assert verdict.instability is not None
+    assert (verdict.instability.reason, verdict.instability.object) == (reason, name)
+    assert set(verdict.settled) == {o.name for o in objects}
+    assert (verdict.visible_share, verdict.hidden) == ({}, ())
+    start = next(o for o in objects if o.name == name)
+    moved = np.linalg.norm(verdict.settled[name].p - start.X_TO.p)
+    assert verdict.instability.displacement == pytest.approx(moved, abs=0.0011)  # the random offset comes before
+    limits = SettleConfig()
+    assert verdict.instability.displacement >= limits.max_displacement or verdict.instability.tilt >= math.radians(
+        limits.max_tilt_deg
+    )
+
+
+def test_the_same_rng_gives_the_same_poses_bit_for_bit(config: ClutterConfig, judge: DrakeJudge) -> None:
+    scene = scene_of(*STABLE["box on box"], resting("large_marker", xy=(0.2, 0.2), name="marker"))
+    verdict = judge.judge(scene, rng(3))
+    assert judge.judge(scene, rng(3)) == verdict
+    assert DrakeJudge(config).judge(scene, rng(3)) == verdict
+    assert judge.judge(scene, rng(4)).settled != verdict.settled
+
+
+def test_an_object_on_its_own_settles_alike_wherever_it_stands(config: ClutterConfig) -> None:
+    places = [(0.0, 0.0), (0.21, -0.13), (-0.3, 0.3)]
+    ended = []
+    for order in (places, places[::-1]):
+        judge = DrakeJudge(config)
+        verdicts = {xy: judge.judge(scene_of(resting("sugar_box", UPRIGHT, xy, name="box")), rng(1)) for xy in order}
+        ended.append({xy: verdict.settled["box"] for xy, verdict in verdicts.items()})
+    assert ended[0] == ended[1]  # whichever place was simulated
+    offsets = {xy: np.subtract(pose.translation[:2], xy) for xy, pose in ended[0].items()}
+    for xy in places:
+        assert ended[0][xy].quaternion == ended[0][places[0]].quaternion
+        assert ended[0][xy].translation[2] == ended[0][places[0]].translation[2]
+        assert offsets[xy] == pytest.approx(offsets[places[0]], abs=1e-12)
+
+
+def test_every_object_on_its_own_is_told_by_its_own_name(judge: DrakeJudge) -> None:
+    """The second falls just as the first did, whose result is kept."""
+    for name in ("one", "two"):
+        verdict = judge.judge(scene_of(resting("gelatin_box", floor=0.15, name=name)), rng())
+        assert verdict.instability is not None
+        assert verdict.instability.object == name
+        assert list(verdict.settled) == [name]
+
+
+def moved_aside(objects: Sequence[SceneObject], y: float, prefix: str) -> list[SceneObject]:
+    return [replace(o, name=prefix + o.name, X_TO=o.X_TO.moved((0.0, y, 0.0))) for o in objects]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (STABLE["box on box"], STABLE["overhang of less than half"]),
+        (STABLE["box on box"], FALLING["overhang of more than half"][0]),
+        (STABLE["a marker that lies"], FALLING["a marker falls through the gap of a pair"][0]),
+    ],
+)
+def test_apart_or_together_the_verdict_is_the_same(
+    first: list[SceneObject], second: list[SceneObject], config: ClutterConfig, judge: DrakeJudge
+) -> None:
+    objects = [*moved_aside(first, -0.2, "first "), *moved_aside(second, 0.2, "second ")]
+    apart = judge.judge(scene_of(*objects), rng(5))
+    together = settle(jittered(objects, config.settle.jitter, rng(5)), 0.70, config.settle)
+    assert (apart.instability is None) == (together.instability is None)
+    if apart.instability is not None and together.instability is not None:
+        assert (apart.instability.reason, apart.instability.object) == (
+            together.instability.reason,
+            together.instability.object,
+        )
+    else:
+        for name, pose in together.poses.items():
+            assert np.linalg.norm(apart.settled[name].p - pose.p) < 0.0005
+
+
+def test_the_first_stack_that_falls_decides(judge: DrakeJudge) -> None:
+    """What was not looked at any more stays where it was."""
+    falling = moved_aside(FALLING["overhang of more than half"][0], -0.2, "first ")
+    standing = moved_aside(STABLE["box on box"], 0.2, "second ")
+    scene = scene_of(*falling, *standing)
+    verdict = judge.judge(scene, rng())
+    assert verdict.instability is not None
+    assert verdict.instability.object == "first above"
+    assert all(verdict.settled[o.name] == o.X_TO for o in standing)
+
+
+def test_not_at_rest() -> None:
+    """A box in free fall for 0.1 s moves at 1 m/s; with limits that wide, it has not fallen over: it is still moving."""
+    config = SettleConfig(max_time=0.1, max_displacement=1.0)
+    result = settle([resting("sugar_box", floor=0.2, name="box"), resting("large_marker", xy=(0, 0.2), name="m")], 0.7, config)
+    assert result.instability is not None
+    assert (result.instability.reason, result.instability.object) == (InstabilityReason.NOT_AT_REST, "box")
+    assert result.instability.displacement == pytest.approx(9.81 * 0.1**2 / 2, rel=0.05)
+    assert result.instability.tilt == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_end_comes_when_all_are_calm() -> None:
+    box = resting("sugar_box", name="box")
+    calm = settle([box], 0.7, SettleConfig(), record=True)
+    assert calm.instability is None
+    assert calm.motion[-1].time == pytest.approx(0.4)  # four calm samples
+    patient = settle([box], 0.7, SettleConfig(max_time=0.6, calm_samples=100), record=True)
+    assert patient.motion[-1].time == pytest.approx(0.6)
+
+
+def check_motion(result: Settled, start: list[SceneObject]) -> None:
+    times = np.array([frame.time for frame in result.motion])
+    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 30), abs=0.002)
+    assert result.motion[0].poses == {o.name: o.X_TO for o in start}
+    assert result.motion[-1].poses == result.poses
+
+
+def test_motion_is_recorded_and_a_fall_followed_if_asked() -> None:
+    falling = FALLING["overhang of more than half"][0]
+    config = SettleConfig(time_step=0.005)
+    stopped = settle(falling, 0.7, config, record=True)
+    followed = settle(falling, 0.7, config, record=True, follow_falls=True)
+    assert settle(falling, 0.7, config).motion == ()
+    check_motion(stopped, falling)
+    check_motion(followed, falling)
+    assert stopped.instability == followed.instability
+    assert len(followed.motion) > len(stopped.motion)
+    assert followed.motion[: len(stopped.motion)] == stopped.motion
+    assert followed.poses["above"].p[2] < stopped.poses["above"].p[2]
+
+
+def test_jitter_is_uniform_over_a_disc_in_the_trays_plane() -> None:
+    box = resting("sugar_box", xy=(0.1, 0.2), name="box")
+    generator = rng(0)
+    moved = jittered([box] * 2000, 0.001, generator)
+    offsets = np.array([o.X_TO.p - box.X_TO.p for o in moved])
+    assert (offsets[:, 2] == 0).all()
+    assert all(o.X_TO.quaternion == box.X_TO.quaternion for o in moved)
+    distances = np.linalg.norm(offsets, axis=1)
+    assert distances.max() <= 0.001 + 1e-12
+    assert (distances**2).mean() == pytest.approx(0.5e-6, rel=0.05)  # uniform over the area
+    assert abs(offsets.mean(axis=0)).max() < 4e-5
+    assert jittered([box], 0.001, rng(0))[0] == moved[0]
+
+
+@pytest.mark.parametrize(
+    ("class_name", "axis", "degrees", "tilt"),
+    [
+        ("sugar_box", "x", 10, 10),
+        ("sugar_box", "z", 25, 25),  # a box that turns on the spot has turned
+        ("sugar_box", "y", 180, 180),
+        ("large_marker", "z", 70, 0),  # a marker that rolls about its axis has not
+        ("large_marker", "x", 20, 20),
+        ("large_marker", "y", 180, 180),
+        ("tomato_soup_can", "y", 0, 0),
+    ],
+)
+def test_tilt_between(class_name: str, axis: str, degrees: float, tilt: float) -> None:
+    start = resting(class_name, Orientation.FLAT_30).X_TO
+    turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    end = Pose.of(start.rotation @ turn, (1.0, 2.0, 3.0))
+    assert math.degrees(tilt_between(CLASSES[class_name], start, end)) == pytest.approx(tilt, abs=1e-5)
+
+
+def test_an_instability_says_what_happened() -> None:
+    assert str(Instability(InstabilityReason.TOPPLED, "can_3", 0.0123, math.radians(20))) == "can_3 toppled (12 mm, 20 deg)"
+    assert not Verdict(Instability(InstabilityReason.SLID, "a", 0.02, 0.0), {}, {}, ()).stable
