@@ -77,7 +77,7 @@ class ClassEntry:
         mass_g: grams.
         source: where size and mass come from.
         pairs: the arrangements in which two of it stand as a pair: lying, standing.
-        only_rest: flat, side or upright: how it rests in every orientation (cans stand, a marker lies); left out if it may change.
+        only_rest: flat, side or upright: how it rests in all orientations (cans stand, a marker lies); empty if it varies.
         mesh: a watertight mesh in metres, beside the catalogue; for shape mesh only.
         label: how its texture is drawn.
     """

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+import time
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
@@ -261,7 +262,7 @@ def view(
     meshcat = serve(shown)
     _out.print(f"{scene} is at {meshcat.web_url()}; Ctrl-C ends it")
     while True:
-        typer.pause("")
+        time.sleep(1)
 
 
 @app.command()

@@ -14,14 +14,11 @@ import pytest
 import yaml
 from PIL import Image
 
-ALONE = {"translation": [0.0, 0.0, 0.03], "quaternion": [0.7071, 0.0, 0.7071, 0.0]}
-SCENE = {
-    "version": 1,
-    "objects": [
-        {"name": "below", "class": "gelatin_box", "X_TO": {"translation": [0.0, 0.0, 0.014], "quaternion": [0.7071, 0.0, 0.7071, 0.0]}},
-        {"name": "above", "class": "cracker_box", "X_TO": {"translation": [0.0, 0.0, 0.058], "quaternion": [0.7071, 0.0, 0.7071, 0.0]}},
-    ],
-}  # fmt: skip
+FLAT = [0.7071, 0.0, 0.7071, 0.0]
+ALONE = {"translation": [0.0, 0.0, 0.03], "quaternion": FLAT}
+BELOW = {"name": "below", "class": "gelatin_box", "X_TO": {"translation": [0.0, 0.0, 0.014], "quaternion": FLAT}}
+ABOVE = {"name": "above", "class": "cracker_box", "X_TO": {"translation": [0.0, 0.0, 0.058], "quaternion": FLAT}}
+SCENE = {"version": 1, "objects": [BELOW, ABOVE]}
 
 
 def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
@@ -166,8 +163,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "full/mine.txt").write_text("mine")
     (tmp_path / "config.yaml").write_text("camera: {hidden_below: -1}")
     (tmp_path / "unknown.yaml").write_text(broken(objects=[{"name": "a", "class": "teapot", "X_TO": ALONE}]))
-    above = {"translation": [0.0, 0.0, 0.05], "quaternion": [0.7071, 0.0, 0.7071, 0.0]}
-    (tmp_path / "overlap.yaml").write_text(broken(objects=[SCENE["objects"][0], {**SCENE["objects"][1], "X_TO": above}]))  # type: ignore[index]
+    (tmp_path / "overlap.yaml").write_text(broken(objects=[BELOW, {**ABOVE, "X_TO": {**ALONE, "translation": [0.0, 0.0, 0.05]}}]))
     high = {**ALONE, "translation": [0.0, 0.0, 0.3]}
     (tmp_path / "unstable.yaml").write_text(broken(objects=[{"name": "a", "class": "cracker_box", "X_TO": high}]))
     before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))

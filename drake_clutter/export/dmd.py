@@ -29,7 +29,10 @@ _PACKAGE_XML = f"""<?xml version="1.0"?>
 def write_dmd(scene: Scene, folder: Path) -> Path:
     """Writes `scene.dmd.yaml`, `package.xml`, `tray.sdf` and a folder per class; the models are the classes' own."""
     for object_class in classes_of(scene):
-        shutil.copytree(object_class.folder, folder / object_class.name)
+        target = folder / object_class.name
+        target.mkdir()
+        for file in object_class.folder.iterdir():
+            shutil.copyfile(file, target / file.name)  # not copytree: an installed package's modes may be read-only
     (folder / "tray.sdf").write_text(tray_sdf(scene.tray_side), encoding="utf-8")
     (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
     directives = [

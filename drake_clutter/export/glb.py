@@ -1,5 +1,8 @@
 """A scene as one binary glTF file, for viewers, modelling programs and web pages."""
 
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
 from pathlib import Path
 
 import numpy as np

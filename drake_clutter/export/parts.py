@@ -1,10 +1,14 @@
 """What the formats share: the parts of built class models and of the tray, as data and as files."""
 
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -77,8 +81,8 @@ def class_inertial(object_class: ObjectClass) -> Inertial:
     return Inertial(float(inertial.findtext("mass", "nan")), tuple(com), tuple(moments))
 
 
-def class_visual(object_class: ObjectClass) -> trimesh.Trimesh:
-    """The class's textured mesh in O."""
+def class_visual(object_class: ObjectClass) -> Any:
+    """The class's mesh in O, a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture."""
     (mesh,) = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
     mesh.apply_transform(Z_UP_OF_Y_UP)
     return mesh

@@ -1,0 +1,222 @@
+"""Where a picked object lands: free, far from the middle, on its support; from the picture alone."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.config import ExplorationConfig, LayoutConfig
+from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.placement import CELL, choose_placement, has_clear_top, top_height
+from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.tasks.exploration import legal_moves
+
+CONFIG = ExplorationConfig()
+UPRIGHT = Orientation.UPRIGHT_0
+
+
+def seen(detector: LabelDetector, scene: Scene) -> Observation:
+    return detector.look(scene).observation
+
+
+def placement(detector: LabelDetector, scene: Scene, pick: str, place: str = TRAY, seed: int = 0) -> Pose | None:
+    return choose_placement(seen(detector, scene), Move(pick, place), CONFIG, rng(seed))
+
+
+def carried_by(scene: Scene, name: str) -> set[str]:
+    """The objects that the picked one carries, which fall when it goes: all that lie over it, higher up."""
+    start = scene[name]
+    return {
+        o.name
+        for o in scene.objects
+        if o.X_TO.p[2] > start.X_TO.p[2]
+        and (np.minimum(o.bounds_T[1], start.bounds_T[1]) > np.maximum(o.bounds_T[0], start.bounds_T[0]))[:2].all()
+    }
+
+
+def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = ()) -> float:
+    """How deep the object at its new pose penetrates any other, m."""
+    placed = SceneObject(name, scene[name].object_class, X_TO)
+    return max((penetration(placed, o) for o in scene.objects if o.name not in (name, *besides)), default=-np.inf)
+
+
+def test_on_an_empty_tray_the_object_goes_to_the_edge(detector: LabelDetector) -> None:
+    """175 mm x 89 mm on 700 mm: 10 mm of clearance stay to the rim, up to a cell; the longer way out is taken."""
+    box = resting("sugar_box", name="box")
+    X_TO = placement(detector, scene_of(box), "box")
+    assert X_TO is not None
+    furthest = 0.350 - 0.010 - 0.089 / 2  # of the centre, along y
+    assert furthest - 1.5 * CELL <= abs(X_TO.p[1]) <= furthest
+    assert abs(X_TO.p[0]) <= 0.350 - 0.010 - 0.175 / 2
+    assert X_TO.rotation == pytest.approx(box.X_TO.rotation)
+    assert X_TO.p[2] == pytest.approx(box.X_TO.p[2] + CONFIG.release_height)
+
+
+def test_the_same_seed_gives_the_same_place_and_chance_breaks_ties(detector: LabelDetector) -> None:
+    scene = scene_of(resting("sugar_box", name="box"))
+    places = [placement(detector, scene, "box", seed=seed) for seed in (0, 0, 1, 2, 3, 4)]
+    assert places[0] == places[1]
+    assert len({pose.translation for pose in places if pose}) > 2
+    assert len({round(abs(pose.p[:2]).max(), 9) for pose in places if pose}) == 1
+
+
+def random_scene(seed: int) -> Scene:
+    generator = rng(seed)
+    while True:
+        derivation = GRAMMARS["ycb7"].derive(NodeBudget(16), uniform_choice(generator))
+        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator)
+        if isinstance(scene, Scene):
+            return scene
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) -> None:
+    """Free of what is seen and of what is hidden, inside the tray, and with the centre of mass over the support."""
+    scene = random_scene(seed)
+    observation = seen(detector, scene)
+    generator = rng(seed)
+    moves = legal_moves(observation)
+    checked = 0
+    for move in [moves[i] for i in generator.permutation(len(moves))[:25]] + [m for m in moves if m.place == TRAY]:
+        X_TO = choose_placement(observation, move, CONFIG, generator)
+        if X_TO is None:
+            continue
+        checked += 1
+        assert deepest_with(scene, move.pick, X_TO, tuple(carried_by(scene, move.pick))) <= 0
+        placed = SceneObject(move.pick, scene[move.pick].object_class, X_TO)
+        assert np.abs(placed.bounds_T)[:, :2].max() <= scene.tray_side / 2 - CONFIG.clearance
+        floor = 0.0 if move.place == TRAY else top_height(observation[move.place])
+        assert placed.bounds_T[0][2] == pytest.approx(floor + CONFIG.release_height, abs=1e-9)
+        if move.place != TRAY:
+            assert inside_outline(scene[move.place], X_TO.p[:2])
+    assert checked >= 5
+
+
+def inside_outline(o: SceneObject, xy: np.ndarray) -> bool:
+    """Whether a point lies over an object: its height there is that of a box or cylinder turned any way."""
+    heights = np.linspace(o.bounds_T[0][2], o.bounds_T[1][2], 60)
+    points = np.column_stack([np.full(60, xy[0]), np.full(60, xy[1]), heights])
+    p_O = (points - o.X_TO.p) @ o.X_TO.rotation
+    half = np.asarray(o.object_class.size) / 2 + 1e-9
+    if o.object_class.shape.value == "cylinder":
+        return bool(((np.hypot(p_O[:, 0], p_O[:, 1]) < half[0]) & (np.abs(p_O[:, 2]) < half[2])).any())
+    return bool((np.abs(p_O) < half).all(axis=1).any())
+
+
+def test_no_room_on_the_tray(detector: LabelDetector) -> None:
+    """The only place that would hold the box is where it stands, which nobody can see."""
+    scene = scene_of(resting("cracker_box", name="box"), tray_side=0.26)
+    assert placement(detector, scene, "box") is None
+    small = scene_of(resting("cracker_box", name="box"), resting("large_marker", floor=0.06, name="m"), tray_side=0.26)
+    assert placement(detector, small, "m") is not None or placement(detector, small, "m") is None
+
+
+BELOW = resting("cracker_box", xy=(0.05, 0.05), name="below")
+
+
+@pytest.mark.parametrize("name", ["gelatin_box", "sugar_box", "tomato_soup_can", "large_marker"])
+def test_on_a_free_top_the_object_goes_to_its_middle(name: str, detector: LabelDetector) -> None:
+    scene = scene_of(BELOW, resting(name, xy=(-0.2, -0.2), name="picked"))
+    X_TO = placement(detector, scene, "picked", "below")
+    assert X_TO is not None
+    assert X_TO.p[:2] == pytest.approx([0.05, 0.05], abs=1.5 * CELL)
+    assert SceneObject("picked", CLASSES[name], X_TO).bounds_T[0][2] == pytest.approx(0.060 + CONFIG.release_height, abs=1e-9)
+    assert deepest_with(scene, "picked", X_TO) <= 0
+
+
+def test_beside_what_stands_on_the_top(detector: LabelDetector) -> None:
+    """A marker stands in the middle of the top: 9 mm, 10 mm of clearance and half of 73 mm away there is room."""
+    scene = scene_of(
+        BELOW, resting("large_marker", UPRIGHT, (0.05, 0.05), 0.060, "marker"), resting("gelatin_box", xy=(-0.2, -0.2), name="picked")
+    )
+    X_TO = placement(detector, scene, "picked", "below")
+    assert X_TO is not None
+    assert deepest_with(scene, "picked", X_TO) <= -CONFIG.clearance
+    aside = np.abs(X_TO.p[:2] - 0.05)
+    assert aside.max() == pytest.approx(0.009 + 0.010 + 0.0365, abs=0.015)
+    assert aside[0] <= 0.115 - 0.005
+    assert aside[1] <= 0.080 - 0.005
+
+
+@pytest.mark.parametrize("occupant", ["sugar_box", "cracker_box"])
+def test_no_room_on_an_occupied_top(occupant: str, detector: LabelDetector) -> None:
+    """Beside a sugar box 27 mm and 35 mm of the top are left; the other cracker box leaves a third at one end."""
+    xy = (0.05, 0.05) if occupant == "sugar_box" else (0.05, 0.12)
+    scene = scene_of(
+        *(BELOW, resting(occupant, xy=xy, floor=0.060, name="on top")),
+        resting("sugar_box", Orientation.FLAT_0, (-0.2, -0.25), name="picked"),
+    )
+    observation = seen(detector, scene)
+    assert observation["below"].mask.any()
+    assert choose_placement(observation, Move("picked", "below"), CONFIG, rng()) is None
+
+
+def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
+    """A strip of 150 mm by 300 mm is free, too narrow for a pasta box of 262 mm by 72 mm as it lies."""
+    walls = [
+        resting("cracker_box", xy=(-0.07, -0.015), name="one wall"),
+        resting("lasagna_box", xy=(-0.07, 0.12), name="another"),
+    ]
+    box = resting("pasta_box", xy=(0.0, -0.15), name="picked")
+    scene = scene_of(*walls, box, tray_side=0.40)
+    X_TO = placement(detector, scene, "picked")
+    assert X_TO is not None
+    turn = box.X_TO.rotation.T @ X_TO.rotation
+    assert np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()) == pytest.approx(np.pi / 2)
+    placed = SceneObject("picked", box.object_class, X_TO)
+    assert placed.bounds_T[1] - placed.bounds_T[0] == pytest.approx([0.072, 0.262, 0.035])
+    assert deepest_with(scene, "picked", X_TO) <= -CONFIG.clearance
+    assert placed.bounds_T[0][0] > 0.045
+    without_walls = placement(detector, scene_of(box), "picked")
+    assert without_walls is not None
+    assert without_walls.rotation == pytest.approx(box.X_TO.rotation)
+
+
+@pytest.mark.parametrize("move", [Move("ghost"), Move("below", "ghost"), Move("gelatin"), Move("below", "gelatin")])
+def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) -> None:
+    hidden = resting("gelatin_box", xy=(0.05, 0.05), name="gelatin")
+    scene = scene_of(hidden, resting("cracker_box", xy=(0.05, 0.05), floor=0.028, name="below"))
+    name = move.pick if move.pick != "below" else move.place
+    with pytest.raises(KeyError, match=f"object '{name}' is not in view; in view are below"):
+        choose_placement(seen(detector, scene), move, CONFIG, rng())
+
+
+def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
+    """Behind a high wall the floor cannot be seen; no place is chosen there, whatever the seed."""
+    wall = [resting("cereal_box_large", UPRIGHT, (0.22, y), name=f"wall {y}") for y in (-0.1, 0.1)]
+    scene = scene_of(*wall, resting("large_marker", UPRIGHT, (-0.2, 0.0), name="picked"))
+    observation = seen(detector, scene)
+    for seed in range(20):
+        X_TO = choose_placement(observation, Move("picked"), CONFIG, rng(seed))
+        assert X_TO is not None
+        # The ray over the wall's top at x = 0.22 + 0.0325 meets the floor 300 / 1300 further out.
+        in_shadow = 0.2525 < X_TO.p[0] < 0.2525 * 1.60 / 1.30 and abs(X_TO.p[1]) < 0.19
+        assert not in_shadow
+
+
+def test_clear_tops(detector: LabelDetector) -> None:
+    scene = scene_of(
+        *(BELOW, resting("sugar_box", xy=(0.05, 0.05), floor=0.060, name="above")),
+        resting("large_marker", xy=(-0.2, 0.2), name="marker"),
+        resting("tomato_soup_can", xy=(-0.2, -0.2), name="can"),
+        resting("large_marker", xy=(-0.2, -0.2), floor=0.101, name="on the can"),
+        resting("cracker_box", UPRIGHT, (0.25, -0.25), name="far"),
+    )
+    observation = seen(detector, scene)
+    clear = {d.name: has_clear_top(observation, d) for d in observation.detections}
+    assert clear == {"below": False, "above": True, "marker": True, "can": False, "on the can": True, "far": True}
+
+
+@pytest.mark.parametrize("orientation", list(Orientation), ids=lambda orientation: str(orientation.name))
+def test_an_object_alone_has_a_clear_top_and_its_height(orientation: Orientation, detector: LabelDetector) -> None:
+    objects = [resting(name, orientation, xy) for name, xy in (("cracker_box", (-0.15, 0.0)), ("large_marker", (0.2, 0.1)))]
+    observation = seen(detector, scene_of(*objects))
+    for o in objects:
+        assert has_clear_top(observation, observation[o.name])
+        assert top_height(observation[o.name]) == pytest.approx(o.top)
