@@ -3,6 +3,7 @@
 python benchmarks/calibrate.py --count 1000 --workers 2 --out benchmarks/results/calibration.json
 """
 
+import json
 import subprocess
 import time
 from pathlib import Path
@@ -15,7 +16,7 @@ from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, summarise
 from drake_clutter.config import config_yaml, load_config
-from drake_clutter.files import write_json
+from drake_clutter.files import InputError, write_json
 from drake_clutter.runner import map_ordered
 
 PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
@@ -47,10 +48,21 @@ def main(
     config: Annotated[Path | None, typer.Option(help="YAML with fields to put over the defaults.")] = None,
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
 ) -> None:
-    """Prints the table, and hidden objects by threshold, and writes both with what is needed to repeat them."""
+    """Prints the table, and hidden objects by threshold, and writes both with what is needed to repeat them.
+
+    A run that was stopped goes on with the sizes that its file lacks.
+    """
     world = load_config(config)
+    head = {"count": count, "seed": seed, "objects": objects, "workers": workers, "config": config_yaml(world)}
     rows: list[dict[str, Any]] = []
+    if out is not None and out.exists():
+        earlier = json.loads(out.read_text())
+        if {key: earlier[key] for key in head} != head:
+            raise InputError(f"--out {out}: holds results of other options; give the same options or another file")
+        rows = earlier["rows"]
     for size in nodes or PAPER_RG:
+        if any(row["nodes"] == size for row in rows):
+            continue
         job = GenerationJob("random", objects, None, size, seed, world)
         start = time.monotonic()
         scenes = map_ordered(_Size(job), range(count), workers=workers)
@@ -59,8 +71,10 @@ def main(
         shares = [m.verdict.visible_share.values() for m in made if m.verdict.stable]
         row["hidden_by_threshold"] = {str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS}
         failures = sum((m.layout_failures for m in made), start=type(made[0].layout_failures)())
-        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start}
+        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start, "commit": commit()}
         rows.append(row)
+        if out is not None:
+            write_json(out, head | {"rows": rows})
     table = Table("nodes", "stable", "paper", "hidden", "paper", *(f"< {t:g}" for t in THRESHOLDS), "s")
     for row in rows:
         paper = PAPER_RG.get(row["nodes"], (float("nan"),) * 2)
@@ -68,8 +82,6 @@ def main(
         cells += [f"{h:.2f}" for h in row["hidden_by_threshold"].values()]
         table.add_row(str(row["nodes"]), *cells, f"{row['seconds']:.0f}")
     Console().print(table)
-    if out is not None:
-        write_json(out, {"commit": commit(), "workers": workers, "config": config_yaml(world), "rows": rows})
 
 
 if __name__ == "__main__":
