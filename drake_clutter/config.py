@@ -29,7 +29,7 @@ class LayoutConfig:
     stack_gap: float = 0.010
     max_stack_height: float = 0.50
     lying_gap: float = 0.002
-    standing_gap: float = 0.040
+    standing_gap: float = 0.050
     placement_tries: int = 100
 
 

@@ -1,0 +1,150 @@
+"""Scenes by the batch: the same for any number of workers; the summary's figures on a batch made by hand."""
+
+from collections import Counter
+from functools import partial
+
+import pytest
+import yaml
+from conftest import CLASSES, GRAMMARS, rng
+
+from drake_clutter.agents.generation import (
+    GenerationJob,
+    RandomGenerator,
+    SceneGenerator,
+    mean_interval,
+    summarise,
+    wilson_interval,
+)
+from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.grammar import Derivation, NodeBudget
+from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_file import scene_fields
+from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
+
+
+def job(nodes: int = 10, seed: int = 5) -> GenerationJob:
+    return GenerationJob("random", "ycb7", None, nodes, seed, ClutterConfig())
+
+
+def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
+    """The scenes with their verdicts, as scene files."""
+    made = map_ordered(partial(SceneGenerator, which), range(count), workers=workers)
+    return [yaml.dump(scene_fields(generated.scene, generated.verdict)) for generated in made]
+
+
+def test_the_scenes_do_not_depend_on_the_number_of_workers() -> None:
+    alone = batch(job(), 4)
+    assert batch(job(), 4, workers=2) == alone
+    assert len(set(alone)) == 4
+
+
+def test_a_scene_depends_on_its_index_alone() -> None:
+    """In any order, with whatever was generated before."""
+    generator, other = SceneGenerator(job(6)), SceneGenerator(job(6))
+    forwards = [generator(index) for index in (0, 1, 2)]
+    backwards = [other(index) for index in (2, 1, 0)][::-1]
+    for one, same in zip(forwards, backwards, strict=True):
+        assert one.scene.objects == same.scene.objects
+        assert one.verdict == same.verdict
+        assert one.layout_failures == same.layout_failures
+        assert one.scene.graph is not None
+        assert len(one.scene.graph) == 6
+    assert SceneGenerator(job(6, seed=6))(0).scene.objects != forwards[0].scene.objects
+
+
+def test_graphs_that_cannot_be_laid_out_are_counted_and_drawn_anew() -> None:
+    """On a tray of 0.3 m few graphs fit."""
+    world = ClutterConfig()
+    world.layout.tray_side = 0.30
+    world.layout.max_stack_height = 0.25
+    generator = SceneGenerator(GenerationJob("random", "ycb7", None, 7, 1, world))
+    made = [generator(index) for index in range(4)]
+    failures = sum((m.layout_failures for m in made), start=Counter())
+    assert set(failures) <= {"no room on the tray", "stack too high"}
+    assert failures.total() > 0
+    for m in made:
+        assert max(o.top for o in m.scene.objects) <= 0.25
+
+
+def test_the_random_generator_is_uniform_over_feasible_rules() -> None:
+    """After the tray's only rule, three are feasible with nodes to spare."""
+    grammar = GRAMMARS["ycb7"]
+    generator = rng(0)
+    second = Counter(RandomGenerator().derive(grammar, NodeBudget(8), generator).rules[1] for _ in range(600))
+    assert set(second) == {"drop_object", "stack_object", "end"}
+    assert min(second.values()) > 200 - 4 * 11.5  # four standard deviations
+
+
+# --- Figures ---
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "low", "high"),
+    [
+        # Published examples of the score interval (Newcombe 1998, table I, method 3) and the closed forms at the ends.
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (20, 20, 0.8389, 1.0),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_wilson_interval(successes: int, count: int, low: float, high: float) -> None:
+    assert wilson_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_mean_interval() -> None:
+    """Standard deviation 2, so the mean of four is known to 1.96 * 2 / 2."""
+    assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx((2.7320508 - 1.959964, 2.7320508 + 1.959964))
+    assert mean_interval([3.0]) is None
+    assert mean_interval([]) is None
+
+
+def laid_out(*rules: str) -> Scene:
+    scene = lay_out(Derivation(GRAMMARS["ycb7"].replay(rules), rules), CLASSES, LayoutConfig(), rng())
+    assert isinstance(scene, Scene)
+    return scene
+
+
+def test_summary_of_a_batch_by_hand() -> None:
+    can, box = (("drop_object", "end", f"insert_{name}") for name in ("tomato_soup_can", "sugar_box"))
+    scenes = [
+        laid_out(*can, "orient_flat_0", *box, "orient_side_0"),  # two stacks, two objects
+        laid_out(*box, "orient_side_0", *can, "orient_upright_90"),  # the same: a can is symmetric, order says nothing
+        laid_out("drop_object", "end", "insert_meta_sugar_box_1"),  # one stack of two objects
+        laid_out("drop_object", "stack_object", "end", "insert_meta_sugar_box_2", "insert_cracker_box", "orient_flat_0"),
+    ]
+    slid = Instability(InstabilityReason.SLID, "sugar_box_3", 0.02, 0.0)
+    verdicts = [
+        Verdict(None, {}, {}, ("a", "b")),
+        Verdict(None, {}, {}, ()),
+        Verdict(slid, {}, {}, ()),
+        Verdict(None, {}, {}, ("c",)),
+    ]
+    summary = summarise(job(), list(zip(scenes, verdicts, strict=True)))
+    low, high = summary.pop("stability_ci95")
+    assert (low, high) == pytest.approx((0.3006, 0.9544), abs=5e-5)
+    assert summary.pop("hidden_ci95") == pytest.approx((1 - 1.959964 / 3**0.5, 1 + 1.959964 / 3**0.5))
+    assert summary == {
+        "nodes": 10,
+        "count": 4,
+        "stability_rate": 0.75,
+        "hidden_mean": 1.0,  # over the three that are stable
+        "distinct_share": 0.75,
+        "mean_stacks": (2 + 2 + 1 + 1) / 4,
+        "mean_objects": (2 + 2 + 2 + 3) / 4,
+        "instability_reasons": {"slid": 1},
+        "agent": "random",
+        "objects": "ycb7",
+        "seed": 5,
+    }
+
+
+def test_a_batch_without_a_stable_scene_has_no_mean() -> None:
+    scene = laid_out("drop_object", "end", "insert_sugar_box", "orient_flat_0")
+    toppled = Verdict(Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.0, 1.0), {}, {}, ())
+    summary = summarise(job(), [(scene, toppled)])
+    assert (summary["stability_rate"], summary["hidden_mean"], summary["hidden_ci95"]) == (0.0, None, None)
