@@ -1,0 +1,111 @@
+"""Is the judge's settling its own truth? Verdicts under finer and coarser steps and without the early stop, on RG stacks.
+
+python benchmarks/settle_settings.py --count 150 --out benchmarks/results/settle_settings.json
+"""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from calibrate import commit
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.generation import RandomGenerator
+from drake_clutter.catalogue import Rest, Shape, load_catalogue
+from drake_clutter.config import ClutterConfig, SettleConfig
+from drake_clutter.files import write_json
+from drake_clutter.grammar import NodeBudget, SceneGrammar
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.layout import LayoutFailure, lay_out
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle import jittered, settle
+
+NEVER = 1_000_000
+SETTINGS = {
+    "default": {},
+    "no early stop, 2.5 s": {"calm_samples": NEVER, "max_time": 2.5},
+    "1 ms steps": {"time_step": 0.001},
+    "4 ms steps": {"time_step": 0.004},
+    "other random offsets": {},
+}
+
+
+def stacks(count: int, nodes: int, seed: int, config: ClutterConfig) -> list[tuple[list[SceneObject], list[SceneObject]]]:
+    """RG stacks of two objects or more, each with two draws of its random offsets."""
+    grammar = SceneGrammar(load_catalogue().object_set("ycb7"))
+    found: list[tuple[list[SceneObject], list[SceneObject]]] = []
+    index = 0
+    while len(found) < count:
+        rng = item_rng(seed, index)
+        index += 1
+        scene = lay_out(RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config.layout, rng)
+        if isinstance(scene, LayoutFailure):
+            continue
+        for group in touching_groups(scene.objects, TOUCHING_MARGIN):
+            if len(group) > 1:
+                found.append((jittered(group, config.settle.jitter, rng), jittered(group, config.settle.jitter, rng)))
+    return found[:count]
+
+
+def rests_on_lying(group: list[SceneObject]) -> str:
+    """ "single" or "pair" if something rests on a lying cylinder or on two side by side, else ""."""
+    found = ""
+    for o in group:
+        if o.object_class.shape is not Shape.CYLINDER or o.object_class.only_rest is Rest.UPRIGHT:
+            continue
+        loaded = any(abs(other.bounds_T[0][2] - o.top) < 1e-6 for other in group)
+        beside = any(
+            other is not o and other.object_class is o.object_class and abs(other.X_TO.p[2] - o.X_TO.p[2]) < 1e-6
+            for other in group
+        )
+        if loaded:
+            found = "pair" if beside and found != "single" else "single"
+    return found
+
+
+def main(
+    count: Annotated[int, typer.Option(help="Stacks of two objects or more.")] = 150,
+    nodes: int = 25,
+    seed: int = 0,
+    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
+) -> None:
+    """Prints and writes how often each setting agrees with the default, and how stacks on lying markers fare."""
+    config = ClutterConfig()
+    groups = stacks(count, nodes, seed, config)
+    stable: dict[str, list[bool]] = {}
+    seconds: dict[str, float] = {}
+    for name, changes in SETTINGS.items():
+        settle_config: SettleConfig = replace(config.settle, **changes)
+        start = time.monotonic()
+        chosen = [second if name.startswith("other") else first for first, second in groups]
+        stable[name] = [
+            settle(group, config.layout.tray_side, settle_config).instability is None
+            for group in track(chosen, name, console=Console(stderr=True))
+        ]
+        seconds[name] = (time.monotonic() - start) / count
+    table = Table("setting", "agrees with the default", "stable", "s per stack")
+    rows: list[dict[str, Any]] = []
+    for name, verdicts in stable.items():
+        agreement = float(np.mean(np.equal(verdicts, stable["default"])))
+        rows.append({"setting": name, "agreement": agreement, "stable_share": float(np.mean(verdicts)), "seconds": seconds[name]})
+        table.add_row(name, f"{agreement:.3f}", f"{np.mean(verdicts):.3f}", f"{seconds[name]:.2f}")
+    lying = {}
+    for kind in ("single", "pair"):
+        fates = [held for (group, _), held in zip(groups, stable["default"], strict=True) if rests_on_lying(group) == kind]
+        lying[kind] = {"stacks": len(fates), "stable": sum(fates)}
+        table.add_row(f"on a {kind} of lying markers", "", f"{sum(fates)} of {len(fates)}", "")
+    Console().print(table)
+    if out is not None:
+        result = {"count": count, "nodes": nodes, "seed": seed, "commit": commit(), "settings": rows, "on_lying_markers": lying}
+        write_json(out, result)
+
+
+if __name__ == "__main__":
+    typer.run(main)
