@@ -28,7 +28,7 @@ from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import jittered, settle
 
 NEVER = 1_000_000
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "no early stop, 2.5 s": {"calm_samples": NEVER, "max_time": 2.5},
     "1 ms steps": {"time_step": 0.001},
