@@ -111,7 +111,8 @@ def test_closing_midway_does_not_wait() -> None:
     assert not active_children()
 
 
-def test_ctrl_c_ends_every_process() -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_ending_the_first_process_ends_the_others(signal_number: signal.Signals) -> None:
     code = """
 from test_runner import make_sleeper, map_ordered
 for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
@@ -126,9 +127,12 @@ for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"0.0\n"
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        if signal_number == signal.SIGINT:
+            os.killpg(process.pid, signal_number)  # as a terminal does
+        else:
+            process.send_signal(signal_number)
         _, errors = process.communicate(timeout=10)  # returns when the last process that holds the pipes has ended
-    assert errors.rstrip().endswith(b"KeyboardInterrupt")
+    assert (signal_number == signal.SIGINT) == errors.rstrip().endswith(b"KeyboardInterrupt")
 
 
 def test_a_killed_process_is_an_error() -> None:
