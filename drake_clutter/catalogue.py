@@ -36,7 +36,7 @@ class Shape(Enum):
 
 
 class Rest(Enum):
-    """Which of an object's axes points up when it rests, by its extent."""
+    """Which of an object's axes points up when it rests: by its extent, but a mesh's are taken to be x, y, z in this order."""
 
     FLAT = "flat"  # the shortest
     SIDE = "side"  # the middle one

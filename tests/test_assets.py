@@ -4,6 +4,8 @@ import base64
 import json
 import math
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -248,3 +250,12 @@ def test_station() -> None:
 
 def test_the_shipped_tray_is_the_default_config_s() -> None:
     assert shipped_path("models/tray.sdf").read_text() == tray_sdf(LayoutConfig().tray_side)
+
+
+def test_the_builder_leaves_drake_s_reader_alone() -> None:
+    """CoACD, loaded before Drake, makes Drake's SDF reader throw."""
+    code = (
+        "import drake_clutter.assets, drake_clutter.simulation.plant as p; from pydrake.systems.framework import DiagramBuilder;"
+        "p.add_scene_plant(DiagramBuilder(), [], 0.7, 0.01, visuals=False)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from conftest import CLASSES, resting, rng
+from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
@@ -97,13 +98,12 @@ def test_a_can_on_a_can() -> None:
 def random_pairs(names: tuple[str, str], count: int, reach: float) -> list[tuple[SceneObject, SceneObject]]:
     """Two objects near each other, turned any way."""
     generator = rng(1)
-    pairs = []
-    for _ in range(count):
-        poses = [Pose.of(Rotation.random(rng=generator).as_matrix(), generator.uniform(0, reach, 3)) for _ in names]
-        pairs.append(
-            (SceneObject("a", CLASSES[names[0]], poses[0]), SceneObject("b", CLASSES[names[1]], poses[1].moved((0, 0, 1.0))))
-        )
-    return [(a, SceneObject("b", b.object_class, b.X_TO.moved((0, 0, -1.0)))) for a, b in pairs]
+
+    def anyhow(name: str, class_name: str) -> SceneObject:
+        rotation = Rotation.random(rng=generator).as_matrix()
+        return SceneObject(name, CLASSES[class_name], Pose.of(rotation, generator.uniform(0, reach, 3)))
+
+    return [(anyhow("a", names[0]), anyhow("b", names[1])) for _ in range(count)]
 
 
 @pytest.mark.parametrize("names", [("cracker_box", "sugar_box"), ("sugar_box", "pasta_box"), ("gelatin_box", "gelatin_box")])
@@ -163,14 +163,14 @@ def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
     return any(penetration(a, SceneObject("b", b.object_class, b.X_TO.moved(distance * d))) < 0 for d in directions)
 
 
-def points_inside(o: SceneObject, generator: np.random.Generator) -> np.ndarray:
+def points_inside(o: SceneObject, generator: np.random.Generator) -> NDArray[np.float64]:
     """(N, 3) m in O, within the cylinder, a bit inside the prism that stands for it."""
     radius, half = 0.99 * o.object_class.size[0] / 2, o.object_class.size[2] / 2
     angle, distance = generator.uniform(0, 2 * math.pi, 2000), radius * np.sqrt(generator.uniform(size=2000))
     return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), generator.uniform(-half, half, 2000)])
 
 
-def inside(o: SceneObject, p_T: np.ndarray) -> np.ndarray:
+def inside(o: SceneObject, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(N,) whether points in the tray frame lie in a box, or in a cylinder of 99 % the radius."""
     p_O = (p_T - o.X_TO.p) @ o.X_TO.rotation
     half = np.asarray(o.object_class.size) / 2

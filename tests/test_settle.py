@@ -47,8 +47,8 @@ FALLING: dict[str, tuple[list[SceneObject], InstabilityReason, str]] = {
         [resting("cracker_box", xy=(0.6, 0.0), name="a"), resting("sugar_box", xy=(0.6, 0.0), floor=0.060, name="b")],
         *(InstabilityReason.LEFT_TRAY, "a"),
     ),
-    "a box off the middle of a narrow foot": (
-        [resting("large_marker", UPRIGHT, name="foot"), resting("gelatin_box", xy=(0.014, 0.0), floor=0.121, name="above")],
+    "a tall box beyond the edge of its foot": (
+        [resting("gelatin_box", name="foot"), resting("cracker_box", UPRIGHT, (0.060, 0.0), floor=0.028, name="above")],
         *(InstabilityReason.TOPPLED, "above"),
     ),
 }

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-import coacd
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -104,6 +103,8 @@ def _convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Convex hulls that together cover the mesh (CoACD, Wei et al. 2022); one for a convex mesh."""
     if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
         return [mesh.convex_hull]
+    import coacd  # not above: loaded before Drake, it breaks Drake's SDF reader
+
     coacd.set_log_level("error")
     pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD)
     low, high = mesh.bounds

@@ -40,7 +40,9 @@ class Orientation(Enum):
 
 def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
     """Indices of O's axes that lie along the tray's x, and point up."""
-    short, middle, long = (int(axis) for axis in np.argsort(object_class.size, kind="stable"))
+    # A mesh is made to stand on its z, whatever sticks out of it.
+    by_extent = range(3) if object_class.shape is Shape.MESH else np.argsort(object_class.size, kind="stable")
+    short, middle, long = (int(axis) for axis in by_extent)
     rest = object_class.only_rest or rest
     return {Rest.FLAT: (long, short), Rest.SIDE: (long, middle), Rest.UPRIGHT: (middle, long)}[rest]
 

@@ -30,10 +30,13 @@ from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_tr
 
 _RENDERER = "vtk"
 # Two lamps beside the camera; the second keeps what turns away from the first from going black.
-_LIGHTS = [
-    LightParameter(type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4),
-    LightParameter(type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9),
-]
+_ENGINE = RenderEngineVtkParams(
+    backend="EGL",
+    lights=[
+        LightParameter(type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4),
+        LightParameter(type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9),
+    ],
+)
 _NO_OBJECT = -1
 
 
@@ -58,8 +61,10 @@ class OverheadCamera:
     Camera frame C: origin at the config's altitude over the tray's centre, z down along the optical axis, x along the tray's x.
     """
 
-    def __init__(self, config: CameraConfig) -> None:
+    def __init__(self, config: CameraConfig, engine: RenderEngineVtkParams = _ENGINE) -> None:
+        """Makes a camera; `engine` sets light, background and shadows."""
         self.config = config
+        self._engine = engine
         self._counts: Counter[ObjectClass] = Counter()
         self._tray_side = 0.0
         core = RenderCameraCore(
@@ -79,9 +84,7 @@ class OverheadCamera:
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, tray_side, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
-        self._scene_plant.scene_graph.AddRenderer(
-            _RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL", lights=_LIGHTS))
-        )
+        self._scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(self._engine))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._counts, self._tray_side = counts, tray_side
@@ -112,8 +115,8 @@ class OverheadCamera:
             plant.SetFreeBodyPose(context, self._scene_plant.bodies[name], X_TO)
         return labels
 
-    def _label_image(self, labels: Mapping[int, int]) -> NDArray[np.int64]:
-        image = self._query().RenderLabelImage(self._color_camera, self._world_frame(), self._X_TC)
+    def _label_image(self, labels: Mapping[int, int], X_TC: RigidTransform) -> NDArray[np.int64]:
+        image = self._query().RenderLabelImage(self._color_camera, self._world_frame(), X_TC)
         lookup = np.full(2**15, _NO_OBJECT)
         lookup[list(labels)] = list(labels.values())
         return np.asarray(lookup[image.data[..., 0]])
@@ -136,11 +139,11 @@ class OverheadCamera:
         X = self._X_TC if X_TC is None else rigid_transform(X_TC)
         color = self._query().RenderColorImage(self._color_camera, self._world_frame(), X)
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), X)
-        return Images(color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels))
+        return Images(color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels, X))
 
     def label(self, scene: Scene) -> NDArray[np.int64]:
         """The label image alone, see `Images`."""
-        return self._label_image(self._show(scene, scene.names))
+        return self._label_image(self._show(scene, scene.names), self._X_TC)
 
     def visible_shares(self, scene: Scene) -> dict[str, float]:
         """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
@@ -151,7 +154,7 @@ class OverheadCamera:
         alone = np.zeros(len(scene.objects), int)
         for together in self._apart_in_image(scene):
             labels = self._show(scene, {scene.objects[i].name for i in together})
-            counts = np.bincount(self._label_image(labels).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+            counts = np.bincount(self._label_image(labels, self._X_TC).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
             alone[together] = counts[together]
         return {o.name: float(seen[i] / alone[i]) if alone[i] else 1.0 for i, o in enumerate(scene.objects)}
 

@@ -1,0 +1,147 @@
+"""Drawing on pictures: outlines, dashes, arrows, and labels that keep out of each other's way. Positions are pixels, (x, y)."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_erosion, distance_transform_edt
+from scipy.spatial import ConvexHull
+
+_HALO = "#ffffff"
+
+
+@lru_cache
+def font(size: int) -> ImageFont.FreeTypeFont:
+    """A bold sans-serif font of a height in pixels."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size)
+
+
+@dataclass(frozen=True)
+class Label:
+    """A few words that belong to a place in a picture.
+
+    Attributes:
+        text: the words.
+        anchor: (x, y), what the label is about.
+        colour: of its box, or of its words if it is faint.
+        size: height of the font.
+        faint: dark words on a pale box, without a line to the anchor.
+    """
+
+    text: str
+    anchor: tuple[float, float]
+    colour: str
+    size: int
+    faint: bool = False
+
+
+@dataclass
+class Canvas:
+    """A picture that is drawn on.
+
+    Attributes:
+        image: RGB.
+        taken: rectangles (left, top, right, bottom) that labels keep clear of.
+    """
+
+    image: Image.Image
+    taken: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    @property
+    def _draw(self) -> ImageDraw.ImageDraw:
+        return ImageDraw.Draw(self.image, "RGBA")
+
+    def outline(self, mask: NDArray[np.bool_], colour: str, width: int) -> None:
+        """The inner edge of a region (height, width) of the picture."""
+        edge = mask & ~binary_erosion(mask, iterations=width)
+        self.image.paste(Image.new("RGB", self.image.size, colour), mask=Image.fromarray(edge))
+
+    def dashed(self, corners: NDArray[np.float64], colour: str, width: int) -> None:
+        """The convex hull of points (N, 2), as a dashed line on a pale one."""
+        hull = corners[ConvexHull(corners).vertices]
+        ring = [(float(x), float(y)) for x, y in (*hull, hull[0])]
+        self._draw.line(ring, fill=_HALO + "a0", width=width + 4, joint="curve")
+        dash, left, on = 5.0 * width, 5.0 * width, True
+        for (x0, y0), (x1, y1) in itertools.pairwise(ring):
+            length, done = math.hypot(x1 - x0, y1 - y0), 0.0
+            while done < length:
+                step = min(left, length - done)
+                a, b = done / length, (done + step) / length
+                if on:
+                    ends = [(x0 + a * (x1 - x0), y0 + a * (y1 - y0)), (x0 + b * (x1 - x0), y0 + b * (y1 - y0))]
+                    self._draw.line(ends, fill=colour, width=width)
+                done, left = done + step, left - step
+                if left <= 0:
+                    left, on = (0.6 * dash, False) if on else (dash, True)
+
+    def arrow(self, start: tuple[float, float], end: tuple[float, float], colour: str, width: int) -> None:
+        """A slightly bent arrow; nothing if it would be shorter than its head."""
+        a, b = np.asarray(start), np.asarray(end)
+        along = b - a
+        length, head = float(np.hypot(*along)), 4.5 * width
+        if length < 1.5 * head:
+            return
+        bend = (a + b) / 2 + 0.12 * np.array([along[1], -along[0]])
+        t = np.linspace(0, 1, 40)[:, None]
+        curve = (1 - t) ** 2 * a + 2 * t * (1 - t) * bend + t**2 * b
+        direction = (b - bend) / np.hypot(*(b - bend))
+        across = np.array([-direction[1], direction[0]])
+        shaft = [(float(x), float(y)) for x, y in curve if np.hypot(*(b - [x, y])) > 0.8 * head]
+        for fill, margin in ((_HALO, 4), (colour, 0)):
+            tip, back = b + 1.5 * margin * direction, b - (head + margin) * direction
+            wings = [back + side * (0.55 * head + 1.3 * margin) * across for side in (-1, 1)]
+            self._draw.line(shaft, fill=fill, width=width + 2 * margin, joint="curve")
+            self._draw.polygon([(float(x), float(y)) for x, y in (tip, *wings)], fill=fill)
+        self.taken += [(x - width, y - width, x + width, y + width) for x, y in shaft]
+
+    def labels(self, labels: Sequence[Label]) -> None:
+        """Labels, each as near to its anchor as there is room; the first ones choose first."""
+        placed = []
+        for label in labels:
+            box = self._room(label)
+            self.taken.append(box)
+            placed.append((label, box))
+        for label, (left, top, right, bottom) in placed:
+            x, y = label.anchor
+            if not label.faint and not (left <= x <= right and top <= y <= bottom):
+                end = (min(max(x, left), right), min(max(y, top), bottom))
+                self._draw.line([label.anchor, end], fill=_HALO, width=8)
+                self._draw.line([label.anchor, end], fill=label.colour, width=4)
+                self._draw.ellipse((x - 7, y - 7, x + 7, y + 7), fill=label.colour, outline=_HALO, width=2)
+        for label, box in placed:
+            fill, ink = ("#ffffffd8", label.colour) if label.faint else (label.colour, "#ffffff")
+            self._draw.rounded_rectangle(box, label.size * 0.35, fill=fill, outline=None if label.faint else _HALO, width=2)
+            self._draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), label.text, ink, font(label.size), anchor="mm")
+
+    def _room(self, label: Label) -> tuple[float, float, float, float]:
+        width = font(label.size).getlength(label.text) + 0.7 * label.size
+        height = 1.4 * label.size
+        best, least = (0.0, 0.0, width, height), math.inf
+        for radius, angle in itertools.product(np.arange(0, 12) * 0.8 * height, np.arange(12) * (math.pi / 6)):
+            x = label.anchor[0] + radius * math.cos(angle) * 1.5
+            y = label.anchor[1] - radius * math.sin(angle)
+            x = min(max(x, width / 2 + 4), self.image.width - width / 2 - 4)
+            y = min(max(y, height / 2 + 4), self.image.height - height / 2 - 4)
+            box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+            cost = sum(_overlap(box, other) for other in self.taken) + 0.02 * height * radius
+            if cost < least:
+                best, least = box, cost
+        return best
+
+
+def middle(mask: NDArray[np.bool_]) -> tuple[float, float]:
+    """The point (x, y) of a region (height, width) that lies farthest from its edge."""
+    row, column = np.unravel_index(int(np.argmax(distance_transform_edt(np.pad(mask, 1)))), np.add(mask.shape, 2))
+    return float(column - 1), float(row - 1)
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> float:
+    """Common area, px^2."""
+    return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))

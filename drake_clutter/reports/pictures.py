@@ -1,0 +1,203 @@
+"""Pictures of scenes for people: from above and at an angle, with shadows; and with what matters marked."""
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydrake.geometry import LightParameter, RenderEngineVtkParams
+from scipy.ndimage import find_objects
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.reports.drawing import Canvas, Label, middle
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.simulation.camera import Images, OverheadCamera
+
+OVERHEAD_SIZE = (720, 720)
+OBLIQUE_SIZE = (960, 720)
+"""Width and height, pixels."""
+# Pictures are rendered and drawn larger and scaled down, which smooths the edges.
+_OVERSAMPLING = 2
+_FOV_Y_DEG = 30.0
+# For a tray of 0.7 m, that is, with room for a stack at its rim; pictures of other trays are taken from farther or nearer.
+_ALTITUDE, _TRAY_SIDE = 1.60, 0.70
+_EYE, _TARGET = (0.45, -1.30, 1.05), (0.0, -0.02, 0.08)
+
+
+def _lamp(kind: str, position: tuple[float, float, float], intensity: float, frame: str = "world") -> LightParameter:
+    return LightParameter(
+        type=kind,
+        position=position,
+        direction=[-v for v in position] if any(position) else [0, 0, 1],
+        frame=frame,
+        intensity=intensity,
+        attenuation_values=[1, 0, 0],
+        cone_angle=16,
+    )
+
+
+# Only the spot casts shadows: point lights cannot, and directional ones would also shine through what is parked out of sight.
+_ENGINE = RenderEngineVtkParams(
+    backend="EGL",
+    default_clear_color=[0.95, 0.955, 0.96],
+    lights=[
+        _lamp("spot", (-0.75, -0.85, 2.6), 2.0),
+        _lamp("point", (0.0, 0.0, 0.0), 0.7, "camera"),
+        _lamp("point", (1.2, -1.8, 1.2), 0.5),
+        _lamp("point", (-1.5, 1.2, 1.2), 0.4),
+    ],
+    cast_shadows=True,
+    shadow_map_size=2048,
+)
+
+
+class Mark(Enum):
+    """What a colour says in annotated pictures; the value is sRGB."""
+
+    IN_VIEW = "#1f2630"
+    MOVED = "#0b5cd6"
+    FOUND = "#0c7c45"
+    HIDDEN = "#c2187e"
+    COVERED = "#5a6270"
+    FALLEN = "#c8360b"
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What an annotated picture points out; objects are given by name.
+
+    Attributes:
+        hidden: out of view and not found yet: dashed where they are.
+        covered: out of view, but found before: dashed.
+        found: newly found.
+        fallen: did not stay.
+        moved: the object that a move is about, or None.
+        X_T_placed: where the move puts it: an arrow leads there; None for no arrow.
+    """
+
+    hidden: tuple[str, ...] = ()
+    covered: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
+    fallen: tuple[str, ...] = ()
+    moved: str | None = None
+    X_T_placed: Pose | None = None
+
+    def of(self, name: str) -> Mark:
+        """The mark of an object."""
+        if name == self.moved:
+            return Mark.MOVED
+        groups = {Mark.FALLEN: self.fallen, Mark.FOUND: self.found, Mark.HIDDEN: self.hidden, Mark.COVERED: self.covered}
+        return next((mark for mark, names in groups.items() if name in names), Mark.IN_VIEW)
+
+
+def humanised(name: str) -> str:
+    """A name of an object, or a key, as people write it: "sugar_box_3" is "Sugar box 3"."""
+    words = name.replace("_", " ").strip()
+    return words[:1].upper() + words[1:]
+
+
+def _short(name: str) -> str:
+    """The number at a name's end, if it has one: pictures of many objects have no room for more."""
+    number = re.search(r"\d+$", name)
+    return number.group() if number else humanised(name)
+
+
+def _look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Pose:
+    """X_TC of a camera at `eye` (3,) m that looks at `target` (3,) m, upright."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    return Pose.of(np.column_stack([x, np.cross(z, x), z]), eye)
+
+
+class PictureCamera:
+    """Takes pictures of scenes."""
+
+    def __init__(self) -> None:
+        self._latest: tuple[Scene, Images] | None = None
+
+    def overhead(self, scene: Scene) -> NDArray[np.uint8]:
+        """The tray from straight above, (720, 720, 3) uint8."""
+        return _scaled(Image.fromarray(self._from_above(scene).color))
+
+    def oblique(self, scene: Scene) -> NDArray[np.uint8]:
+        """The tray from the front, at an angle, (720, 960, 3) uint8."""
+        scale = scene.tray_side / _TRAY_SIDE
+        images = self._oblique.render(scene, _look_at(scale * np.array(_EYE), scale * np.array(_TARGET)))
+        return _scaled(Image.fromarray(images.color))
+
+    def annotated(self, scene: Scene, marks: Marks) -> NDArray[np.uint8]:
+        """`overhead`, with the objects outlined and named, (720, 720, 3) uint8.
+
+        What is in view and not marked bears only the number of its name.
+        """
+        images = self._from_above(scene)
+        canvas = Canvas(Image.fromarray(images.color))
+        areas = find_objects(images.label + 1, max_label=len(scene.objects))
+        dashed, strong, weak, anchors = [], [], [], {}
+        for index, (scene_object, area) in enumerate(zip(scene.objects, areas, strict=True)):
+            mark = marks.of(scene_object.name)
+            outside = area is None
+            if outside or mark in (Mark.HIDDEN, Mark.COVERED):
+                corners = self._project(scene, scene_object.corners_T)
+                if outside and not np.isfinite(corners).all():
+                    continue
+                anchors[scene_object.name] = tuple(float(v) for v in (corners.min(axis=0) + corners.max(axis=0)) / 2)
+                if mark in (Mark.HIDDEN, Mark.COVERED):
+                    dashed.append((corners, mark))
+            else:
+                mask = images.label == index
+                rows, columns = area
+                x, y = middle(mask[area])
+                anchors[scene_object.name] = (columns.start + x, rows.start + y)
+                canvas.outline(mask, mark.value, 3 if mark is Mark.IN_VIEW else 9)
+            if mark is Mark.IN_VIEW:
+                if not outside:
+                    weak.append(Label(_short(scene_object.name), anchors[scene_object.name], mark.value, 38, faint=True))
+            else:
+                strong.append(Label(humanised(scene_object.name), anchors[scene_object.name], mark.value, 46))
+        if marks.moved in anchors and marks.X_T_placed is not None:
+            landed = self._project(scene, marks.X_T_placed.apply(scene[marks.moved].object_class.corners))
+            dashed.append((landed, Mark.MOVED))
+        for corners, mark in dashed:
+            canvas.dashed(corners, mark.value, 6)
+        if marks.moved in anchors and marks.X_T_placed is not None:
+            x, y = (landed.min(axis=0) + landed.max(axis=0)) / 2
+            canvas.arrow(anchors[marks.moved], (float(x), float(y)), Mark.MOVED.value, 12)
+        canvas.labels(strong + weak)
+        return _scaled(canvas.image)
+
+    @cached_property
+    def _overhead(self) -> OverheadCamera:
+        return _camera(OVERHEAD_SIZE)
+
+    @cached_property
+    def _oblique(self) -> OverheadCamera:
+        return _camera(OBLIQUE_SIZE)
+
+    def _from_above(self, scene: Scene) -> Images:
+        # One move's picture "after" shows the same scene as the next one's "before".
+        if self._latest is None or self._latest[0] is not scene:
+            altitude = _ALTITUDE * scene.tray_side / _TRAY_SIDE
+            self._latest = scene, self._overhead.render(scene, Pose((0.0, 0.0, altitude), (0.0, 1.0, 0.0, 0.0)))
+        return self._latest[1]
+
+    def _project(self, scene: Scene, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (N, 2) in the picture from above, before it is scaled down, of points (N, 3) m in the tray frame."""
+        config = self._overhead.config
+        # Nothing reaches the camera, save what a collapse has flung there.
+        distance = np.maximum(_ALTITUDE * scene.tray_side / _TRAY_SIDE - p_T[:, 2:], 0.05)
+        centre = (np.array([config.width, config.height]) - 1) / 2
+        return np.asarray(centre + config.focal_length * p_T[:, :2] * [1, -1] / distance)
+
+
+def _camera(size: tuple[int, int]) -> OverheadCamera:
+    width, height = size
+    return OverheadCamera(CameraConfig(_OVERSAMPLING * width, _OVERSAMPLING * height, _FOV_Y_DEG, _ALTITUDE), _ENGINE)
+
+
+def _scaled(picture: Image.Image) -> NDArray[np.uint8]:
+    return np.asarray(picture.resize((picture.width // _OVERSAMPLING, picture.height // _OVERSAMPLING), Image.Resampling.LANCZOS))

@@ -1,0 +1,175 @@
+"""Scenes that move, in the browser: one HTML file that plays offline, or a live view (Meshcat)."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import (
+    Meshcat,
+    MeshcatAnimation,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Role,
+)
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation, Slerp
+
+from drake_clutter.files import write_text
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import Frame, MoveResult
+from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+from drake_clutter.tasks.exploration import Step
+
+FRAMES_PER_SECOND = 30
+_CARRY_TIME = 0.5
+"""s, for each of up, across and down."""
+_PAUSE, _LONG_PAUSE = 0.6, 1.5
+"""s, after each move; before the first and after the last."""
+_CLEARANCE = 0.03
+"""m, between what is carried and the highest other object."""
+_SAME_DISTANCE, _SAME_TURN = 1e-4, 1e-3
+"""m, rad; poses that differ by less share a key frame, which makes the file a third as large."""
+_FOREVER = 1_000_000_000
+_EYE, _TARGET = (0.40, -1.15, 0.85), (0.0, 0.0, 0.05)
+"""m, for a tray of 0.7 m."""
+
+
+def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
+    """An episode's moves as one motion: each object is lifted, carried over and set down, then everything settles.
+
+    The lifting and carrying illustrates what happens in one instant when moves are made by teleport; it is not a robot's
+    motion. Moves that could not be carried out are left out.
+    """
+    poses, time = dict(start.poses), _LONG_PAUSE
+    frames = [Frame(0.0, dict(poses))]
+    scene = start
+    for step in steps:
+        if step.outcome.result not in (MoveResult.PLACED, MoveResult.COLLAPSED):
+            continue
+        pick, motion = step.move.pick, step.outcome.motion
+        released = motion[0].poses.get(pick) if motion else None
+        for X_TO in _carried(scene, pick, released or step.outcome.scene[pick].X_TO):
+            poses[pick] = X_TO
+            frames.append(Frame(time, dict(poses)))
+            time += 1 / FRAMES_PER_SECOND
+        for frame in motion:
+            poses |= frame.poses
+            frames.append(Frame(time + frame.time, dict(poses)))
+        scene = step.outcome.scene
+        poses = dict(scene.poses)
+        time = frames[-1].time + _PAUSE
+        frames.append(Frame(time, dict(poses)))
+    frames.append(Frame(frames[-1].time + _LONG_PAUSE, dict(poses)))
+    return frames
+
+
+def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
+    """The illustrated way of an object from where it is to its place, at 30 Hz: up, across, down."""
+    picked = scene[pick]
+    # Its lowest point may lie below its origin by as much as its farthest corner.
+    reach = float(np.linalg.norm(picked.object_class.corners, axis=1).max())
+    tops = [o.top for o in scene.objects if o.name != pick]
+    height = max([picked.X_TO.p[2], X_T_placed.p[2], *(top + reach for top in tops)]) + _CLEARANCE
+    start, end = picked.X_TO.p, X_T_placed.p
+    corners = np.array([start, [start[0], start[1], height], [end[0], end[1], height], end])
+    turn = Slerp([0.0, 1.0], Rotation.from_matrix([picked.X_TO.rotation, X_T_placed.rotation]))
+    count = round(_CARRY_TIME * FRAMES_PER_SECOND)
+    share = np.arange(count) / count
+    smooth = share**2 * (3 - 2 * share)
+    poses = []
+    for leg in range(3):
+        for s in smooth:
+            turned = (0.0, s, 1.0)[leg]
+            poses.append(Pose.of(turn(turned).as_matrix(), corners[leg] + s * (corners[leg + 1] - corners[leg])))
+    return poses
+
+
+def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
+    """Writes one HTML file that shows the frames again and again, without a network.
+
+    Args:
+        path: the file.
+        scene: the objects, and the pose of those that a frame does not name.
+        frames: in order of time; a single one is a still scene.
+    """
+    with _quiet():
+        meshcat, paths = _shown(scene)
+    if len(frames) > 1:
+        animation = MeshcatAnimation(FRAMES_PER_SECOND)
+        animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
+        animation.set_repetitions(_FOREVER)
+        animation.set_autoplay(True)
+        numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
+        for name, at_rest in scene.poses.items():
+            for index, pose in _key_frames([frame.poses.get(name, at_rest) for frame in frames]):
+                animation.SetTransform(numbers[index], paths[name], rigid_transform(pose))
+        meshcat.SetAnimation(animation)
+    write_text(path, meshcat.StaticHtml())
+
+
+def serve(scene: Scene) -> Meshcat:
+    """Shows a scene at `web_url()` of what is returned, on this machine only, for as long as that is kept."""
+    with _quiet():
+        return _shown(scene)[0]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Drake from announcing an address: nobody is to open that of a recording; that of a view is for the caller to say."""
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
+    """A viewer with the scene in it, and the Meshcat path of each object by name."""
+    builder = DiagramBuilder()
+    objects = [(o.name, o.object_class) for o in scene.objects]
+    scene_plant = add_scene_plant(builder, objects, scene.tray_side, 0.01, visuals=True)
+    plant = scene_plant.plant
+    plant.Finalize()
+    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    visualizer = MeshcatVisualizer.AddToBuilder(
+        builder, scene_plant.scene_graph, meshcat, MeshcatVisualizerParams(role=Role.kIllustration, prefix="/scene")
+    )
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    scene_plant.set_poses(plant.GetMyMutableContextFromRoot(context), scene.objects)
+    visualizer.ForcedPublish(visualizer.GetMyContextFromRoot(context))
+
+    scale = scene.tray_side / 0.70
+    meshcat.SetCameraPose(scale * np.array(_EYE), scale * np.array(_TARGET))
+    for path in ("/Grid", "/Axes"):
+        meshcat.SetProperty(path, "visible", False)
+    for which, colour in (("top_color", [0.88, 0.90, 0.93]), ("bottom_color", [0.98, 0.98, 0.98])):
+        meshcat.SetProperty("/Background", which, colour)
+    inspector = scene_plant.scene_graph.model_inspector()
+    frame_ids = {name: plant.GetBodyFrameIdOrThrow(body.index()) for name, body in scene_plant.bodies.items()}
+    return meshcat, {name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()}
+
+
+def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
+    """Index and pose of the frames between which a viewer may interpolate; an object that rests has one at each end of its rest."""
+    keys = [(0, poses[0])]
+    for index, pose in enumerate(poses[1:], start=1):
+        last, held = keys[-1]
+        if _same(held, pose):
+            continue
+        if last < index - 1:
+            keys.append((index - 1, held))
+        keys.append((index, pose))
+    last, held = keys[-1]
+    return keys if last == len(poses) - 1 else [*keys, (len(poses) - 1, held)]
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    # A turn by a small angle moves the unit quaternion by half of it; q and -q are one rotation.
+    turn = 2 * min(np.linalg.norm(np.subtract(a.quaternion, b.quaternion)), np.linalg.norm(np.add(a.quaternion, b.quaternion)))
+    return bool(np.linalg.norm(a.p - b.p) < _SAME_DISTANCE and turn < _SAME_TURN)
