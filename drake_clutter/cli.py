@@ -141,8 +141,7 @@ def generate(
     from drake_clutter.config import load_config
 
     job = GenerationJob(agent.value, objects, catalogue, nodes, seed, load_config(config))
-    columns = (TextColumn("scenes"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_err) as bar:
+    with _progress("scenes") as bar:
 
         def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
             return bar.track(made, total=total, completed=done)
@@ -183,6 +182,56 @@ def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
         return
     shown = {key: fields[key] for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")}
     _print(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
+
+
+@app.command()
+def evaluate(
+    scenes: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of judged scene files, as `generate` wrote them.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON with the rows and every episode.")],
+    agents: Annotated[list[ExplorerName] | None, typer.Option("--agent", help="May be repeated; all if not given.")] = None,
+    max_moves: Annotated[int, typer.Option(min=1, help="Moves after which an episode ends.")] = 10,
+    count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
+    seed: SeedOption = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Local processes; the result is the same for any number.")] = 1,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare explorers on the stable scenes of a folder that hide something."""
+    from drake_clutter.commands import evaluate as command
+    from drake_clutter.config import load_config
+
+    world = load_config(config)
+    played = command.playable(scenes, catalogue)[:count]
+    names = [agent.value for agent in agents or ExplorerName]
+    with _progress("episodes") as bar:
+
+        def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
+            return bar.track(results, total=total)
+
+        rows = command.evaluate(played, names, max_moves, seed, world, catalogue, workers, out, progress)
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return
+    table = Table(
+        "agent", "episodes", "success", "95 %", "hidden", "found", "moves", "ended", title=f"{scenes}, {max_moves} moves"
+    )
+    for row in rows:
+        low, high = row["success_ci95"]
+        numbers = (
+            f"{row['success_rate']:.2f}",
+            f"{low:.2f} to {high:.2f}",
+            f"{row['hidden_mean']:.2f}",
+            f"{row['found_mean']:.2f}",
+        )
+        ended = ", ".join(f"{n} {why}" for why, n in row["ended"].items())
+        table.add_row(row["agent"], str(row["episodes"]), *numbers, f"{row['moves_mean']:.1f}", ended)
+    _out.print(table)
+
+
+def _progress(what: str) -> Progress:
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=_err)
 
 
 @app.command()

@@ -105,9 +105,10 @@ def test_depth_in_the_middle_is_the_distance_to_the_top(objects: list[SceneObjec
 
 def test_shapes_and_types(camera: OverheadCamera) -> None:
     images = camera.render(SCATTERED)
-    assert (images.color.shape, images.color.dtype) == ((480, 640, 3), np.uint8)
-    assert (images.depth.shape, images.depth.dtype) == ((480, 640), np.float32)
-    assert images.label.shape == (480, 640)
+    assert images.color.shape == (480, 640, 3)
+    assert images.color.dtype == np.dtype(np.uint8)
+    assert images.depth.shape == images.label.shape == (480, 640)
+    assert images.depth.dtype == np.dtype(np.float32)
     assert set(np.unique(images.label)) == {-1, 0, 1, 2, 3, 4}
     assert np.isinf(images.depth[0, 0])  # beside the tray
     assert np.array_equal(camera.label(SCATTERED), images.label)
@@ -209,7 +210,9 @@ def test_detections_of_a_random_heap_are_those_above_the_threshold(detector: Lab
     generator = rng(4)
     heap = scene_of(
         *(
-            resting("pudding_box", Orientation.FLAT_60, generator.uniform(-0.1, 0.1, 2), floor=0.035 * k, name=f"pudding {k}")
+            resting(
+                "pudding_box", Orientation.FLAT_60, generator.uniform(-0.1, 0.1, 2).tolist(), floor=0.035 * k, name=f"pudding {k}"
+            )
             for k in range(8)
         )
     )

@@ -101,6 +101,23 @@ def test_explore_finds_what_is_below(scene: Path, tmp_path: Path) -> None:
     assert (out / "index.html").is_file()
 
 
+def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
+    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": {}}
+    (tmp_path / "scenes").mkdir()
+    for name in ("one", "two"):
+        (tmp_path / f"scenes/{name}.yaml").write_text(broken(verdict=verdict))
+    alone, together = tmp_path / "alone.json", tmp_path / "together.json"
+    agents = ("--agent", "random", "--agent", "largest-first")
+    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--out", alone)
+    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--workers", "2", "--out", together)
+    assert alone.read_bytes() == together.read_bytes()
+    random, largest_first = json.loads(alone.read_text())["rows"]
+    assert random["agent"] == "random"
+    assert largest_first["success_rate"] == 1.0
+    assert largest_first["moves_mean"] == 1.0
+    assert largest_first["hidden_mean"] == largest_first["found_mean"] == 1.0
+
+
 def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
     moves = tmp_path / "moves.yaml"
     moves.write_text("- {pick: above, place: tray}\n- {pick: below, place: above}\n")
@@ -150,6 +167,7 @@ def broken(**changes: object) -> str:
         (("explore", "unknown.yaml", "--out", "new"), ("unknown.yaml", "objects[0].class", "teapot")),
         (("explore", "overlap.yaml", "--out", "new"), ("overlap.yaml", "above", "below", "mm")),
         (("explore", "unstable.yaml", "--out", "new"), ("not stable",)),
+        (("evaluate", "full", "--out", "new.json"), ("full", "no scene files")),
         (("move", "scene.yaml", "--pick", "below", "--place", "tray", "--out", "new"), ("below", "not in view")),
         (("move", "scene.yaml", "--pick", "above", "--out", "new"), ("--pick", "--moves")),
         (("export", "scene.yaml", "--format", "glb", "--out", "full"), ("full", "not empty")),

@@ -1,7 +1,6 @@
 """The exploration episode's book-keeping, on scripted outcomes and on real ones; the agents that need no learning."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,13 +55,14 @@ def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) 
 
 def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
     task = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_SPOT, MoveResult.PLACED)
-    assert task.known == ("cover 1", "cover 2", "marker")
+    at_first = task.known
+    assert at_first == ("cover 1", "cover 2", "marker")
     assert task.hidden_at_start == ("g1", "g2", "p")
     assert (task.found, task.end) == ((), None)
 
     first = task.step(Move("cover 1"), rng())
     assert (first.newly_found, first.reward) == (("g1", "g2"), 4.0)
-    assert task.known == ("cover 1", "cover 2", "marker", "g1", "g2")
+    assert task.known == (*at_first, "g1", "g2")
     assert (task.found, task.end) == (("g1", "g2"), None)
 
     look = task.look
@@ -245,10 +245,12 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
 def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
     observation = detector.look(HIDING).observation
 
-    def choices(seed: int) -> Sequence[Move | None]:
-        agent, generator, tried = EXPLORATION_AGENTS[name](), rng(seed), []
+    def choices(seed: int) -> list[Move]:
+        agent, generator = EXPLORATION_AGENTS[name](), rng(seed)
+        tried: list[Move] = []
         for _ in range(8):
             move = agent.choose(observation, tried, generator)
+            assert move is not None
             assert move in legal_moves(observation)
             tried.append(move)
         return tried

@@ -8,7 +8,7 @@ import numpy as np
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.scenes.seams import Detection, Move, Observation
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.tasks.exploration import ExplorationTask, Step, legal_moves
 
 
 class ExplorationAgent(Protocol):
@@ -68,3 +68,14 @@ EXPLORATION_AGENTS: dict[str, Callable[[], ExplorationAgent]] = {
     "largest-first": LargestFirst,
     "largest-clear": LargestClear,
 }
+
+
+def play(
+    task: ExplorationTask, agent: ExplorationAgent, rng: np.random.Generator, report: Callable[[Step], None] = lambda _: None
+) -> None:
+    """Lets an agent play a task to its end, or until it has no move left; `report` is called after each move."""
+    while task.end is None:
+        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
+        if move is None:
+            return
+        report(task.step(move, rng))

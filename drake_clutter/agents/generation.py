@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
+from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
@@ -125,7 +125,7 @@ def summarise(job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]]) -> di
     reasons: Counter[str] = Counter()
     for scene, verdict in scenes:
         assert scene.graph is not None
-        stacks.append(_stack_count(scene.graph))
+        stacks.append(len(scene.graph.stacks()))
         objects.append(len(scene.objects))
         forms.add(canonical_form(scene.graph, classes))
         if verdict.instability is None:
@@ -149,12 +149,3 @@ def summarise(job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]]) -> di
         "objects": job.objects,
         "seed": job.seed,
     }
-
-
-def _stack_count(graph: ClutterGraph) -> int:
-    """Stacks on the tray; a pair that stands on it is one."""
-    bases = set()
-    for node in graph.children(ClutterGraph.TRAY_NODE):
-        dummy = next((child for child in graph.children(node) if graph.kind(child) == "dummy"), None)
-        bases.add(node if dummy is None else dummy)
-    return len(bases)

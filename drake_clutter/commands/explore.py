@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from drake_clutter.agents.exploration import EXPLORATION_AGENTS
+from drake_clutter.agents.exploration import EXPLORATION_AGENTS, play
 from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
@@ -50,12 +50,8 @@ def explore(scene: Scene, agent_name: str, max_moves: int, seed: int, config: Cl
         config: the world.
         report: called after each move.
     """
-    task, agent, rng = _task(scene, config, max_moves), EXPLORATION_AGENTS[agent_name](), item_rng(seed)
-    while task.end is None:
-        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
-        if move is None:
-            break
-        report(task.step(move, rng))
+    task = _task(scene, config, max_moves)
+    play(task, EXPLORATION_AGENTS[agent_name](), item_rng(seed), report)
     return task
 
 

@@ -83,6 +83,14 @@ class ClutterGraph:
         """All nodes that the tray leads to, breadth first, siblings in order."""
         return [self.TRAY_NODE] + [child for _, child in nx.bfs_edges(self.nx, self.TRAY_NODE)]
 
+    def stacks(self) -> list[list[int]]:
+        """The nodes that stand on the tray, stack by stack: one, or the two of a pair."""
+        bases: dict[int, list[int]] = {}
+        for node in self.children(self.TRAY_NODE):
+            base = next((child for child in self.children(node) if self.kind(child) == DUMMY), node)
+            bases.setdefault(base, []).append(node)
+        return list(bases.values())
+
     def objects(self) -> Iterator[tuple[int, str]]:
         """(node, class) of every object node, in order of creation."""
         return ((node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS)

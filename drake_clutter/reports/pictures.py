@@ -87,10 +87,14 @@ class Marks:
 
     def of(self, name: str) -> Mark:
         """The mark of an object."""
-        if name == self.moved:
-            return Mark.MOVED
-        groups = {Mark.FALLEN: self.fallen, Mark.FOUND: self.found, Mark.HIDDEN: self.hidden, Mark.COVERED: self.covered}
-        return next((mark for mark, names in groups.items() if name in names), Mark.IN_VIEW)
+        groups = (
+            (Mark.FALLEN, self.fallen),
+            (Mark.MOVED, (self.moved,)),
+            (Mark.FOUND, self.found),
+            (Mark.HIDDEN, self.hidden),
+            (Mark.COVERED, self.covered),
+        )
+        return next((mark for mark, names in groups if name in names), Mark.IN_VIEW)
 
 
 def humanised(name: str) -> str:
@@ -143,8 +147,6 @@ class PictureCamera:
             outside = area is None
             if outside or mark in (Mark.HIDDEN, Mark.COVERED):
                 corners = self._project(scene, scene_object.corners_T)
-                if outside and not np.isfinite(corners).all():
-                    continue
                 anchors[scene_object.name] = tuple(float(v) for v in (corners.min(axis=0) + corners.max(axis=0)) / 2)
                 if mark in (Mark.HIDDEN, Mark.COVERED):
                     dashed.append((corners, mark))

@@ -156,7 +156,7 @@ def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
 
 
 def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
-    """Index and pose of the frames between which a viewer may interpolate; an object that rests has one at each end of its rest."""
+    """Index and pose of the frames between which a viewer may interpolate; a rest has one at each of its ends."""
     keys = [(0, poses[0])]
     for index, pose in enumerate(poses[1:], start=1):
         last, held = keys[-1]

@@ -70,22 +70,6 @@ def _stack(graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: list
     return placed
 
 
-def _stacks(graph: ClutterGraph) -> list[list[int]]:
-    """The nodes that stand on the tray: [single] or [one, other] of a pair."""
-    bottoms: list[list[int]] = []
-    dummies: dict[int, list[int]] = {}
-    for node in graph.children(ClutterGraph.TRAY_NODE):
-        dummy = next((child for child in graph.children(node) if graph.kind(child) == DUMMY), None)
-        if dummy is None:
-            bottoms.append([node])
-        elif dummy in dummies:
-            dummies[dummy].append(node)
-        else:
-            dummies[dummy] = [node]
-            bottoms.append(dummies[dummy])
-    return bottoms
-
-
 def _place(half_sizes: NDArray[np.float64], config: LayoutConfig, rng: np.random.Generator) -> NDArray[np.float64] | None:
     """(S, 2) m, centres of S rectangles in the tray's square, gap kept; None if no draw fits. Large ones are drawn first."""
     reach = config.tray_side / 2 - config.stack_gap - half_sizes
@@ -128,7 +112,7 @@ def lay_out(
         seed: noted in the scene.
     """
     graph = derivation.graph
-    stacks = [_stack(graph, classes, bottom, config) for bottom in _stacks(graph)]
+    stacks = [_stack(graph, classes, bottom, config) for bottom in graph.stacks()]
     height = max(o.top for stack in stacks for o in stack)
     if height > config.max_stack_height:
         return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.max_stack_height)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.grammar import ClutterGraph
 
 TRAY = "tray"
@@ -136,7 +136,7 @@ class Scene:
 
 def tilt_between(object_class: ObjectClass, X_TA: Pose, X_TB: Pose) -> float:
     """How far an object has turned from pose A to pose B, rad; a body of revolution: how far its axis has."""
-    if object_class.shape.value == "cylinder":
+    if object_class.shape is Shape.CYLINDER:
         axis_A, axis_B = X_TA.rotation[:, 2], X_TB.rotation[:, 2]
         return math.atan2(float(np.linalg.norm(np.cross(axis_A, axis_B))), float(axis_A @ axis_B))
     return float(np.linalg.norm(Rotation.from_matrix(X_TA.rotation.T @ X_TB.rotation).as_rotvec()))

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_clutter.catalogue import Shape
 from drake_clutter.config import SettleConfig
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
 from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason
@@ -139,7 +140,7 @@ def _still_moving(
 def _may_creep(objects: Sequence[SceneObject]) -> bool:
     """Whether a lying cylinder may carry something: its axis is level and something reaches higher above it."""
     for o in objects:
-        if o.object_class.shape.value != "cylinder" or abs(o.X_TO.rotation[2, 2]) > 0.5:
+        if o.object_class.shape is not Shape.CYLINDER or abs(o.X_TO.rotation[2, 2]) > 0.5:
             continue
         (lower, upper) = o.bounds_T
         for other in objects:

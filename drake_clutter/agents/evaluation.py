@@ -1,0 +1,97 @@
+"""Playing explorers on many scenes, in parallel, the same for any number of workers."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_clutter.agents.exploration import EXPLORATION_AGENTS, play
+from drake_clutter.agents.generation import mean_interval, wilson_interval
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What is to be played: an agent on a scene file that a judge has called stable. `index` seeds its chances."""
+
+    scene: Path
+    agent: str
+    index: int
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode went.
+
+    Attributes:
+        scene: the scene file's name.
+        agent: the agent's name.
+        ended: why it ended.
+        hidden: objects hidden at the start.
+        found: those of them that were found.
+        moves: moves made.
+        found_after: (moves,) how many were found after each move.
+        no_free_spot: moves that could not be carried out.
+    """
+
+    scene: str
+    agent: str
+    ended: str
+    hidden: int
+    found: int
+    moves: int
+    found_after: tuple[int, ...]
+    no_free_spot: int
+
+
+class EpisodePlayer:
+    """Plays episodes at fidelity `settle`; a worker for the runner."""
+
+    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int) -> None:
+        self._config, self._max_moves, self._seed = config, max_moves, seed
+        self._catalogue = load_catalogue(catalogue_folder)
+        self._executor, self._detector = SettleExecutor(config), LabelDetector(config.camera)
+
+    def __call__(self, episode: Episode) -> EpisodeResult:
+        """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
+        scene = load_scene(episode.scene, self._catalogue).settled_scene
+        task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
+        play(task, EXPLORATION_AGENTS[episode.agent](), item_rng(self._seed, episode.index))
+        found_after = np.cumsum([len(step.newly_found) for step in task.steps], dtype=int)
+        return EpisodeResult(
+            scene=episode.scene.name,
+            agent=episode.agent,
+            ended=(task.end or EpisodeEnd.GAVE_UP).value,
+            hidden=len(task.hidden_at_start),
+            found=len(task.found),
+            moves=len(task.steps),
+            found_after=tuple(int(n) for n in found_after),
+            no_free_spot=sum(step.outcome.result.value == "no free spot" for step in task.steps),
+        )
+
+
+def summarise_episodes(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """One agent's row: success rate, objects found, how episodes ended, with 95 % intervals."""
+    successes = sum(result.ended == EpisodeEnd.ALL_FOUND.value for result in results)
+    hidden = sum(result.hidden for result in results)
+    return {
+        "agent": results[0].agent,
+        "episodes": len(results),
+        "success_rate": successes / len(results),
+        "success_ci95": wilson_interval(successes, len(results)),
+        "hidden_mean": hidden / len(results),
+        "found_mean": float(np.mean([result.found for result in results])),
+        "found_ci95": mean_interval([result.found for result in results]),
+        "found_share": sum(result.found for result in results) / hidden if hidden else None,
+        "moves_mean": float(np.mean([result.moves for result in results])),
+        "ended": dict(Counter(result.ended for result in results).most_common()),
+    }

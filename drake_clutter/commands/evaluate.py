@@ -1,0 +1,51 @@
+"""`drake-clutter evaluate`: explorers on the stable scenes of a folder that hide something."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, summarise_episodes
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, write_json
+from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.scene_file import load_scene
+
+
+def playable(folder: Path, catalogue_folder: Path | None) -> list[Path]:
+    """The folder's scene files, in order, that were judged stable and hide something.
+
+    Raises:
+        InputError: no scene files, one that is broken, or none that can be played.
+    """
+    paths = sorted(folder.glob("*.yaml"))
+    if not paths:
+        raise InputError(f"{folder}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote")
+    catalogue = load_catalogue(catalogue_folder)
+    found = [path for path in paths if (verdict := load_scene(path, catalogue).verdict) is not None and verdict.hidden]
+    if not found:
+        raise InputError(f"{folder}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes")
+    return found
+
+
+def evaluate(
+    scenes: Sequence[Path],
+    agents: Sequence[str],
+    max_moves: int,
+    seed: int,
+    config: ClutterConfig,
+    catalogue_folder: Path | None,
+    workers: int,
+    out: Path,
+    progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
+) -> list[dict[str, Any]]:
+    """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
+    episodes = [Episode(scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]
+    make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed)
+    results = list(progress(map_ordered(make_player, episodes, workers=workers), len(episodes)))
+    rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]
+    fields = {"max_moves": max_moves, "seed": seed, "fidelity": "settle", "config": asdict(config), "rows": rows}
+    write_json(out, fields | {"episodes": [asdict(result) for result in results]})
+    return rows
