@@ -271,21 +271,17 @@ def demo(
     nodes: NodesOption = 25,
     as_json: JsonOption = False,
 ) -> None:
-    """Generate a random scene that hides something, search it, and write a page to watch."""
+    """Generate random scenes and search them until everything hidden in one is found; write a page to watch."""
     from drake_clutter.commands import explore as command
     from drake_clutter.config import ClutterConfig
     from drake_clutter.scenes.scene_file import save_scene
 
-    world = ClutterConfig()
     output_directory(out)
-    with _err.status("generating a stable scene that hides something"):
-        made = command.demo_scene(seed, nodes, world)
-    save_scene(out / "scene.yaml", made.scene, made.verdict)
-    start = made.scene.at(made.verdict.settled)
     agent = ExplorerName.LARGEST_CLEAR.value
-    task = command.explore(start, agent, world.exploration.max_moves, seed, world, _report)
-    fields = command.write_episode(out, task, f"A random scene of {nodes} nodes, explored", agent, seed)
-    _print_episode(fields, as_json, out)
+    made, task, tried = command.demo(seed, nodes, ClutterConfig(), agent, _report)
+    save_scene(out / "scene.yaml", made.scene, made.verdict)
+    title = f"A random scene of {nodes} nodes, explored"
+    _print_episode(command.write_episode(out, task, title, agent, seed, scenes_tried=tried), as_json, out)
 
 
 @app.command()

@@ -22,6 +22,9 @@ from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
 
 Report = Callable[[Step], None]
 
+DEMO_TRIES = 10
+"""Scenes that the demo explores at most."""
+
 
 def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     """The scene as it settles.
@@ -125,21 +128,32 @@ def episode_fields(task: ExplorationTask, agent: str, seed: int) -> dict[str, An
     }
 
 
-def write_episode(out: Path, task: ExplorationTask, title: str, agent: str, seed: int) -> dict[str, Any]:
+def write_episode(out: Path, task: ExplorationTask, title: str, agent: str, seed: int, **more: int) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds."""
-    fields = episode_fields(task, agent, seed)
+    fields = {**more, **episode_fields(task, agent, seed)}
     save_scene(out / "after.yaml", task.scene)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
     write_json(out / "episode.json", fields)
     return fields
 
 
-def demo_scene(seed: int, nodes: int, config: ClutterConfig) -> GeneratedScene:
-    """The first stable scene of a seed that hides something an explorer could miss: at least two objects."""
+def demo(
+    seed: int, nodes: int, config: ClutterConfig, agent_name: str, report: Report
+) -> tuple[GeneratedScene, ExplorationTask, int]:
+    """Random scenes of a seed that hide at least two objects, explored one after the other until everything is found in one.
+
+    Returns:
+        The last scene, its episode, and how many scenes were explored.
+    """
     generate = SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
-    index = 0
+    tried = index = 0
     while True:
         made = generate(index)
-        if len(made.verdict.hidden) >= 2:
-            return made
         index += 1
+        if len(made.verdict.hidden) < 2:
+            continue
+        tried += 1
+        start = made.scene.at(made.verdict.settled)
+        task = explore(start, agent_name, config.exploration.max_moves, seed, config, report)
+        if task.end is EpisodeEnd.ALL_FOUND or tried == DEMO_TRIES:
+            return made, task, tried

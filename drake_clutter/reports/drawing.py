@@ -17,6 +17,10 @@ from scipy.spatial import ConvexHull
 _HALO = "#ffffff"
 
 
+Rectangle = tuple[float, float, float, float]
+"""Left, top, right, bottom."""
+
+
 @lru_cache
 def font(size: int) -> ImageFont.FreeTypeFont:
     """A bold sans-serif font of a height in pixels."""
@@ -30,6 +34,7 @@ class Label:
     Attributes:
         text: the words.
         anchor: (x, y), what the label is about.
+        about: (left, top, right, bottom) of what it is about; it should stay recognisable.
         colour: of its box, or of its words if it is faint.
         size: height of the font.
         faint: dark words on a pale box, without a line to the anchor.
@@ -37,6 +42,7 @@ class Label:
 
     text: str
     anchor: tuple[float, float]
+    about: Rectangle
     colour: str
     size: int
     faint: bool = False
@@ -52,16 +58,16 @@ class Canvas:
     """
 
     image: Image.Image
-    taken: list[tuple[float, float, float, float]] = field(default_factory=list)
+    taken: list[Rectangle] = field(default_factory=list)
 
     @property
     def _draw(self) -> ImageDraw.ImageDraw:
         return ImageDraw.Draw(self.image, "RGBA")
 
-    def outline(self, mask: NDArray[np.bool_], colour: str, width: int) -> None:
-        """The inner edge of a region (height, width) of the picture."""
+    def outline(self, mask: NDArray[np.bool_], corner: tuple[int, int], colour: str, width: int) -> None:
+        """The inner edge of a region (height, width) whose left upper corner lies at `corner`."""
         edge = mask & ~binary_erosion(mask, iterations=width)
-        self.image.paste(Image.new("RGB", self.image.size, colour), mask=Image.fromarray(edge))
+        self.image.paste(Image.new("RGB", edge.shape[::-1], colour), corner, Image.fromarray(edge))
 
     def dashed(self, corners: NDArray[np.float64], colour: str, width: int) -> None:
         """The convex hull of points (N, 2), as a dashed line on a pale one."""
@@ -120,7 +126,7 @@ class Canvas:
             self._draw.rounded_rectangle(box, label.size * 0.35, fill=fill, outline=None if label.faint else _HALO, width=2)
             self._draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), label.text, ink, font(label.size), anchor="mm")
 
-    def _room(self, label: Label) -> tuple[float, float, float, float]:
+    def _room(self, label: Label) -> Rectangle:
         width = font(label.size).getlength(label.text) + 0.7 * label.size
         height = 1.4 * label.size
         best, least = (0.0, 0.0, width, height), math.inf
@@ -130,7 +136,8 @@ class Canvas:
             x = min(max(x, width / 2 + 4), self.image.width - width / 2 - 4)
             y = min(max(y, height / 2 + 4), self.image.height - height / 2 - 4)
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-            cost = sum(_overlap(box, other) for other in self.taken) + 0.02 * height * radius
+            covered = _overlap(box, label.about) / max(1.0, _overlap(label.about, label.about))
+            cost = sum(_overlap(box, other) for other in self.taken) + height * (0.02 * radius + (0 if label.faint else 16 * covered))
             if cost < least:
                 best, least = box, cost
         return best
@@ -142,6 +149,6 @@ def middle(mask: NDArray[np.bool_]) -> tuple[float, float]:
     return float(column - 1), float(row - 1)
 
 
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> float:
+def _overlap(a: Rectangle, b: Rectangle) -> float:
     """Common area, px^2."""
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))

@@ -147,15 +147,16 @@ class PictureCamera:
             outside = area is None
             if outside or mark in (Mark.HIDDEN, Mark.COVERED):
                 corners = self._project(scene, scene_object.corners_T)
-                anchors[scene_object.name] = tuple(float(v) for v in (corners.min(axis=0) + corners.max(axis=0)) / 2)
+                left, top, right, bottom = (float(v) for v in (*corners.min(axis=0), *corners.max(axis=0)))
+                anchors[scene_object.name] = ((left + right) / 2, (top + bottom) / 2)
                 if mark in (Mark.HIDDEN, Mark.COVERED):
                     dashed.append((corners, mark))
             else:
-                mask = images.label == index
-                rows, columns = area
-                x, y = middle(mask[area])
-                anchors[scene_object.name] = (columns.start + x, rows.start + y)
-                canvas.outline(mask, mark.value, 3 if mark is Mark.IN_VIEW else 9)
+                mask = images.label[area] == index
+                left, top, right, bottom = area[1].start, area[0].start, area[1].stop, area[0].stop
+                x, y = middle(mask)
+                anchors[scene_object.name] = (left + x, top + y)
+                canvas.outline(mask, (left, top), mark.value, 3 if mark is Mark.IN_VIEW else 9)
             if mark is Mark.IN_VIEW:
                 if not outside:
                     weak.append(Label(_short(scene_object.name), anchors[scene_object.name], mark.value, 38, faint=True))

@@ -1,0 +1,202 @@
+"""The page of an episode, its pictures and recording; the contact sheet."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import resting, rng, scene_of
+from PIL import Image
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, TILE, write_contact_sheet
+from drake_clutter.reports.episode_page import write_episode_page
+from drake_clutter.reports.pictures import Mark, Marks, humanised
+from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.tasks.exploration import ExplorationTask, Step
+
+GELATIN = resting("gelatin_box", xy=(-0.15, 0.1), name="gelatin_box_1")
+SCENE = scene_of(
+    GELATIN,
+    resting("cracker_box", xy=(-0.15, 0.1), floor=GELATIN.top, name="cracker_box_2"),
+    resting("sugar_box", xy=(0.2, -0.2), name="sugar_box_3"),
+)
+UNCOVER = Move("cracker_box_2")
+HOSTILE = '<script>alert(1)</script> & "co"'
+
+
+class Page(HTMLParser):
+    """What a page refers to and says."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.alts: list[str | None] = []
+        self.tags: list[str] = []
+        self.text = ""
+        self.feed(source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.tags.append(tag)
+        self.references += [value for key in ("src", "href") if (value := values.get(key))]
+        if tag == "img":
+            self.alts.append(values.get("alt"))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def task(config: ClutterConfig, detector: LabelDetector) -> ExplorationTask:
+    """An episode of one real move, which uncovers the gelatin box."""
+    task = ExplorationTask(SCENE, SettleExecutor(config), detector, config.exploration, 1)
+    task.step(UNCOVER, rng())
+    assert task.found == ("gelatin_box_1",)
+    return task
+
+
+@pytest.fixture(scope="module")
+def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The episode's page; after the real move come one that found no spot and one that made the sugar box fall."""
+    out = tmp_path_factory.mktemp("page")
+    step = task.steps[0]
+    stuck = Step(Move("sugar_box_3", "gelatin_box_1"), Outcome(MoveResult.NO_FREE_SPOT, task.scene), step.look, (), 0.0)
+    fallen = Instability(InstabilityReason.TOPPLED, "sugar_box_3", 0.1, 1.5)
+    collapse = Step(Move("cracker_box_2"), Outcome(MoveResult.COLLAPSED, task.scene, fallen), step.look, (), -1.0)
+    summary = {"agent": HOSTILE, "seed": 3, "success": True, "moves": [{"move": HOSTILE}]}
+    write_episode_page(out, f"Episode {HOSTILE}", task.start, task.first_look, [step, stuck, collapse], summary)
+    return out
+
+
+def test_the_page_refers_only_to_files_that_lie_beside_it(folder: Path) -> None:
+    source = (folder / "index.html").read_text(encoding="utf-8")
+    page = Page(source)
+    assert not re.search(r"https?://|@import|url\(", source)
+    assert {"recording.html", "images/start_oblique.png", "images/move_01_after.png"} <= set(page.references)
+    for reference in page.references:
+        assert (folder / reference).is_file(), reference
+    written = {f"images/{path.name}" for path in (folder / "images").iterdir()}
+    assert written == {reference for reference in page.references if reference.startswith("images/")}
+    assert "$" not in source  # every field of the template is filled in
+    assert all(page.alts)
+
+
+def test_the_page_says_what_happened(folder: Path) -> None:
+    text = Page((folder / "index.html").read_text(encoding="utf-8")).text
+    assert "Hidden: Gelatin box 1." in text
+    assert "1. Cracker box 2 \N{RIGHTWARDS ARROW} tray" in text
+    assert "Newly found: Gelatin box 1." in text
+    assert "0% \N{RIGHTWARDS ARROW} 100%" in text
+    assert "no free spot" in text
+    assert "Sugar box 3: toppled (100 mm, 86\N{DEGREE SIGN})" in text
+
+
+def test_words_from_outside_are_escaped(folder: Path) -> None:
+    page = Page((folder / "index.html").read_text(encoding="utf-8"))
+    assert "script" not in page.tags
+    assert page.text.count(HOSTILE) >= 3  # the document's title, the heading, the key figure
+
+
+def test_pictures_have_their_size_and_show_something(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as picture:
+            assert picture.size == ((960, 720) if "oblique" in path.name else (720, 720))
+            assert np.asarray(picture).std() > 20, path.name
+            assert len(picture.getcolors(maxcolors=2**20) or ()) > 1000, path.name
+
+
+def test_hidden_and_found_objects_are_marked(folder: Path) -> None:
+    def pixels(name: str, mark: Mark) -> int:
+        colour = [int(mark.value[i : i + 2], 16) for i in (1, 3, 5)]
+        with Image.open(folder / "images" / name) as picture:
+            return int((np.abs(np.asarray(picture, int) - colour).max(axis=2) < 3).sum())
+
+    assert pixels("start_overhead.png", Mark.HIDDEN) > 500
+    assert pixels("start_overhead.png", Mark.MOVED) == 0
+    assert pixels("move_01_before.png", Mark.MOVED) > 500
+    assert pixels("move_01_after.png", Mark.FOUND) > 500
+    assert pixels("move_01_after.png", Mark.HIDDEN) == 0
+    assert pixels("move_03_after.png", Mark.FALLEN) > 500
+
+
+def test_what_fell_is_marked_as_fallen_even_if_it_was_moved() -> None:
+    assert Marks(fallen=("a",), moved="a").of("a") is Mark.FALLEN
+    assert Marks(found=("a",), moved="a").of("a") is Mark.MOVED
+    assert Marks().of("a") is Mark.IN_VIEW
+
+
+def test_the_recording_is_one_file_that_moves(folder: Path, tmp_path: Path) -> None:
+    source = (folder / "recording.html").read_text(encoding="utf-8")
+    assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)\s*=", source)
+    assert len(source) < 4_000_000
+    still = tmp_path / "still.html"
+    write_recording(still, SCENE, [Frame(0.0, SCENE.poses)])
+    # The last command that the viewer is given; a still scene has none of its kind.
+    assert _commands(source, "set_animation") == 1
+    assert _commands(still.read_text(encoding="utf-8"), "set_animation") == 0
+
+
+def _commands(source: str, kind: str) -> int:
+    from base64 import b64decode
+
+    blocks = re.findall(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)', source)
+    return sum(kind.encode() in b64decode(block)[:60] for block in blocks)
+
+
+def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
+    frames = episode_frames(task.start, task.steps)
+    times = [frame.time for frame in frames]
+    assert times == sorted(times)
+    assert len(set(np.rint(np.multiply(times, FRAMES_PER_SECOND)))) >= 0.9 * len(times)
+    assert frames[0].poses == task.start.poses
+    assert frames[-1].poses == task.scene.poses
+    path = np.array([frame.poses["cracker_box_2"].p for frame in frames])
+    assert path[:, 2].max() > max(o.top for o in SCENE.objects)
+    # Nothing jumps: within a frame of carrying, less than 10 cm.
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.1
+
+
+def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) -> None:
+    step = replace(task.steps[0], outcome=Outcome(MoveResult.NO_FREE_SPOT, SCENE))
+    assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {SCENE["cracker_box_2"].X_TO}
+
+
+def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
+    alone = Scene((GELATIN,), 0.70)
+    write_episode_page(tmp_path, "Nothing to do", alone, detector.look(alone), [], {})
+    text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
+    assert "Nothing is hidden." in text
+    assert "No move was made." in text
+
+
+@pytest.mark.parametrize(("count", "columns", "rows"), [(1, 2, 1), (7, 4, 2), (48, 8, 6)])
+def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> None:
+    picture = np.full((90, 120, 3), 128, np.uint8)
+    write_contact_sheet(tmp_path / "sheet.png", [(picture, f"{i:04d}  hidden 2", i != 1) for i in range(count)])
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        gap = sheet.width - columns * TILE[0]
+        assert sheet.size == (columns * TILE[0] + gap, rows * TILE[1] + gap)
+        assert 0 < gap < 20
+        red, green, _ = sheet.convert("RGB").getpixel((gap + 1, gap + 1))  # type: ignore[misc]
+        assert green > red
+        if count > 1:
+            red, green, _ = sheet.convert("RGB").getpixel((gap + TILE[0] + 1, gap + 1))  # type: ignore[misc]
+            assert red > green
+
+
+@pytest.mark.parametrize("count", [0, MAX_THUMBNAILS + 1])
+def test_a_contact_sheet_holds_at_least_one_and_not_too_many(tmp_path: Path, count: int) -> None:
+    with pytest.raises(ValueError, match="allowed are 1 to 48"):
+        write_contact_sheet(tmp_path / "sheet.png", [(np.zeros((4, 4, 3), np.uint8), "", True)] * count)
+
+
+def test_humanised() -> None:
+    assert humanised("sugar_box_3") == "Sugar box 3"
+    assert humanised("hidden_at_start") == "Hidden at start"
