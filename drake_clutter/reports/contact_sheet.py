@@ -14,7 +14,7 @@ from drake_clutter.reports.drawing import font
 MAX_THUMBNAILS = 48
 """More would be too small to read."""
 THUMBNAIL_SIDE = 240
-CAPTION_HEIGHT = 30
+CAPTION_HEIGHT = 46
 _FRAME, _GAP, _FONT_SIZE = 5, 14, 16
 _STABLE, _UNSTABLE, _PAPER, _INK = "#2e9e5b", "#d23f31", "#ffffff", "#22272e"
 TILE = (THUMBNAIL_SIDE + 2 * _FRAME + _GAP, THUMBNAIL_SIDE + 2 * _FRAME + CAPTION_HEIGHT + _GAP)
@@ -49,9 +49,16 @@ def write_contact_sheet(path: Path, entries: Sequence[tuple[NDArray[np.uint8], s
             thumbnail,
             (left + _FRAME + (THUMBNAIL_SIDE - thumbnail.width) // 2, top + _FRAME + (THUMBNAIL_SIDE - thumbnail.height) // 2),
         )
-        size = _FONT_SIZE
-        while size > 9 and font(size).getlength(caption) > outer - 2 * _FRAME - 6:
-            size -= 1
-        draw.text((left + outer / 2, top + outer + CAPTION_HEIGHT / 2 - 2), caption, _INK, font(size), anchor="mm")
+        _caption(draw, caption, (left + outer / 2, top + outer + CAPTION_HEIGHT / 2 - 2))
     with replacing(path) as temporary:
         sheet.save(temporary)
+
+
+def _caption(draw: ImageDraw.ImageDraw, caption: str, middle: tuple[float, float]) -> None:
+    """One line, or two if it has a colon and is too long; smaller if that is still too long."""
+    size, room = _FONT_SIZE, THUMBNAIL_SIDE - 6
+    if font(size).getlength(caption) > room:
+        caption = caption.replace(": ", ":\n", 1)
+    while size > 9 and max(font(size).getlength(line) for line in caption.splitlines() or [""]) > room:
+        size -= 1
+    draw.multiline_text(middle, caption, _INK, font(size), anchor="mm", align="center")

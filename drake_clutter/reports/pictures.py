@@ -159,9 +159,11 @@ class PictureCamera:
                 canvas.outline(mask, (left, top), mark.value, 3 if mark is Mark.IN_VIEW else 9)
             if mark is Mark.IN_VIEW:
                 if not outside:
-                    weak.append(Label(_short(scene_object.name), anchors[scene_object.name], mark.value, 38, faint=True))
+                    about = (left, top, right, bottom)
+                    weak.append(Label(_short(scene_object.name), anchors[scene_object.name], about, mark.value, 38, faint=True))
             else:
-                strong.append(Label(humanised(scene_object.name), anchors[scene_object.name], mark.value, 46))
+                about = (left, top, right, bottom)
+                strong.append(Label(humanised(scene_object.name), anchors[scene_object.name], about, mark.value, 46))
         if marks.moved in anchors and marks.X_T_placed is not None:
             landed = self._project(scene, marks.X_T_placed.apply(scene[marks.moved].object_class.corners))
             dashed.append((landed, Mark.MOVED))

@@ -1,6 +1,7 @@
 """Scenes that move, in the browser: one HTML file that plays offline, or a live view (Meshcat)."""
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,8 +34,11 @@ _CLEARANCE = 0.03
 _SAME_DISTANCE, _SAME_TURN = 1e-4, 1e-3
 """m, rad; poses that differ by less share a key frame, which makes the file a third as large."""
 _FOREVER = 1_000_000_000
-_EYE, _TARGET = (0.40, -1.15, 0.85), (0.0, 0.0, 0.05)
+_EYE, _TARGET, _FOV_Y_DEG = (0.45, -1.30, 1.05), (0.0, 0.0, 0.08), 34.0
 """m, for a tray of 0.7 m."""
+_LAMPS = {"SpotLight": 14.0, "PointLightNegativeX": 9.0, "PointLightPositiveX": 7.0, "AmbientLight": 0.5, "FillLight": 0.5}
+"""Meshcat's own, dimmed: left as they are, they bleach bright products."""
+_SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 
 
 def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
@@ -107,7 +111,8 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
             for index, pose in _key_frames([frame.poses.get(name, at_rest) for frame in frames]):
                 animation.SetTransform(numbers[index], paths[name], rigid_transform(pose))
         meshcat.SetAnimation(animation)
-    write_text(path, meshcat.StaticHtml())
+    # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
+    write_text(path, _SOURCE_COMMENT.sub("", meshcat.StaticHtml()))
 
 
 def serve(scene: Scene) -> Meshcat:
@@ -145,9 +150,14 @@ def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
     visualizer.ForcedPublish(visualizer.GetMyContextFromRoot(context))
 
     scale = scene.tray_side / 0.70
+    meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=_FOV_Y_DEG))
     meshcat.SetCameraPose(scale * np.array(_EYE), scale * np.array(_TARGET))
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
+    for lamp, intensity in _LAMPS.items():
+        meshcat.SetProperty(f"/Lights/{lamp}/<object>", "intensity", intensity)
+    meshcat.SetProperty("/Lights/SpotLight", "visible", True)
+    meshcat.SetProperty("/Lights/SpotLight/<object>", "castShadow", True)
     for which, colour in (("top_color", [0.88, 0.90, 0.93]), ("bottom_color", [0.98, 0.98, 0.98])):
         meshcat.SetProperty("/Background", which, colour)
     inspector = scene_plant.scene_graph.model_inspector()
