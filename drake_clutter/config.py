@@ -1,12 +1,15 @@
 """Every number that the simulated world leaves open, in one place; `docs/calibration.md` argues the defaults."""
 
 import dataclasses
+import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import yaml
+from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from drake_clutter.files import InputError
@@ -85,6 +88,16 @@ class CameraConfig:
         """Pixels."""
         return self.height / 2 / math.tan(math.radians(self.fov_y_deg) / 2)
 
+    def project(self, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column and row (N, 2) of the pixels on which points (N, 3) m in the tray frame fall; whole numbers are their middles.
+
+        Drake's VTK engine draws half a pixel left of and above the principal point that it is given, (width - 1) / 2,
+        (height - 1) / 2: measured in tests/test_camera.py.
+        """
+        distance = self.altitude - p_T[:, 2:]
+        offset = self.focal_length * np.column_stack([p_T[:, 0], -p_T[:, 1]]) / distance
+        return np.asarray(offset + np.array([self.width / 2 - 1, self.height / 2 - 1]))
+
 
 @dataclass
 class ExplorationConfig:
@@ -115,34 +128,61 @@ class ClutterConfig:
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
 
 
-def _numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if dataclasses.is_dataclass(value):
-            yield from _numbers(value, f"{prefix}{item.name}.")
-        else:
-            yield prefix + item.name, value
+_ANY = (0.0, math.inf)
+_ALLOWED = {
+    "layout.tray_side": (0.1, 2.0),
+    "layout.placement_tries": (1, math.inf),
+    "settle.time_step": (1e-4, 0.02),
+    "settle.max_time": (0.1, 60.0),
+    "settle.calm_samples": (1, math.inf),
+    "camera.width": (16, 4096),
+    "camera.height": (16, 4096),
+    "camera.fov_y_deg": (1.0, 170.0),
+    "camera.altitude": (0.1, 10.0),
+    "camera.hidden_below": (0.0, 1.0),
+    "exploration.max_moves": (1, math.inf),
+    "exploration.collapse_penalty": (-math.inf, 0.0),
+}
+"""Least and greatest value of a field; of every other field, `_ANY`."""
+
+
+def _check(given: Any, schema: Any, path: Path, where: str = "") -> None:
+    """Refuses fields that the schema lacks and values out of range."""
+    names = [item.name for item in dataclasses.fields(schema)]
+    if not isinstance(given, dict):
+        raise InputError(f"{path}: {where or 'the file'}: {given!r}; allowed is a mapping with some of {', '.join(names)}")
+    for name, value in given.items():
+        field = f"{where}.{name}" if where else str(name)
+        if name not in names:
+            raise InputError(f"{path}: {field}: is unknown; allowed are {', '.join(names)}")
+        default = getattr(schema, name)
+        if dataclasses.is_dataclass(default):
+            _check(value, default, path, field)
+            continue
+        low, high = _ALLOWED.get(field, _ANY)
+        kind = int if isinstance(default, int) else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
+            whole = "a whole number" if isinstance(default, int) else "a finite number"
+            raise InputError(f"{path}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
 
 
 def load_config(path: Path | None = None) -> ClutterConfig:
     """The defaults, with the fields that a YAML file names put over them.
 
     Raises:
-        InputError: an unknown field or a value that is not allowed.
+        InputError: the file cannot be read, has an unknown field, or a value that is not allowed.
     """
     if path is None:
         return ClutterConfig()
     try:
-        config: ClutterConfig = yaml_load_typed(schema=ClutterConfig, filename=str(path), defaults=ClutterConfig())
-    except Exception as error:  # Drake's reader raises many kinds; every one means a broken file
-        raise InputError(f"{path}: {error}; allowed are the fields of\n{config_yaml(ClutterConfig())}") from error
-    for name, value in _numbers(config):
-        may_be_negative = name == "exploration.collapse_penalty"
-        if not math.isfinite(value) or (value < 0 and not may_be_negative):
-            raise InputError(f"{path}: {name}: {value}; allowed is a finite number, not negative")
-    for name in ("layout.tray_side", "settle.time_step", "settle.max_time", "camera.width", "camera.height", "camera.altitude"):
-        if dict(_numbers(config))[name] <= 0:
-            raise InputError(f"{path}: {name}: allowed is more than 0")
+        text = path.read_text(encoding="utf-8")
+        given = yaml.safe_load(text) or {}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except Exception as error:  # as in scenes/scene_file.py
+        raise InputError(f"{path}: is not YAML ({error}); allowed is a mapping of config fields") from error
+    _check(given, ClutterConfig(), path)
+    config: ClutterConfig = yaml_load_typed(schema=ClutterConfig, data=json.dumps(given), defaults=ClutterConfig())
     return config
 
 

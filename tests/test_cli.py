@@ -102,7 +102,8 @@ def test_explore_finds_what_is_below(scene: Path, tmp_path: Path) -> None:
 
 
 def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
-    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": {}}
+    settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
+    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": settled}
     (tmp_path / "scenes").mkdir()
     for name in ("one", "two"):
         (tmp_path / f"scenes/{name}.yaml").write_text(broken(verdict=verdict))

@@ -191,7 +191,7 @@ def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) 
 
 def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
     """Behind a high wall the floor cannot be seen; no place is chosen there, whatever the seed."""
-    wall = [resting("cereal_box_large", UPRIGHT, (0.22, y), name=f"wall {y}") for y in (-0.1, 0.1)]
+    wall = [resting("cereal_box_large", Orientation.UPRIGHT_90, (0.22, y), name=f"wall {y}") for y in (-0.1, 0.1)]
     scene = scene_of(*wall, resting("tomato_soup_can", xy=(-0.2, 0.0), name="picked"))
     observation = seen(detector, scene)
     for seed in range(20):

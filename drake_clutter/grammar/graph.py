@@ -1,5 +1,6 @@
 """The paper's scene graph: a tray, what stands on it, and what stands on that."""
 
+import hashlib
 from collections.abc import Iterator, Mapping
 
 import networkx as nx
@@ -41,7 +42,8 @@ class ClutterGraph:
         """A graph of the given kinds.
 
         Raises:
-            ValueError: node 0 is not the only tray, an edge's end is unknown, or a node cannot be reached from the tray.
+            ValueError: node 0 is not the only tray, an edge's end is unknown, a node cannot be reached from the tray, or
+                something stands on an end.
         """
         if [node for node, kind in nodes.items() if kind == TRAY] != [cls.TRAY_NODE]:
             raise ValueError("nodes: allowed is exactly one tray, with id 0")
@@ -54,6 +56,8 @@ class ClutterGraph:
             graph.nx.add_edge(parent, child, kind=edge_kind)
         if len(graph.breadth_first()) != len(nodes) or not nx.is_directed_acyclic_graph(graph.nx):
             raise ValueError("edges: allowed is an acyclic graph in which the tray leads to every node")
+        if any(graph.kind(node) == END and graph.children(node) for node in nodes):
+            raise ValueError("edges: nothing may stand on an end")
         return graph
 
     def __len__(self) -> int:
@@ -104,16 +108,16 @@ class ClutterGraph:
 
 
 def canonical_form(graph: ClutterGraph, classes: Mapping[str, ObjectClass]) -> str:
-    """Equal for two terminal graphs exactly when they differ only by sibling order and by symmetric orientations."""
-
-    def describe(node: int) -> str:
+    """A digest, equal for two terminal graphs exactly when they differ only by sibling order and by symmetric orientations."""
+    digests: dict[int, str] = {}
+    for node in reversed(list(nx.topological_sort(graph.nx))):
         children = []
         for child in graph.children(node):
             edge, kind = graph.edge_kind(node, child), graph.kind(child)
             # An edge into an end or a dummy says nothing that its neighbours do not.
             oriented = isinstance(edge, Orientation) and kind in classes
             label = str(symmetry_key(classes[kind], Orientation(edge))) if oriented else ""
-            children.append(label + describe(child))
-        return f"{graph.kind(node)}({','.join(sorted(children))})"
-
-    return describe(ClutterGraph.TRAY_NODE)
+            children.append(label + digests[child])
+        description = f"{graph.kind(node)}({','.join(sorted(children))})"
+        digests[node] = hashlib.sha256(description.encode()).hexdigest()
+    return digests[ClutterGraph.TRAY_NODE]

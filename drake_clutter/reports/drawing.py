@@ -129,15 +129,19 @@ class Canvas:
     def _room(self, label: Label) -> Rectangle:
         width = font(label.size).getlength(label.text) + 0.7 * label.size
         height = 1.4 * label.size
+        own = max(1.0, _overlap(label.about, label.about))
+        hiding = 0.0 if label.faint else 16 * height / own
         best, least = (0.0, 0.0, width, height), math.inf
         for radius, angle in itertools.product(np.arange(0, 12) * 0.8 * height, np.arange(12) * (math.pi / 6)):
+            away = 0.02 * height * radius
+            if away >= least:
+                break
             x = label.anchor[0] + radius * math.cos(angle) * 1.5
             y = label.anchor[1] - radius * math.sin(angle)
             x = min(max(x, width / 2 + 4), self.image.width - width / 2 - 4)
             y = min(max(y, height / 2 + 4), self.image.height - height / 2 - 4)
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-            covered = _overlap(box, label.about) / max(1.0, _overlap(label.about, label.about))
-            cost = sum(_overlap(box, other) for other in self.taken) + height * (0.02 * radius + (0 if label.faint else 16 * covered))
+            cost = away + hiding * _overlap(box, label.about) + sum(_overlap(box, other) for other in self.taken)
             if cost < least:
                 best, least = box, cost
         return best

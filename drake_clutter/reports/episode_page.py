@@ -158,7 +158,8 @@ def _place(scene: Scene, step: Step) -> Pose | None:
 
 def _shares(before: Mapping[str, float], after: Mapping[str, float], threshold: float, found: Sequence[str]) -> str:
     """Bars of the visible shares: those that changed or are hidden, and the others below a fold."""
-    shown, folded = [], []
+    shown: list[str] = []
+    folded: list[str] = []
     for name, share in after.items():
         was = before[name]
         kind = "found" if name in found else "hidden" if share < threshold else ""

@@ -12,7 +12,7 @@ from pydrake.geometry import LightParameter, RenderEngineVtkParams
 from scipy.ndimage import find_objects
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.reports.drawing import Canvas, Label, middle
+from drake_clutter.reports.drawing import Canvas, Label, Rectangle, middle
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.camera import Images, OverheadCamera
 
@@ -75,7 +75,7 @@ class Marks:
         found: newly found.
         fallen: did not stay.
         moved: the object that a move is about, or None.
-        X_T_placed: where the move puts it: an arrow leads there; None for no arrow.
+        X_T_placed: X_TO of `moved` where the move puts it: an arrow leads there; None for no arrow.
     """
 
     hidden: tuple[str, ...] = ()
@@ -141,37 +141,36 @@ class PictureCamera:
         images = self._from_above(scene)
         canvas = Canvas(Image.fromarray(images.color))
         areas = find_objects(images.label + 1, max_label=len(scene.objects))
-        dashed, strong, weak, anchors = [], [], [], {}
+        dashed: list[tuple[NDArray[np.float64], Mark]] = []
+        strong, weak, arrows = [], [], []
         for index, (scene_object, area) in enumerate(zip(scene.objects, areas, strict=True)):
-            mark = marks.of(scene_object.name)
-            outside = area is None
-            if outside or mark in (Mark.HIDDEN, Mark.COVERED):
+            name, mark = scene_object.name, marks.of(scene_object.name)
+            if mark in (Mark.HIDDEN, Mark.COVERED) or area is None:
+                if mark is Mark.IN_VIEW:  # it has left the picture
+                    continue
                 corners = self._project(scene, scene_object.corners_T)
-                left, top, right, bottom = (float(v) for v in (*corners.min(axis=0), *corners.max(axis=0)))
-                anchors[scene_object.name] = ((left + right) / 2, (top + bottom) / 2)
+                about = _bounds(corners)
+                anchor = _centre(about)
                 if mark in (Mark.HIDDEN, Mark.COVERED):
                     dashed.append((corners, mark))
             else:
                 mask = images.label[area] == index
-                left, top, right, bottom = area[1].start, area[0].start, area[1].stop, area[0].stop
+                about = (area[1].start, area[0].start, area[1].stop, area[0].stop)
                 x, y = middle(mask)
-                anchors[scene_object.name] = (left + x, top + y)
-                canvas.outline(mask, (left, top), mark.value, 3 if mark is Mark.IN_VIEW else 9)
+                anchor = (about[0] + x, about[1] + y)
+                canvas.outline(mask, (area[1].start, area[0].start), mark.value, 3 if mark is Mark.IN_VIEW else 9)
             if mark is Mark.IN_VIEW:
-                if not outside:
-                    about = (left, top, right, bottom)
-                    weak.append(Label(_short(scene_object.name), anchors[scene_object.name], about, mark.value, 38, faint=True))
+                weak.append(Label(_short(name), anchor, about, mark.value, 38, faint=True))
             else:
-                about = (left, top, right, bottom)
-                strong.append(Label(humanised(scene_object.name), anchors[scene_object.name], about, mark.value, 46))
-        if marks.moved in anchors and marks.X_T_placed is not None:
-            landed = self._project(scene, marks.X_T_placed.apply(scene[marks.moved].object_class.corners))
-            dashed.append((landed, Mark.MOVED))
+                strong.append(Label(humanised(name), anchor, about, mark.value, 46))
+            if name == marks.moved and marks.X_T_placed is not None:
+                landing = self._project(scene, marks.X_T_placed.apply(scene_object.object_class.corners))
+                dashed.append((landing, Mark.MOVED))
+                arrows.append((anchor, _centre(_bounds(landing))))
         for corners, mark in dashed:
             canvas.dashed(corners, mark.value, 6)
-        if marks.moved in anchors and marks.X_T_placed is not None:
-            x, y = (landed.min(axis=0) + landed.max(axis=0)) / 2
-            canvas.arrow(anchors[marks.moved], (float(x), float(y)), Mark.MOVED.value, 12)
+        for start, end in arrows:
+            canvas.arrow(start, end, Mark.MOVED.value, 12)
         canvas.labels(strong + weak)
         return _scaled(canvas.image)
 
@@ -202,6 +201,15 @@ class PictureCamera:
 def _camera(size: tuple[int, int]) -> OverheadCamera:
     width, height = size
     return OverheadCamera(CameraConfig(_OVERSAMPLING * width, _OVERSAMPLING * height, _FOV_Y_DEG, _ALTITUDE), _ENGINE)
+
+
+def _bounds(points: NDArray[np.float64]) -> Rectangle:
+    left, top, right, bottom = (float(v) for v in (*points.min(axis=0), *points.max(axis=0)))
+    return left, top, right, bottom
+
+
+def _centre(rectangle: Rectangle) -> tuple[float, float]:
+    return (rectangle[0] + rectangle[2]) / 2, (rectangle[1] + rectangle[3]) / 2
 
 
 def _scaled(picture: Image.Image) -> NDArray[np.uint8]:

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -34,10 +35,16 @@ _CLEARANCE = 0.03
 _SAME_DISTANCE, _SAME_TURN = 1e-4, 1e-3
 """m, rad; poses that differ by less share a key frame, which makes the file a third as large."""
 _FOREVER = 1_000_000_000
-_EYE, _TARGET, _FOV_Y_DEG = (0.45, -1.30, 1.05), (0.0, 0.0, 0.08), 34.0
+_EYE, _TARGET, _FOV_Y_DEG = (0.45, -1.35, 1.10), (0.0, 0.0, 0.14), 36.0
 """m, for a tray of 0.7 m."""
-_LAMPS = {"SpotLight": 14.0, "PointLightNegativeX": 9.0, "PointLightPositiveX": 7.0, "AmbientLight": 0.5, "FillLight": 0.5}
-"""Meshcat's own, dimmed: left as they are, they bleach bright products."""
+_LAMPS: dict[str, dict[str, Any]] = {
+    "SpotLight": {"intensity": 20.0, "castShadow": True, "shadow.bias": -0.003, "position": [-1.0, -1.1, 2.6]},
+    "PointLightNegativeX": {"intensity": 3.0},
+    "PointLightPositiveX": {"intensity": 3.0},
+    "AmbientLight": {"intensity": 0.4},
+    "FillLight": {"intensity": 0.3},
+}
+"""Meshcat's own, dimmed: left as they are, they bleach bright products. The bias keeps surfaces from shading themselves."""
 _SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 
 
@@ -154,11 +161,12 @@ def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
     meshcat.SetCameraPose(scale * np.array(_EYE), scale * np.array(_TARGET))
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
-    for lamp, intensity in _LAMPS.items():
-        meshcat.SetProperty(f"/Lights/{lamp}/<object>", "intensity", intensity)
     meshcat.SetProperty("/Lights/SpotLight", "visible", True)
-    meshcat.SetProperty("/Lights/SpotLight/<object>", "castShadow", True)
-    for which, colour in (("top_color", [0.88, 0.90, 0.93]), ("bottom_color", [0.98, 0.98, 0.98])):
+    for lamp, properties in _LAMPS.items():
+        for name, value in properties.items():
+            meshcat.SetProperty(f"/Lights/{lamp}/<object>", name, value)
+    # Grey, because the background also lights the products from all sides.
+    for which, colour in (("top_color", [0.50, 0.53, 0.57]), ("bottom_color", [0.70, 0.71, 0.73])):
         meshcat.SetProperty("/Background", which, colour)
     inspector = scene_plant.scene_graph.model_inspector()
     frame_ids = {name: plant.GetBodyFrameIdOrThrow(body.index()) for name, body in scene_plant.bodies.items()}

@@ -51,26 +51,14 @@ class _Grid:
 def _pixels(observation: Observation, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Row and column of the pixel that points (N, 3) m fall on; points out of the frame fall on its edge."""
     camera = observation.camera
-    distance = camera.altitude - p_T[:, 2]
-    column = camera.focal_length * p_T[:, 0] / distance + camera.width / 2 - 0.5
-    row = -camera.focal_length * p_T[:, 1] / distance + camera.height / 2 - 0.5
-    rows = np.clip(np.rint(row), 0, camera.height - 1).astype(np.int64)
-    return rows, np.clip(np.rint(column), 0, camera.width - 1).astype(np.int64)
+    columns, rows = np.rint(camera.project(p_T)).astype(np.int64).T
+    return np.clip(rows, 0, camera.height - 1), np.clip(columns, 0, camera.width - 1)
 
 
-def seen_through(
-    observation: Observation, p_T: NDArray[np.float64], ignored: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
-    """(N,) whether the camera sees past each point (N, 3) m, so that it is known to be free.
-
-    Args:
-        observation: what the camera has shown.
-        p_T: the points, in the tray frame.
-        ignored: (height, width), pixels that tell nothing.
-    """
+def seen_through(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether the camera sees past each point (N, 3) m in the tray frame, so that it is known to be free."""
     rows, columns = _pixels(observation, p_T)
-    free = observation.depth[rows, columns] >= observation.camera.altitude - p_T[:, 2]
-    return np.asarray(free if ignored is None else free & ~ignored[rows, columns])
+    return np.asarray(observation.depth[rows, columns] >= observation.camera.altitude - p_T[:, 2])
 
 
 def _turned(pose: Pose, yaw: float) -> NDArray[np.float64]:
@@ -116,7 +104,8 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
     """The pose X_TO at which the picked object is let go, or None if no place is known to be free.
 
     The object keeps its orientation, or is turned by a quarter about the vertical if only that fits. A place counts as free
-    where the camera sees through the air that the object will take up, its clearance included; what lies in shadow is not.
+    where the camera sees through the air that the object will take up, its clearance included; what lies in shadow, or where
+    the picked object itself still is, does not.
     On the tray the place furthest from the centre is taken, where an object hides least and leaves the most room; on an
     object, the place nearest to the middle of what is seen of its top, with the centre of mass over that top.
 
@@ -150,7 +139,7 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
         corners = picked.object_class.corners @ R_TO.T
         height = float(np.ptp(corners[:, 2]))
         levels = floor + _DEPTH_TOLERANCE + np.arange(0, height + config.release_height, _LEVEL_STEP)
-        free = np.all([grid.square(seen_through(observation, grid.points(z), picked.mask)) for z in levels], axis=0)
+        free = np.all([grid.square(seen_through(observation, grid.points(z))) for z in levels], axis=0)
         fits = _clear_of(~free, _footprint(corners[:, :2], config.clearance)) & support
         if not fits.any():
             continue

@@ -1,6 +1,7 @@
 """Scene files: versioned YAML that a person can read and edit."""
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,8 +47,11 @@ class _Reader:
         self.value, self.where = value, where
 
     def refuse(self, allowed: str) -> InputError:
-        shown = repr(self.value)
-        return InputError(f"{self.where}: {shown if len(shown) < 80 else shown[:77] + '...'}; allowed is {allowed}")
+        try:
+            shown = reprlib.repr(self.value)
+        except ValueError:  # an integer of too many digits
+            shown = "a number"
+        return InputError(f"{self.where}: {shown}; allowed is {allowed}")
 
     def mapping(self, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, "_Reader"]:
         if not isinstance(self.value, dict):
@@ -70,6 +74,16 @@ class _Reader:
             raise self.refuse("a list")
         return [_Reader(value, f"{self.where}[{index}]") for index, value in enumerate(self.value)]
 
+    def truth(self) -> bool:
+        if not isinstance(self.value, bool):
+            raise self.refuse("true or false")
+        return self.value
+
+    def share(self) -> float:
+        if not 0 <= self.number() <= 1:
+            raise self.refuse("0 to 1")
+        return self.number()
+
     def text(self) -> str:
         if not isinstance(self.value, str) or not self.value:
             raise self.refuse("a text")
@@ -81,9 +95,14 @@ class _Reader:
         return self.value
 
     def number(self) -> float:
-        if not isinstance(self.value, int | float) or isinstance(self.value, bool) or not math.isfinite(self.value):
-            raise self.refuse("a finite number")
-        return float(self.value)
+        if isinstance(self.value, int | float) and not isinstance(self.value, bool):
+            try:
+                number = float(self.value)
+            except OverflowError:  # an integer beyond every float
+                number = math.inf
+            if math.isfinite(number):
+                return number
+        raise self.refuse("a finite number")
 
     def numbers(self, count: int) -> list[float]:
         if not isinstance(self.value, list) or len(self.value) != count:
@@ -113,7 +132,7 @@ def load_scene(path: Path, catalogue: Catalogue) -> SceneFile:
         document = _Reader(yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.CSafeLoader), str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except Exception as error:  # its constructors raise whatever a bad date, number or nesting leads to
         raise InputError(f"{path}: is not YAML, or cut off ({error})") from error
     fields = document.mapping(("version", "objects"), ("tray", "graph", "derivation", "seed", "verdict"))
     if fields["version"].integer() != VERSION:
@@ -167,8 +186,6 @@ def _graph(item: _Reader, objects: Sequence[SceneObject]) -> ClutterGraph:
         if kind not in STRUCTURE_KINDS and classes.get(identity) != kind:
             raise entry["kind"].refuse("a structure node, or the class of the object that names this node")
         nodes[identity] = kind
-    if missing := [o.name for o in objects if o.node is not None and o.node not in nodes]:
-        raise InputError(f"{item.where}.nodes: the node of {missing[0]} is missing")
     edges: dict[tuple[int, int], EdgeKind] = {}
     for edge in fields["edges"].items():
         entry = edge.mapping(("parent", "child", "kind"))
@@ -177,32 +194,47 @@ def _graph(item: _Reader, objects: Sequence[SceneObject]) -> ClutterGraph:
             raise entry["kind"].refuse(f"one of {', '.join(_EDGE_KINDS)}")
         edges[entry["parent"].integer(), entry["child"].integer()] = _EDGE_KINDS[kind]
     try:
-        return ClutterGraph.from_parts(nodes, edges)
+        graph = ClutterGraph.from_parts(nodes, edges)
     except ValueError as error:
         raise InputError(f"{item.where}.{error}") from error
+    for o in objects:
+        if o.node is not None and nodes.get(o.node) != o.object_class.name:
+            raise InputError(
+                f"{item.where}.nodes: the node of {o.name}, {o.node}, is missing or not of kind {o.object_class.name}"
+            )
+    if not graph.is_terminal:
+        raise InputError(f"{item.where}: holds slots or edges without orientation; allowed is a terminal graph")
+    return graph
 
 
 def _verdict(item: _Reader, scene: Scene) -> Verdict:
     fields = item.mapping(("stable", "settled", "visible_share", "hidden"), ("instability",))
-    instability = None
-    if not fields["stable"].value:
-        if "instability" not in fields:
-            raise InputError(f"{item.where}.instability: is missing; an unstable scene needs it")
-        entry = fields["instability"].mapping(("reason", "object", "displacement", "tilt"))
-        reasons = {reason.value: reason for reason in InstabilityReason}
-        if entry["reason"].text() not in reasons:
-            raise entry["reason"].refuse(f"one of {', '.join(reasons)}")
-        instability = Instability(
-            reasons[entry["reason"].text()], entry["object"].text(), entry["displacement"].number(), entry["tilt"].number()
-        )
+    stable = fields["stable"].truth()
+    if stable == ("instability" in fields):
+        raise InputError(f"{item.where}.instability: allowed is one for an unstable scene, and none for a stable one")
     settled = {name: reader.pose() for name, reader in fields["settled"].entries().items()}
-    shares = {name: reader.number() for name, reader in fields["visible_share"].entries().items()}
+    shares = {name: reader.share() for name, reader in fields["visible_share"].entries().items()}
     hidden = tuple(reader.text() for reader in fields["hidden"].items())
-    if strangers := (settled.keys() | shares.keys() | set(hidden)) - set(scene.names):
-        raise InputError(
-            f"{item.where}: {sorted(strangers)[0]!r} is no object of the scene; allowed are {', '.join(scene.names)}"
-        )
+    instability = _instability(fields["instability"]) if not stable else None
+    named = {"settled": set(settled), "visible_share": set(shares), "hidden": set(hidden)}
+    named["instability.object"] = {instability.object} if instability else set()
+    for field, names in named.items():
+        if strangers := sorted(names - set(scene.names)):
+            raise InputError(f"{item.where}.{field}: {strangers[0]!r} is no object; allowed are {', '.join(scene.names)}")
+    for field in ("settled", "visible_share") if stable else ("settled",):
+        if missing := sorted(set(scene.names) - named[field]):
+            raise InputError(f"{item.where}.{field}: {missing[0]} is missing; allowed is an entry for every object")
     return Verdict(instability, settled, shares, hidden)
+
+
+def _instability(item: _Reader) -> Instability:
+    fields = item.mapping(("reason", "object", "displacement", "tilt"))
+    reasons = {reason.value: reason for reason in InstabilityReason}
+    if fields["reason"].text() not in reasons:
+        raise fields["reason"].refuse(f"one of {', '.join(reasons)}")
+    return Instability(
+        reasons[fields["reason"].text()], fields["object"].text(), fields["displacement"].number(), fields["tilt"].number()
+    )
 
 
 def _pose_fields(pose: Pose) -> dict[str, list[float]]:

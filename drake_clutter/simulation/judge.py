@@ -33,13 +33,14 @@ class DrakeJudge:
         config = self._config.settle
         settled: dict[str, Pose] = dict(scene.poses)
         for group in touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN):
-            result = self._settle_single(group[0], scene.tray_side) if len(group) == 1 else settle(group, scene.tray_side, config)
+            alone = len(group) == 1 and _well_inside(group[0], scene.tray_side)
+            result = self._settle_alone(group[0], scene.tray_side) if alone else settle(group, scene.tray_side, config)
             settled |= result.poses
             if result.instability is not None:
                 return Verdict(result.instability, settled, {}, ())
         return self.look(scene.at(settled))
 
-    def _settle_single(self, single: SceneObject, tray_side: float) -> Settled:
+    def _settle_alone(self, single: SceneObject, tray_side: float) -> Settled:
         """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
         x, y, z = single.X_TO.translation
         key = (single.object_class, tray_side, z, single.X_TO.quaternion)
@@ -55,3 +56,9 @@ class DrakeJudge:
         """The verdict on a scene that is known to be at rest: what it hides."""
         shares = self._camera.visible_shares(scene)
         return Verdict(None, scene.poses, shares, self._camera.hidden(shares))
+
+
+def _well_inside(scene_object: SceneObject, tray_side: float) -> bool:
+    """Whether an object is clear of the rim."""
+    lower, upper = scene_object.bounds_T
+    return bool(np.abs([lower[:2], upper[:2]]).max() < tray_side / 2 - TOUCHING_MARGIN)
