@@ -4,7 +4,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -141,12 +141,11 @@ def generate(
     from drake_clutter.config import load_config
 
     job = GenerationJob(agent.value, objects, catalogue, nodes, seed, load_config(config))
-    with _progress("scenes") as bar:
 
-        def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-            return bar.track(made, total=total, completed=done)
+    def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
+        return _tracked("scenes", made, done, total)
 
-        summary = command.generate(job, count, out, workers, progress)
+    summary = command.generate(job, count, out, workers, progress)
     shown = {key: value for key, value in summary.items() if key != "config"}
     _print(summary if as_json else shown, as_json, f"{out}")
 
@@ -204,12 +203,11 @@ def evaluate(
     world = load_config(config)
     played = command.playable(scenes, catalogue)[:count]
     names = [agent.value for agent in agents or ExplorerName]
-    with _progress("episodes") as bar:
 
-        def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
-            return bar.track(results, total=total)
+    def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
+        return _tracked("episodes", results, 0, total)
 
-        rows = command.evaluate(played, names, max_moves, seed, world, catalogue, workers, out, progress)
+    rows = command.evaluate(played, names, max_moves, seed, world, catalogue, workers, out, progress)
     if as_json:
         print(json.dumps(rows, indent=2))
         return
@@ -229,9 +227,11 @@ def evaluate(
     _out.print(table)
 
 
-def _progress(what: str) -> Progress:
+def _tracked(what: str, items: Iterable[Any], done: int, total: int) -> Iterator[Any]:
+    """The items, with a progress bar that appears with the first of them."""
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=_err)
+    with Progress(*columns, console=_err) as bar:
+        yield from bar.track(items, total=total, completed=done)
 
 
 @app.command()
