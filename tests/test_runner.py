@@ -114,7 +114,9 @@ def test_closing_midway_does_not_wait() -> None:
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_ending_the_first_process_ends_the_others(signal_number: signal.Signals) -> None:
     code = """
+import signal
 from test_runner import make_sleeper, map_ordered
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
 for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
     print(result, flush=True)
 """
