@@ -134,6 +134,21 @@ def test_project_agrees_with_the_label_image(index: int, camera: OverheadCamera)
     assert np.array([columns.max(), rows.max()]) == pytest.approx(corners.max(axis=0), abs=1.5)
 
 
+def test_a_picture_from_elsewhere_has_its_own_labels(camera: OverheadCamera) -> None:
+    near = camera.render(SCATTERED, Pose((0.0, 0.0, 1.00), (0.0, 1.0, 0.0, 0.0)))
+    here = camera.label(SCATTERED)
+    assert (near.label >= 0).sum() > 1.5 * (here >= 0).sum()
+
+
+def test_project_is_not_shifted(camera: OverheadCamera) -> None:
+    shifts = []
+    label = camera.label(SCATTERED)
+    for index, o in enumerate(SCATTERED.objects):
+        rows, columns = np.nonzero(label == index)
+        shifts.append(np.array([columns.mean(), rows.mean()]) - outline(camera, o)[1])
+    assert np.abs(np.mean(shifts, axis=0)).max() < 0.25  # pixels
+
+
 def test_project_by_hand(camera: OverheadCamera) -> None:
     """x to the right, y up in the image; a point at half the altitude is twice as far from the middle, half a pixel off."""
     f = camera.config.focal_length

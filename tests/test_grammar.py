@@ -428,6 +428,11 @@ def test_canonical_form_tells_structures_apart() -> None:
     assert len(set(forms)) == len(forms)
 
 
+def test_canonical_form_of_a_tower_of_pairs_stays_short() -> None:
+    rules = ["drop_object", *["stack_object"] * 9, "end", *["insert_meta_large_marker_1"] * 10]
+    assert len(canonical_form(YCB.replay(tuple(rules)), CLASSES)) < 5000
+
+
 # --- Orientations ---
 
 

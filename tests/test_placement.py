@@ -76,7 +76,7 @@ def random_scene(seed: int) -> Scene:
             return scene
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) -> None:
     """Free of what is seen and of what is hidden, inside the tray, and with the centre of mass over the support."""
     scene = random_scene(seed)
@@ -189,12 +189,19 @@ def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) 
         choose_placement(seen(detector, scene), move, CONFIG, rng())
 
 
+def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> None:
+    scene = scene_of(resting("tomato_soup_can", name="can"), resting("gelatin_box", xy=(0.0805, 0.0), name="picked"))
+    X_TO = choose_placement(detector.look(scene).observation, Move("picked", "can"), CONFIG, rng())
+    assert X_TO is not None
+    assert X_TO.p[:2] == pytest.approx([0.0, 0.0], abs=0.0075)
+
+
 def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
     """Behind a high wall the floor cannot be seen; no place is chosen there, whatever the seed."""
     wall = [resting("cereal_box_large", Orientation.UPRIGHT_90, (0.22, y), name=f"wall {y}") for y in (-0.1, 0.1)]
     scene = scene_of(*wall, resting("tomato_soup_can", xy=(-0.2, 0.0), name="picked"))
     observation = seen(detector, scene)
-    for seed in range(20):
+    for seed in range(10):
         X_TO = choose_placement(observation, Move("picked"), CONFIG, rng(seed))
         assert X_TO is not None
         # The ray over the wall's top at x = 0.22 + 0.0325 meets the floor 300 / 1300 further out.

@@ -324,6 +324,75 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
     assert refused > 120
 
 
+ONE_BOX = """version: 1
+objects:
+- {name: a, class: sugar_box, X_TO: {translation: [0, 0, 0.0875], quaternion: [1, 0, 0, 0]}}
+"""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "seed: 2023-13-45",
+        "seed: !!timestamp foo",
+        "seed: !!int foo",
+        "seed: !!bool foo",
+        "seed: 0b_",
+        "seed: " + "9" * 5000,
+        "tray: {side: 0x" + "f" * 5000 + "}",
+        "tray: {side: 1" + "0" * 400 + "}",
+        "seed: " + "[" * 3000 + "]" * 3000,
+    ],
+)
+def test_yaml_that_its_reader_stumbles_over_is_refused(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(ONE_BOX + line + "\n")
+    with pytest.raises(InputError, match=r"scene\.yaml"):
+        load_scene(path, CATALOGUE)
+
+
+@pytest.mark.parametrize(
+    "verdict",
+    [
+        "{stable: banana, settled: {}, visible_share: {}, hidden: []}",
+        "{stable: 1, settled: {}, visible_share: {}, hidden: []}",
+        "{stable: false, settled: {}, visible_share: {}, hidden: [], "
+        "instability: {reason: slid, object: ghost, displacement: 0.1, tilt: 0.1}}",
+        "{stable: true, settled: {}, visible_share: {}, hidden: [], "
+        "instability: {reason: slid, object: a, displacement: 0.1, tilt: 0.1}}",
+        "{stable: true, settled: {}, visible_share: {a: 7.0}, hidden: []}",
+        "{stable: true, settled: {}, visible_share: {a: 1.0}, hidden: []}",
+    ],
+)
+def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(ONE_BOX + f"verdict: {verdict}\n")
+    with pytest.raises(InputError, match=r"scene\.yaml\.verdict"):
+        load_scene(path, CATALOGUE)
+
+
+@pytest.mark.parametrize(
+    "graph",
+    [
+        "{nodes: [{id: 0, kind: tray}, {id: 1, kind: open_slot}], edges: [{parent: 0, child: 1, kind: primitive}]}",
+        "{nodes: [{id: 0, kind: tray}, {id: 1, kind: end}, {id: 2, kind: end}], "
+        "edges: [{parent: 0, child: 1, kind: primitive}, {parent: 1, child: 2, kind: primitive}]}",
+    ],
+)
+def test_a_graph_that_no_derivation_ends_with_is_refused(graph: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(ONE_BOX + f"graph: {graph}\n")
+    with pytest.raises(InputError, match=r"scene\.yaml\.graph"):
+        load_scene(path, CATALOGUE)
+
+
+def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(ONE_BOX.replace("name: a", "name: a, node: 0") + "graph: {nodes: [{id: 0, kind: tray}], edges: []}\n")
+    with pytest.raises(InputError, match="node"):
+        load_scene(path, CATALOGUE)
+
+
 # --- Fuzz ---
 
 

@@ -113,6 +113,15 @@ def test_every_object_on_its_own_is_told_by_its_own_name(judge: DrakeJudge) -> N
         assert list(verdict.settled) == [name]
 
 
+@pytest.mark.parametrize("x", [0.6, 0.36])
+def test_a_single_object_beside_the_tray_has_left_it(x: float, judge: DrakeJudge) -> None:
+    """Also after one on the tray has settled alike."""
+    assert judge.judge(scene_of(resting("cracker_box", name="box")), rng()).stable
+    verdict = judge.judge(scene_of(resting("cracker_box", xy=(x, 0.0), name="box")), rng())
+    assert verdict.instability is not None
+    assert verdict.instability.reason is InstabilityReason.LEFT_TRAY
+
+
 def moved_aside(objects: Sequence[SceneObject], y: float, prefix: str) -> list[SceneObject]:
     return [replace(o, name=prefix + o.name, X_TO=o.X_TO.moved((0.0, y, 0.0))) for o in objects]
 
