@@ -72,6 +72,9 @@ ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML with the config's fields that differ from the defaults.")
 ]
 ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")]
+MaxMovesOption = Annotated[
+    int | None, typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given.")
+]
 NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
 
 
@@ -158,7 +161,7 @@ def explore(
     fidelity: Annotated[Fidelity, typer.Option(help="settle: objects are teleported, Drake settles what a move touched.")] = (
         Fidelity.SETTLE
     ),
-    max_moves: Annotated[int, typer.Option(min=1, help="Moves after which the search ends.")] = 10,
+    max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
@@ -170,7 +173,8 @@ def explore(
 
     world, file = load_config(config), _load(scene, catalogue)
     output_directory(out)
-    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, max_moves, seed, world, _report)
+    limit = max_moves or world.exploration.max_moves
+    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, limit, seed, world, _report)
     fields = command.write_episode(out, task, f"{agent.value} explores {scene.name}", agent.value, seed)
     _print_episode(fields, as_json, out)
 
@@ -188,7 +192,7 @@ def evaluate(
     scenes: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of judged scene files, as `generate` wrote them.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON with the rows and every episode.")],
     agents: Annotated[list[ExplorerName] | None, typer.Option("--agent", help="May be repeated; all if not given.")] = None,
-    max_moves: Annotated[int, typer.Option(min=1, help="Moves after which an episode ends.")] = 10,
+    max_moves: MaxMovesOption = None,
     count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
     seed: SeedOption = 0,
     workers: Annotated[int, typer.Option(min=1, help="Local processes; the result is the same for any number.")] = 1,
@@ -203,17 +207,16 @@ def evaluate(
     world = load_config(config)
     played = command.playable(scenes, catalogue)[:count]
     names = [agent.value for agent in agents or ExplorerName]
+    limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return _tracked("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, max_moves, seed, world, catalogue, workers, out, progress)
+    rows = command.evaluate(played, names, limit, seed, world, catalogue, workers, out, progress)
     if as_json:
         print(json.dumps(rows, indent=2))
         return
-    table = Table(
-        "agent", "episodes", "success", "95 %", "hidden", "found", "moves", "ended", title=f"{scenes}, {max_moves} moves"
-    )
+    table = Table("agent", "episodes", "success", "95 %", "hidden", "found", "moves", "ended", title=f"{scenes}, {limit} moves")
     for row in rows:
         low, high = row["success_ci95"]
         numbers = (

@@ -50,7 +50,8 @@ class SettleConfig:
         max_time: s simulated.
         rest_drift: m, what went further in the last 0.5 s is "not at rest". Contact chatter and a marker that rocks on the
             facets of its contact mesh stay below it.
-        calm_speed: m/s; calm_displacement: m; calm_tilt_deg: deg. A stack is calm while every object is below all three.
+        calm_speed: m/s; calm_displacement: m, calm_tilt_deg: deg, both since the start. A stack is calm while every object is
+            below all three.
         calm_samples: calm samples in a row, 0.1 s apart, that end the simulation early.
     """
 

@@ -173,7 +173,7 @@ def test_too_high() -> None:
     assert isinstance(failure, LayoutFailure)
     assert (failure.reason, failure.limit) == (LayoutFailureReason.TOO_HIGH, 0.50)
     assert failure.amount == pytest.approx(0.69)
-    assert str(failure) == "stack too high: 0.69, at most 0.5"
+    assert str(failure) == "stack too high: 0.69 of 0.5 m"
     lower_cap = lay_out(tower(2), CLASSES, replace(LayoutConfig(), max_stack_height=0.45), rng())
     assert isinstance(lower_cap, LayoutFailure)
     assert lower_cap.reason is LayoutFailureReason.TOO_HIGH

@@ -33,7 +33,7 @@ class RandomExplorer:
         return moves[rng.integers(len(moves))] if moves else None
 
 
-def _largest_not_yet_moved(
+def _least_picked_then_largest(
     candidates: Sequence[Detection], tried: Sequence[Move], size: Callable[[Detection], float]
 ) -> Move | None:
     """The largest candidate to the tray. Those picked least often come first, so that a sweep ends before a repeat begins;
@@ -44,23 +44,26 @@ def _largest_not_yet_moved(
 
 
 class LargestFirst:
-    """LF: the object in view with the largest volume goes to the tray, whatever may lie on it; nearest to the paper's."""
+    """LF: the object in view with the largest volume goes to the tray, whatever may lie on it; nearest to the paper's.
+
+    Those picked least often come first, see `_least_picked_then_largest`.
+    """
 
     def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
         """See `ExplorationAgent.choose`."""
-        return _largest_not_yet_moved(observation.detections, tried, lambda d: d.object_class.volume)
+        return _least_picked_then_largest(observation.detections, tried, lambda d: d.object_class.volume)
 
 
 class LargestClear:
     """LF-clear: the object in view with the most pixels, among those with nothing on top, goes to the tray.
 
-    If nothing in view has a clear top, all count as candidates.
+    Those picked least often come first. If nothing in view has a clear top, all count as candidates.
     """
 
     def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
         """See `ExplorationAgent.choose`."""
         clear = [d for d in observation.detections if has_clear_top(observation, d)]
-        return _largest_not_yet_moved(clear or observation.detections, tried, lambda d: float(d.mask.sum()))
+        return _least_picked_then_largest(clear or observation.detections, tried, lambda d: float(d.mask.sum()))
 
 
 EXPLORATION_AGENTS: dict[str, Callable[[], ExplorationAgent]] = {

@@ -24,7 +24,7 @@ class Look:
 
 
 class LabelDetector:
-    """Detects every object that is not hidden, with its true class and pose."""
+    """Detects every object that is in the frame and not hidden, with its true class and pose."""
 
     def __init__(self, config: CameraConfig) -> None:
         self.camera = OverheadCamera(config)
@@ -35,8 +35,8 @@ class LabelDetector:
         shares = self.camera.visible_shares(scene)
         hidden = self.camera.hidden(shares)
         detections = tuple(
-            Detection(o.name, o.object_class, o.X_TO, images.label == index)
+            Detection(o.name, o.object_class, o.X_TO, mask)
             for index, o in enumerate(scene.objects)
-            if o.name not in hidden
+            if o.name not in hidden and (mask := images.label == index).any()
         )
         return Look(Observation(images.depth, detections, self.camera.config, scene.tray_side), images, shares)

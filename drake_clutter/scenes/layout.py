@@ -28,7 +28,7 @@ class LayoutFailure:
     Attributes:
         reason: why.
         amount: m^2, area of the stacks' footprints, or m, height of the highest stack.
-        limit: what would have been allowed, in the same unit.
+        limit: m^2, area of the tray, or m, the height allowed.
     """
 
     reason: LayoutFailureReason
@@ -36,7 +36,8 @@ class LayoutFailure:
     limit: float
 
     def __str__(self) -> str:
-        return f"{self.reason.value}: {self.amount:.3g}, at most {self.limit:.3g}"
+        unit = "m" if self.reason is LayoutFailureReason.TOO_HIGH else "m^2"
+        return f"{self.reason.value}: {self.amount:.3g} of {self.limit:.3g} {unit}"
 
 
 def _resting_at(node: int, object_class: ObjectClass, orientation: Orientation, floor: float) -> SceneObject:

@@ -99,7 +99,7 @@ class Scene:
         tray_side: m, inner side of the square tray.
         graph: the terminal graph it was laid out from, or None.
         derivation: the names of the rules that derived the graph.
-        seed: the seed it was drawn with, or None.
+        seed: of the batch it was drawn in, or None.
     """
 
     objects: tuple[SceneObject, ...]

@@ -28,7 +28,8 @@ class Instability:
     """The object that did not stay, and how.
 
     Attributes:
-        reason: toppled (turned past the limit), slid (moved past it, not turned), left the tray, or still moving at the end.
+        reason: toppled (turned past the limit), slid (moved past it, sideways or down, not turned), left the tray,
+            or still moving at the end.
         object: its name.
         displacement: m, of its origin.
         tilt: rad, see `tilt_between`.

@@ -50,8 +50,7 @@ class SettleExecutor:
             if settled[-1].instability is not None:
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
                 whole = settle(moved.objects, scene.tray_side, coarse, record=True, follow_falls=True)
-                instability = whole.instability or settled[-1].instability
-                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), instability, whole.motion)
+                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), settled[-1].instability, whole.motion)
         return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, _together(moved.poses, settled))
 
 

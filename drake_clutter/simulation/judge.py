@@ -19,8 +19,8 @@ TOUCHING_MARGIN = 0.003
 class DrakeJudge:
     """Settles a scene and looks at it (a `SceneJudge`).
 
-    Stacks that cannot touch are settled apart. The first that falls decides, since a scene is stable only if all are; what
-    a falling stack would do to its neighbours changes no verdict.
+    Groups of objects that do not touch as laid out are settled apart. The first that falls decides, since a scene is stable
+    only if all are; what a falling stack would do to its neighbours changes no verdict.
     """
 
     def __init__(self, config: ClutterConfig) -> None:

@@ -82,10 +82,11 @@ class ExplorationTask:
 
         Raises:
             KeyError: the move names an object that is not in view.
-            ValueError: the move puts an object on itself, or the episode is over.
+            ValueError: the move puts an object on itself, or the scene has collapsed. Otherwise an episode that is over may be
+                played on, as with moves of one's own choice.
         """
         if self.end is EpisodeEnd.COLLAPSED:
-            raise ValueError("the scene has collapsed; no move is allowed")
+            raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
         if move.place == move.pick:
             raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
         outcome = self._executor.execute(self.scene, self.look.observation, move, rng)
