@@ -8,6 +8,7 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 .PHONY: demo test
 
 demo: .venv/installed
+	rm -rf out/demo
 	.venv/bin/drake-clutter demo --seed 0 --out out/demo
 
 test: .venv/installed
