@@ -22,9 +22,9 @@ from drake_clutter.grammar import NodeBudget, SceneGrammar
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import SceneObject, jittered
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
-from drake_clutter.simulation.settle import jittered, settle
+from drake_clutter.simulation.settle import settle
 
 NEVER = 1_000_000
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -10,9 +10,9 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "config", "files", "resources", "runner"},
+    0: {"assets", "catalogue", "config", "files", "resources", "runner", "runner_ray"},
     1: {"grammar"},
-    2: {"scenes"},
+    2: {"fast", "scenes"},
     3: {"export", "simulation"},
     4: {"arm", "perception"},
     5: {"tasks"},

@@ -87,14 +87,19 @@ class SceneGenerator:
         self._judge = DrakeJudge(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:
-        """The scene of an index; it depends on nothing but the job and the index."""
+        """The scene of an index, judged; it depends on nothing but the job and the index."""
         rng = item_rng(self._job.seed, index)
+        scene, failures = self.lay_out(rng)
+        return GeneratedScene(scene, self._judge.judge(scene, rng), failures)
+
+    def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
+        """A scene as laid out, and why the graphs drawn before it could not be."""
         failures: Counter[str] = Counter()
         for _ in range(LAYOUT_TRIES):
             derivation = self._agent.derive(self._grammar, self._budget, rng)
             scene = lay_out(derivation, self._grammar.classes, self._job.config.layout, rng, self._job.seed)
             if not isinstance(scene, LayoutFailure):
-                return GeneratedScene(scene, self._judge.judge(scene, rng), failures)
+                return scene, failures
             failures[scene.reason.value] += 1
         raise RuntimeError(f"{LAYOUT_TRIES} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}")
 

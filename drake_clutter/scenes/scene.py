@@ -4,7 +4,7 @@ Frames: T the tray (origin on the tray's floor at its centre, z up), O an object
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -132,6 +132,19 @@ class Scene:
     def at(self, poses: Mapping[str, Pose]) -> "Scene":
         """The scene with the poses of the objects that are named replaced."""
         return replace(self, objects=tuple(replace(o, X_TO=poses[o.name]) if o.name in poses else o for o in self.objects))
+
+
+def random_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """(count, 3) m: for each object an offset in the tray's plane, drawn uniformly from a disc of the radius (m)."""
+    draws = rng.random((count, 2))
+    distance, angle = radius * np.sqrt(draws[:, 0]), 2 * math.pi * draws[:, 1]
+    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)])
+
+
+def jittered(objects: Sequence[SceneObject], radius: float, rng: np.random.Generator) -> list[SceneObject]:
+    """The objects, each moved by a random offset of its own."""
+    offsets = random_offsets(len(objects), radius, rng)
+    return [replace(o, X_TO=o.X_TO.moved(offset)) for o, offset in zip(objects, offsets, strict=True)]
 
 
 def tilt_between(object_class: ObjectClass, X_TA: Pose, X_TB: Pose) -> float:

@@ -21,6 +21,9 @@ class InstabilityReason(Enum):
     SLID = "slid"
     LEFT_TRAY = "left the tray"
     NOT_AT_REST = "not at rest in time"
+    UNBALANCED = "out of balance"
+    ROLLS = "balanced on a lying cylinder"
+    UNSUPPORTED = "between what should carry it"
 
 
 @dataclass(frozen=True)
@@ -29,18 +32,21 @@ class Instability:
 
     Attributes:
         reason: toppled (turned past the limit), slid (moved past it, sideways or down, not turned), left the tray,
-            or still moving at the end.
+            or still moving at the end; of a judge that simulates no motion: no contact forces hold it, they do only on a line
+            on which it rolls, or nothing is under it.
         object: its name.
-        displacement: m, of its origin.
-        tilt: rad, see `tilt_between`.
+        displacement: m, of its origin; 0 if no motion was simulated.
+        tilt: rad, see `tilt_between`; likewise.
     """
 
     reason: InstabilityReason
     object: str
-    displacement: float
-    tilt: float
+    displacement: float = 0.0
+    tilt: float = 0.0
 
     def __str__(self) -> str:
+        if not self.displacement and not self.tilt:
+            return f"{self.object} {self.reason.value}"
         return f"{self.object} {self.reason.value} ({1000 * self.displacement:.0f} mm, {math.degrees(self.tilt):.0f} deg)"
 
 
@@ -66,10 +72,37 @@ class Verdict:
         return self.instability is None
 
 
+class CannotJudgeReason(Enum):
+    """What is beyond a judge's model of a scene."""
+
+    LEANING = "leans"
+    NOT_CONVEX = "is not convex"
+    OUTSIDE_TRAY = "is outside the tray"
+    INTERPENETRATING = "interpenetrates another object or the tray"
+    FLOATING = "floats in the air"
+    EDGE_CONTACT = "rests on an edge or on a curved side"
+
+
+@dataclass(frozen=True)
+class CannotJudge:
+    """A judge's answer to a scene that its model does not cover; `DrakeJudge` judges all.
+
+    Attributes:
+        reason: what is beyond the model.
+        object: the name of the first object of which it is true.
+    """
+
+    reason: CannotJudgeReason
+    object: str
+
+    def __str__(self) -> str:
+        return f"{self.object} {self.reason.value}"
+
+
 class SceneJudge(Protocol):
     """Says whether a scene is stable and what it hides."""
 
-    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
         """The verdict; `rng` draws the random offsets that no exact balance survives."""
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene import Pose, Scene, jittered
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
-from drake_clutter.simulation.settle import Settled, jittered, settle
+from drake_clutter.simulation.settle import Settled, settle
 
 _AFTERMATH_TIME_STEP = 0.005
 """s; what a fall does to the rest of the scene decides nothing any more, it is only shown."""

@@ -1,16 +1,18 @@
 """The judge that every published number comes from: settled in hydroelastic contact, seen by the rendered camera."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
 from drake_clutter.scenes.geometry import touching_groups
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.settle import Settled, jittered, settle
+from drake_clutter.simulation.settle import Settled, settle
 
 TOUCHING_MARGIN = 0.003
 """m; objects further apart than this, random offsets included, settle without each other."""
@@ -20,25 +22,32 @@ class DrakeJudge:
     """Settles a scene and looks at it (a `SceneJudge`).
 
     Groups of objects that do not touch as laid out are settled apart. The first that falls decides, since a scene is stable
-    only if all are; what a falling stack would do to its neighbours changes no verdict.
+    only if all are; what a falling stack would do to its neighbours changes no verdict. Those that the fast judge expects to
+    fall, or cannot judge, come first: the sooner a fall is seen, the less is simulated.
     """
 
     def __init__(self, config: ClutterConfig) -> None:
         self._config = config
         self._camera = OverheadCamera(config.camera)
+        self._fast = FastJudge(config)
         self._singles: dict[tuple[ObjectClass, float, float, tuple[float, ...]], Settled] = {}
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
         """The verdict. See `SceneJudge.judge`."""
-        config = self._config.settle
         settled: dict[str, Pose] = dict(scene.poses)
-        for group in touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN):
-            alone = len(group) == 1 and _well_inside(group[0], scene.tray_side)
-            result = self._settle_alone(group[0], scene.tray_side) if alone else settle(group, scene.tray_side, config)
+        for _, result in self.settle_groups(scene, rng):
             settled |= result.poses
             if result.instability is not None:
                 return Verdict(result.instability, settled, {}, ())
         return self.look(scene.at(settled))
+
+    def settle_groups(self, scene: Scene, rng: np.random.Generator) -> Iterator[tuple[tuple[SceneObject, ...], Settled]]:
+        """Settles group after group of objects that may touch, random offsets added; each with how it settled."""
+        config = self._config.settle
+        groups = touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN)
+        for group in sorted(groups, key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None):
+            alone = len(group) == 1 and _well_inside(group[0], scene.tray_side)
+            yield tuple(group), self._settle_alone(group[0], scene.tray_side) if alone else settle(group, scene.tray_side, config)
 
     def _settle_alone(self, single: SceneObject, tray_side: float) -> Settled:
         """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""

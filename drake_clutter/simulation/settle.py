@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -14,11 +14,10 @@ from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
 from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason
 from drake_clutter.simulation.plant import add_scene_plant
 
-SAMPLE_PERIOD = 0.1
+SAMPLE_PERIOD = 0.05
 """s between two looks at whether the objects have fallen or come to rest."""
-REST_SAMPLES = 5
+REST_SAMPLES = 10
 """Samples over which what is at rest may not drift."""
-FRAME_PERIOD = 1 / 30
 
 
 @dataclass(frozen=True)
@@ -28,22 +27,12 @@ class Settled:
     Attributes:
         instability: None if they stayed.
         poses: X_TO by name at the end.
-        motion: frames at 30 Hz, if asked for.
+        motion: frames at 40 Hz, if asked for.
     """
 
     instability: Instability | None
     poses: dict[str, Pose]
     motion: tuple[Frame, ...]
-
-
-def jittered(objects: Sequence[SceneObject], radius: float, rng: np.random.Generator) -> list[SceneObject]:
-    """The objects, each moved in the tray's plane by an offset drawn uniformly from a disc of the radius (m)."""
-    found = []
-    for scene_object in objects:
-        distance, angle = radius * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi)
-        offset = (distance * math.cos(angle), distance * math.sin(angle), 0.0)
-        found.append(replace(scene_object, X_TO=scene_object.X_TO.moved(offset)))
-    return found
 
 
 def _fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleConfig) -> Instability | None:
@@ -92,9 +81,8 @@ def settle(
     calm_samples, instability = 0, None
     for sample in range(1, math.ceil(config.max_time / SAMPLE_PERIOD) + 1):
         if record:
-            for part in range(1, round(SAMPLE_PERIOD / FRAME_PERIOD)):
-                simulator.AdvanceTo((sample - 1) * SAMPLE_PERIOD + part * FRAME_PERIOD)
-                motion.append(Frame(simulator.get_context().get_time(), scene_plant.poses(context)))
+            simulator.AdvanceTo((sample - 0.5) * SAMPLE_PERIOD)
+            motion.append(Frame(simulator.get_context().get_time(), scene_plant.poses(context)))
         # Half a step is added so that rounding never leaves a step out.
         simulator.AdvanceTo(sample * SAMPLE_PERIOD + config.time_step / 2)
         poses, speeds = scene_plant.poses(context), scene_plant.speeds(context)

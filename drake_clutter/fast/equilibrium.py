@@ -1,0 +1,338 @@
+"""Quasi-static equilibrium of objects that stand on each other: do non-negative contact forces exist that hold them?
+
+All contacts are level. A force may act anywhere in a contact polygon, that is, at its corners. Equilibrium under vertical forces
+is a non-negative least-squares problem: three rows per object (force, two moments about its centre of mass) and a column per
+corner (Lawson and Hanson, Solving Least Squares Problems, ch. 23). With friction there are six rows, and four columns a corner.
+"""
+
+import numpy as np
+from numba import njit
+
+LEVEL_GAP = 0.002
+"""m; surfaces whose heights differ by less touch each other."""
+DEEPEST = 0.0015
+"""m; objects that overlap further, in height and seen from above, interpenetrate."""
+BESIDE = 0.060
+"""m; an object that begins at the height where another one ends, and no further beside it, was put on it and misses it. The gap
+of a standing pair is smaller."""
+_LENGTH = 0.05
+"""m, by which moments are divided, so that they count about as much as forces."""
+_BALANCED = 1e-6
+"""Of the total weight: the residual that is taken for rounding."""
+
+# What `contacts` says of objects.
+SOUND, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
+GROUND = -1
+
+
+@njit(cache=True)
+def _clip(polygon, count, x, y, nx, ny, room):  # type: ignore[no-untyped-def]
+    """Keeps what lies within `room` of the line through (x, y) on the side that (nx, ny) points away from; in place."""
+    kept = np.empty_like(polygon)
+    found = 0
+    for k in range(count):
+        after = (k + 1) % count
+        here = (polygon[k, 0] - x) * nx + (polygon[k, 1] - y) * ny - room
+        there = (polygon[after, 0] - x) * nx + (polygon[after, 1] - y) * ny - room
+        if here <= 0 and found < len(kept):
+            kept[found] = polygon[k]
+            found += 1
+        if (here < 0 < there or there < 0 < here) and found < len(kept):
+            share = here / (here - there)
+            kept[found] = polygon[k] + share * (polygon[after] - polygon[k])
+            found += 1
+    polygon[:found] = kept[:found]
+    return found
+
+
+@njit(cache=True)
+def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignore[no-untyped-def]
+    """Clips a polygon to another one that is moved by (dx, dy) and shrunk by the margin; a segment counts as thin."""
+    if other_count == 2:
+        ex, ey = other[1, 0] - other[0, 0], other[1, 1] - other[0, 1]
+        length = np.hypot(ex, ey)
+        ex, ey = ex / length, ey / length
+        count = _clip(polygon, count, other[0, 0] + dx, other[0, 1] + dy, -ex, -ey, -margin)
+        count = _clip(polygon, count, other[1, 0] + dx, other[1, 1] + dy, ex, ey, -margin)
+        count = _clip(polygon, count, other[0, 0] + dx, other[0, 1] + dy, -ey, ex, 1e-9)
+        return _clip(polygon, count, other[0, 0] + dx, other[0, 1] + dy, ey, -ex, 1e-9)
+    for k in range(other_count):
+        after = (k + 1) % other_count
+        ex, ey = other[after, 0] - other[k, 0], other[after, 1] - other[k, 1]
+        length = np.hypot(ex, ey)
+        count = _clip(polygon, count, other[k, 0] + dx, other[k, 1] + dy, ey / length, -ex / length, -margin)
+        if count == 0:
+            return 0
+    return count
+
+
+@njit(cache=True)
+def contact_polygon(table, lower_shape, upper_shape, lower_p, upper_p, margin):  # type: ignore[no-untyped-def]
+    """Corners (V, 2) m in T where an object stands on another one (shape -1: on the tray), shrunk by the margin (m)."""
+    polygon = np.empty((48, 2))
+    bottom, corners = table.bottom[upper_shape], table.bottom_count[upper_shape]
+    # Larger than the bottom, so that a negative margin makes it grow.
+    reach = 0.1
+    for k in range(corners):
+        reach = max(reach, 0.1 + abs(bottom[k, 0]), 0.1 + abs(bottom[k, 1]))
+    for k in range(4):
+        polygon[k, 0] = upper_p[0] + (reach if k in (1, 2) else -reach)
+        polygon[k, 1] = upper_p[1] + (reach if k in (2, 3) else -reach)
+    count = _clip_to(polygon, 4, bottom, corners, upper_p[0], upper_p[1], margin)
+    if lower_shape >= 0:
+        top, corners = table.top[lower_shape], table.top_count[lower_shape]
+        count = _clip_to(polygon, count, top, corners, lower_p[0], lower_p[1], margin) if corners > 0 else 0
+    return polygon[:count]
+
+
+@njit(cache=True)
+def _overlap(table, i, j, p_i, p_j):  # type: ignore[no-untyped-def]
+    """How deep two outlines overlap seen from above, m (separating axes); negative: how far they are apart at least."""
+    apart = np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1]) - table.reach[i] - table.reach[j]
+    if apart > BESIDE:
+        return -apart
+    least = np.inf
+    for first in range(2):
+        a, b = (i, j) if first == 0 else (j, i)
+        p_a, p_b = (p_i, p_j) if first == 0 else (p_j, p_i)
+        corners, count = table.footprint[a], table.footprint_count[a]
+        others, other_count = table.footprint[b], table.footprint_count[b]
+        for k in range(count):
+            after = (k + 1) % count
+            ex, ey = corners[after, 0] - corners[k, 0], corners[after, 1] - corners[k, 1]
+            length = np.hypot(ex, ey)
+            nx, ny = ey / length, -ex / length
+            nearest = np.inf
+            for m in range(other_count):
+                nearest = min(
+                    nearest,
+                    (others[m, 0] + p_b[0] - corners[k, 0] - p_a[0]) * nx + (others[m, 1] + p_b[1] - corners[k, 1] - p_a[1]) * ny,
+                )
+            least = min(least, -nearest)
+    return least
+
+
+@njit(cache=True)
+def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
+    """Who stands on whom.
+
+    Args:
+        table: of the shapes.
+        shapes: (n,) rows of the table.
+        p_T: (n, 3) m.
+        tray_side: m.
+
+    Returns:
+        What is wrong (`SOUND` if nothing is), with which object, the pairs (c, 2) of lower (`GROUND`: the tray) and upper
+        object, and (n,) the number of the stack that each object belongs to.
+    """
+    n = len(shapes)
+    pairs = np.empty((n * (n + 1), 2), np.int64)
+    count = 0
+    stack = np.arange(n)
+    fault, culprit = SOUND, 0
+    for j in range(n):
+        shape = shapes[j]
+        if table.fault[shape] != 0:
+            return LEANING if table.fault[shape] == 1 else NOT_CONVEX, j, pairs[:0], stack
+        for k in range(table.footprint_count[shape]):
+            for axis in range(2):
+                if abs(table.footprint[shape, k, axis] + p_T[j, axis]) > tray_side / 2 + DEEPEST:
+                    return OUTSIDE, j, pairs[:0], stack
+    for j in range(n):
+        upper = shapes[j]
+        low = p_T[j, 2] + table.low[upper]
+        supported = False
+        if low < -LEVEL_GAP:
+            return OVERLAPPING, j, pairs[:0], stack
+        if low < LEVEL_GAP:
+            pairs[count, 0], pairs[count, 1] = GROUND, j
+            count += 1
+            supported = True
+        beside, above = False, False  # or above something that ends where this begins
+        for i in range(n):
+            if i == j:
+                continue
+            lower = shapes[i]
+            high = p_T[i, 2] + table.high[lower]
+            level = abs(low - high) < LEVEL_GAP
+            over = min(p_T[j, 2] + table.high[upper], high) - max(low, p_T[i, 2] + table.low[lower])
+            if not level and over <= DEEPEST:
+                continue
+            deep = _overlap(table, upper, lower, p_T[j], p_T[i])
+            if not level:
+                if deep > DEEPEST and fault == SOUND:
+                    fault, culprit = OVERLAPPING, j
+                continue
+            beside |= deep > -BESIDE
+            above |= deep > 0
+            if deep > 0 and len(contact_polygon(table, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
+                pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+                supported = True
+                old, new = stack[j], stack[i]
+                for k in range(n):
+                    if stack[k] == old:
+                        stack[k] = new
+        if not supported and fault == SOUND:
+            culprit = j
+            fault = EDGE if above else UNSUPPORTED if beside else FLOATING
+    return fault, culprit, pairs[:count], stack
+
+
+@njit(cache=True)
+def _nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
+    """x >= 0 that minimises |A x - b|, by Lawson and Hanson's active sets on the normal equations."""
+    rows, columns = A.shape
+    G, c = A.T @ A, A.T @ b
+    x, chosen = np.zeros(columns), np.zeros(columns, np.bool_)
+    blocked = np.zeros(columns, np.bool_)
+    for _ in range(6 * rows + 30):
+        w = c - G @ x
+        entering, most = -1, tolerance
+        for k in range(columns):
+            if not chosen[k] and not blocked[k] and w[k] > most:
+                entering, most = k, w[k]
+        if entering < 0:
+            break
+        chosen[entering] = True
+        while True:
+            members = np.nonzero(chosen)[0]
+            m = len(members)
+            # Cholesky, in place; a column that depends on the others is left out.
+            L, s = np.empty((m, m)), np.empty(m)
+            dependent = -1
+            for r in range(m):
+                for q in range(r + 1):
+                    value = G[members[r], members[q]]
+                    for t in range(q):
+                        value -= L[r, t] * L[q, t]
+                    if r == q:
+                        if value < 1e-11:
+                            dependent = r
+                            break
+                        L[r, r] = np.sqrt(value)
+                    else:
+                        L[r, q] = value / L[q, q]
+                if dependent >= 0:
+                    break
+            if dependent >= 0:
+                chosen[entering] = False
+                x[entering] = 0.0
+                blocked[entering] = True
+                break
+            for r in range(m):
+                value = c[members[r]]
+                for t in range(r):
+                    value -= L[r, t] * s[t]
+                s[r] = value / L[r, r]
+            for r in range(m - 1, -1, -1):
+                value = s[r]
+                for t in range(r + 1, m):
+                    value -= L[t, r] * s[t]
+                s[r] = value / L[r, r]
+            step = 1.0
+            for r in range(m):
+                if s[r] <= 0:
+                    step = min(step, x[members[r]] / (x[members[r]] - s[r]))
+            for r in range(m):
+                x[members[r]] += step * (s[r] - x[members[r]])
+            if step >= 1.0:
+                blocked[:] = False
+                break
+            for r in range(m):
+                if x[members[r]] <= 1e-12:
+                    x[members[r]] = 0.0
+                    chosen[members[r]] = False
+    return x
+
+
+@njit(cache=True)
+def residuals(table, shapes, p_T, pairs, margins, aside, friction):  # type: ignore[no-untyped-def]
+    """How much of each object's weight and moment no contact forces can hold.
+
+    Args:
+        table: of the shapes.
+        shapes: (n,) rows of the table.
+        p_T: (n, 3) m.
+        pairs: (c, 2) lower (`GROUND`: the tray) and upper object of each contact.
+        margins: (n,) m, by which the contacts below each object are shrunk.
+        aside: (n, 2) m, by which the centres of mass are moved.
+        friction: 0, or the coefficient of the pyramids in which the forces lie.
+
+    Returns:
+        (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
+    """
+    n = len(shapes)
+    at, ends = np.empty((48 * len(pairs), 3)), np.empty((48 * len(pairs), 2), np.int64)
+    count = 0
+    for c in range(len(pairs)):
+        lower, upper = pairs[c]
+        lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
+        polygon = contact_polygon(table, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper])
+        for k in range(len(polygon)):
+            at[count, :2], at[count, 2] = polygon[k], p_T[upper, 2] + table.low[shapes[upper]]
+            ends[count, 0], ends[count, 1] = upper, lower
+            count += 1
+    total = 0.0
+    for i in range(n):
+        total += table.mass[shapes[i]]
+    rows, sides = (6, 4) if friction > 0 else (3, 1)
+    A, b = np.zeros((rows * n, sides * count)), np.zeros(rows * n)
+    for i in range(n):
+        b[rows * i] = table.mass[shapes[i]] / total
+    for k in range(count):
+        for end in range(2):
+            i = ends[k, end]
+            if i < 0:
+                continue
+            sign = 1.0 - 2.0 * end
+            com = table.com[shapes[i]]
+            x = (at[k, 0] - p_T[i, 0] - com[0] - aside[i, 0]) / _LENGTH
+            y = (at[k, 1] - p_T[i, 1] - com[1] - aside[i, 1]) / _LENGTH
+            z = (at[k, 2] - p_T[i, 2] - com[2]) / _LENGTH
+            for side in range(sides):
+                fx = friction * ((side == 0) - (side == 1)) if sides > 1 else 0.0
+                fy = friction * ((side == 2) - (side == 3)) if sides > 1 else 0.0
+                column = sides * k + side
+                A[rows * i, column] = sign
+                A[rows * i + 1, column] = sign * (y - z * fy)
+                A[rows * i + 2, column] = sign * (z * fx - x)
+                if sides > 1:
+                    A[rows * i + 3, column] = sign * fx
+                    A[rows * i + 4, column] = sign * fy
+                    A[rows * i + 5, column] = sign * (x * fy - y * fx)
+    rest = b - A @ _nnls(A, b, 1e-9) if count > 0 else b
+    found = np.empty(n)
+    for i in range(n):
+        norm = np.sqrt((rest[rows * i : rows * i + rows] ** 2).sum())
+        found[i] = norm if norm > _BALANCED else 0.0
+    return found
+
+
+@njit(cache=True)
+def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
+    """The object of a stack that is furthest from equilibrium, and whether it rolls; -1 if the stack stands.
+
+    Vertical forces come first; what they cannot hold, forces with friction may, as in an arch of two boxes that lean on what
+    bridges them. All contacts are shrunk by the margin (m). The line along which a cylinder carries has no width to shrink:
+    instead, what lies on one must also be held with its centre of mass moved by the margin to either side of the line.
+    """
+    n = len(shapes)
+    margins, aside = np.full(n, margin), np.zeros((n, 2))
+    rest = residuals(table, shapes, p_T, pairs, margins, aside, 0.0)
+    needed = 0.0
+    if rest.max() > 0:
+        needed = friction
+        if residuals(table, shapes, p_T, pairs, margins, aside, friction).max() > 0:
+            return np.argmax(rest), False
+    for lower, upper in pairs:
+        if lower >= 0 and table.rolls[shapes[lower]]:
+            line = table.top[shapes[lower], 1] - table.top[shapes[lower], 0]
+            for sign in (-1.0, 1.0):
+                aside[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
+                aside[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
+                if residuals(table, shapes, p_T, pairs, margins, aside, needed).max() > 0:
+                    return upper, True
+            aside[upper] = 0.0
+    return -1, False

@@ -1,0 +1,164 @@
+"""The judge that training needs: verdicts from equilibrium and rays, without simulating."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast import equilibrium
+from drake_clutter.fast.shapes import Floats, Ints, Shapes
+from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, random_offsets
+from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
+
+FRICTION = 0.3
+"""Coefficient of the friction that is relied on, of the 0.5 that there is: bodies at rest do not find every force that could
+hold them."""
+_ROUNDING = 5e-5
+"""m, added to the margin: stacks that differ from balance by just the offsets' reach are common, since sizes are round."""
+_GRID = 1e-6
+"""m; stacks whose objects stand alike to within this share their verdict."""
+_MARGIN_RANGE = (-0.030, 0.150)
+_MARGIN_STEP = 1e-4
+_KEPT = 100_000
+_CANNOT = {
+    equilibrium.LEANING: CannotJudgeReason.LEANING,
+    equilibrium.NOT_CONVEX: CannotJudgeReason.NOT_CONVEX,
+    equilibrium.OUTSIDE: CannotJudgeReason.OUTSIDE_TRAY,
+    equilibrium.OVERLAPPING: CannotJudgeReason.INTERPENETRATING,
+    equilibrium.FLOATING: CannotJudgeReason.FLOATING,
+    equilibrium.EDGE: CannotJudgeReason.EDGE_CONTACT,
+}
+
+_StackKey = tuple[tuple[int, int, int, int], ...]
+
+
+class FastJudge:
+    """Says whether a scene can stand, by quasi-static equilibrium, and what its camera sees (a `SceneJudge`).
+
+    Objects must be convex, level and in contact as scenes are laid out or come to rest; of others it says that it cannot
+    judge. Contacts are shrunk by a margin: the most that the random offsets of two objects can take away. Verdicts are
+    remembered by stack, wherever it stands on the tray: after a change, only the stacks that changed are judged again.
+    """
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._config = config
+        self._shapes = Shapes()
+        self.rays = RayCaster(config.camera, self._shapes)
+        self._known: dict[_StackKey, tuple[int, bool]] = {}
+        self._generation = 0
+        self._margin = 2 * config.settle.jitter + _ROUNDING
+
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
+        """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
+        p_T = np.array([o.X_TO.translation for o in scene.objects])
+        found = self.stability(scene)
+        if isinstance(found, CannotJudge):
+            return found
+        moved = p_T + random_offsets(len(p_T), self._config.settle.jitter, rng)
+        settled = {o.name: Pose((x, y, z), o.X_TO.quaternion) for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)}
+        if found is not None:
+            return Verdict(found, settled, {}, ())
+        shares = self.rays.visible_shares(scene.objects, moved)
+        below = self._config.camera.hidden_below
+        return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < below))
+
+    def stability(self, scene: Scene) -> Instability | CannotJudge | None:
+        """What does not stand, or None if everything does."""
+        shapes, p_T = self._arrays(scene.objects)
+        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
+        if fault == equilibrium.UNSUPPORTED:
+            return Instability(InstabilityReason.UNSUPPORTED, scene.objects[culprit].name)
+        if fault != equilibrium.SOUND:
+            return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
+        members: dict[int, list[int]] = defaultdict(list)
+        for index, number in enumerate(stack.tolist()):
+            members[number].append(index)
+        for rows in members.values():
+            weakest, rolls = self._weakest(shapes, p_T, pairs, rows)
+            if weakest >= 0:
+                reason = InstabilityReason.ROLLS if rolls else InstabilityReason.UNBALANCED
+                return Instability(reason, scene.objects[weakest].name)
+        return None
+
+    def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
+        """The objects, in the scene's order, that would not stay if the named one were taken away.
+
+        Of a stack that loses its balance these are what is furthest from equilibrium, without it the next, and so on.
+
+        Raises:
+            KeyError: no such object.
+        """
+        scene[name]
+        shapes, p_T = self._arrays(scene.objects)
+        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
+        if fault != equilibrium.SOUND:
+            reason = CannotJudgeReason.FLOATING if fault == equilibrium.UNSUPPORTED else _CANNOT[fault]
+            return CannotJudge(reason, scene.objects[culprit].name)
+        taken = scene.names.index(name)
+        left = [row for row in np.flatnonzero(stack == stack[taken]).tolist() if row != taken]
+        fallen = []
+        while left:
+            carried = {upper for lower, upper in pairs.tolist() if upper in left and (lower in left or lower < 0)}
+            unsupported = [row for row in left if row not in carried]
+            if not unsupported:
+                weakest, _ = self._weakest(shapes, p_T, pairs, left)
+                if weakest < 0:
+                    break
+                unsupported = [weakest]
+            fallen += unsupported
+            left = [row for row in left if row not in unsupported]
+        return tuple(scene.objects[row].name for row in sorted(fallen))
+
+    def margins(self, scene: Scene) -> dict[str, float] | CannotJudge:
+        """How much narrower the contacts under each object may become before its stack loses balance, m, by name.
+
+        Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm.
+        """
+        shapes, p_T = self._arrays(scene.objects)
+        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
+        if fault != equilibrium.SOUND:
+            reason = CannotJudgeReason.FLOATING if fault == equilibrium.UNSUPPORTED else _CANNOT[fault]
+            return CannotJudge(reason, scene.objects[culprit].name)
+        found = {}
+        for row, scene_object in enumerate(scene.objects):
+            rows = np.flatnonzero(stack == stack[row])
+            own, members = int(np.flatnonzero(rows == row)[0]), _within(pairs, rows.tolist())
+            low, high = _MARGIN_RANGE
+            while high - low > _MARGIN_STEP / 2:
+                margin = np.zeros(len(rows))
+                margin[own] = (low + high) / 2
+                aside = np.zeros((len(rows), 2))
+                rest = equilibrium.residuals(self._shapes.table, shapes[rows], p_T[rows], members, margin, aside, 0.0)
+                low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
+            found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
+        return found
+
+    def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
+        shapes = self._shapes.indices(objects)
+        if self._generation != self._shapes.generation or len(self._known) > _KEPT:
+            self._known.clear()
+            self._generation = self._shapes.generation
+        return shapes, np.array([o.X_TO.translation for o in objects])
+
+    def _weakest(self, shapes: Ints, p_T: Floats, pairs: Ints, rows: list[int]) -> tuple[int, bool]:
+        """The row of the object of a stack that is furthest from equilibrium, or -1; and whether it rolls."""
+        points = np.rint(p_T[rows] / _GRID).astype(np.int64).tolist()
+        order = sorted(range(len(rows)), key=lambda k: (points[k][2], shapes[rows[k]], points[k]))
+        x0, y0, _ = points[order[0]]
+        key = tuple((int(shapes[rows[k]]), points[k][0] - x0, points[k][1] - y0, points[k][2]) for k in order)
+        if key not in self._known:
+            chosen = [rows[k] for k in order]
+            self._known[key] = equilibrium.weakest(
+                self._shapes.table, shapes[chosen], p_T[chosen], _within(pairs, chosen), self._margin, FRICTION
+            )
+        weakest, rolls = self._known[key]
+        return (rows[order[weakest]] if weakest >= 0 else -1), rolls
+
+
+def _within(pairs: Ints, rows: list[int]) -> Ints:
+    """The contacts among the rows and with the tray, with the rows numbered as they stand in the list."""
+    number = {row: k for k, row in enumerate(rows)} | {equilibrium.GROUND: equilibrium.GROUND}
+    chosen = [(number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0]
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
