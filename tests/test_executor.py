@@ -99,7 +99,7 @@ def test_the_motion_shows_the_whole_scene(move: Move, executor: SettleExecutor, 
     outcome = carried_out(executor, detector, STACKS, move)
     times = [frame.time for frame in outcome.motion]
     assert times[0] == 0.0
-    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 30), abs=0.006)
+    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 40), abs=0.003)
     assert all(set(frame.poses) == set(STACKS.names) for frame in outcome.motion)
     assert outcome.motion[-1].poses == outcome.scene.poses
     assert outcome.motion[0].poses["can"] == STACKS["can"].X_TO

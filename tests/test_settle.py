@@ -184,7 +184,7 @@ def test_the_end_comes_when_all_are_calm() -> None:
 
 def check_motion(result: Settled, start: list[SceneObject]) -> None:
     times = np.array([frame.time for frame in result.motion])
-    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 30), abs=0.002)
+    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 40), abs=0.002)
     assert result.motion[0].poses == {o.name: o.X_TO for o in start}
     assert result.motion[-1].poses == result.poses
 
