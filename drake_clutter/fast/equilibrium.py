@@ -23,6 +23,7 @@ _BALANCED = 1e-6
 # What `contacts` says of objects.
 SOUND, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
 GROUND = -1
+NO_LOADS = np.empty((0, 4))
 
 
 @njit(cache=True)
@@ -110,6 +111,23 @@ def _overlap(table, i, j, p_i, p_j):  # type: ignore[no-untyped-def]
                 )
             least = min(least, -nearest)
     return least
+
+
+@njit(cache=True)
+def free_top(table, shape, above, p_T, above_p):  # type: ignore[no-untyped-def]
+    """Corners (V, 2) m in T of what an object's top has beside another object that covers some of it."""
+    top, count = table.top[shape], table.top_count[shape]
+    outline, outline_count = table.footprint[above], table.footprint_count[above]
+    found = np.empty((0, 2))
+    for k in range(outline_count):  # the part of the top beyond each side of the outline
+        after = (k + 1) % outline_count
+        ex, ey = outline[after, 0] - outline[k, 0], outline[after, 1] - outline[k, 1]
+        length = np.hypot(ex, ey)
+        polygon = np.zeros((48, 2))
+        polygon[:count] = top[:count] + p_T[:2]
+        beyond = _clip(polygon, count, outline[k, 0] + above_p[0], outline[k, 1] + above_p[1], -ey / length, ex / length, 0.0)
+        found = np.vstack((found, polygon[:beyond]))
+    return found
 
 
 @njit(cache=True)
@@ -248,7 +266,7 @@ def _nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def residuals(table, shapes, p_T, pairs, margins, aside, friction):  # type: ignore[no-untyped-def]
+def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # type: ignore[no-untyped-def]
     """How much of each object's weight and moment no contact forces can hold.
 
     Args:
@@ -259,13 +277,18 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction):  # type: ign
         margins: (n,) m, by which the contacts below each object are shrunk.
         aside: (n, 2) m, by which the centres of mass are moved.
         friction: 0, or the coefficient of the pyramids in which the forces lie.
+        loads: (l, 4) points x, y, z, m, at which anything may press from above, and the object that is pressed; may be empty.
 
     Returns:
         (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
     """
     n = len(shapes)
-    at, ends = np.empty((48 * len(pairs), 3)), np.empty((48 * len(pairs), 2), np.int64)
+    at, ends = np.empty((48 * len(pairs) + len(loads), 3)), np.empty((48 * len(pairs) + len(loads), 2), np.int64)
     count = 0
+    for load in loads:
+        at[count] = load[:3]
+        ends[count, 0], ends[count, 1] = -1, int(load[3])
+        count += 1
     for c in range(len(pairs)):
         lower, upper = pairs[c]
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
@@ -320,11 +343,11 @@ def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
     """
     n = len(shapes)
     margins, aside = np.full(n, margin), np.zeros((n, 2))
-    rest = residuals(table, shapes, p_T, pairs, margins, aside, 0.0)
+    rest = residuals(table, shapes, p_T, pairs, margins, aside, 0.0, NO_LOADS)
     needed = 0.0
     if rest.max() > 0:
         needed = friction
-        if residuals(table, shapes, p_T, pairs, margins, aside, friction).max() > 0:
+        if residuals(table, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
             return np.argmax(rest), False
     for lower, upper in pairs:
         if lower >= 0 and table.rolls[shapes[lower]]:
@@ -332,7 +355,7 @@ def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
             for sign in (-1.0, 1.0):
                 aside[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
                 aside[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
-                if residuals(table, shapes, p_T, pairs, margins, aside, needed).max() > 0:
+                if residuals(table, shapes, p_T, pairs, margins, aside, needed, NO_LOADS).max() > 0:
                     return upper, True
             aside[upper] = 0.0
     return -1, False

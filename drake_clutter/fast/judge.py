@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast import equilibrium
 from drake_clutter.fast.shapes import Floats, Ints, Shapes
 from drake_clutter.fast.visibility import RayCaster
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject, random_offsets
+from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, random_offsets
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
 
 FRICTION = 0.3
@@ -29,7 +30,18 @@ _CANNOT = {
     equilibrium.OVERLAPPING: CannotJudgeReason.INTERPENETRATING,
     equilibrium.FLOATING: CannotJudgeReason.FLOATING,
     equilibrium.EDGE: CannotJudgeReason.EDGE_CONTACT,
+    equilibrium.UNSUPPORTED: CannotJudgeReason.UNSUPPORTED,
 }
+
+
+class _Standing(NamedTuple):
+    """See `equilibrium.contacts`."""
+
+    shapes: Ints
+    p_T: Floats
+    pairs: Ints
+    stack: Ints
+
 
 _StackKey = tuple[tuple[int, int, int, int], ...]
 
@@ -66,12 +78,12 @@ class FastJudge:
 
     def stability(self, scene: Scene) -> Instability | CannotJudge | None:
         """What does not stand, or None if everything does."""
-        shapes, p_T = self._arrays(scene.objects)
-        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
-        if fault == equilibrium.UNSUPPORTED:
-            return Instability(InstabilityReason.UNSUPPORTED, scene.objects[culprit].name)
-        if fault != equilibrium.SOUND:
-            return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
+        standing = self._standing(scene)
+        if isinstance(standing, CannotJudge):
+            if standing.reason is CannotJudgeReason.UNSUPPORTED:
+                return Instability(InstabilityReason.UNSUPPORTED, standing.object)
+            return standing
+        shapes, p_T, pairs, stack = standing
         members: dict[int, list[int]] = defaultdict(list)
         for index, number in enumerate(stack.tolist()):
             members[number].append(index)
@@ -82,6 +94,16 @@ class FastJudge:
                 return Instability(reason, scene.objects[weakest].name)
         return None
 
+    def supports(self, scene: Scene) -> dict[str, frozenset[str]] | CannotJudge:
+        """What each object stands on, by name; `TRAY` for the tray."""
+        standing = self._standing(scene)
+        if isinstance(standing, CannotJudge):
+            return standing
+        found: dict[str, set[str]] = {name: set() for name in scene.names}
+        for lower, upper in standing.pairs.tolist():
+            found[scene.names[upper]].add(TRAY if lower < 0 else scene.names[lower])
+        return {name: frozenset(below) for name, below in found.items()}
+
     def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
         """The objects, in the scene's order, that would not stay if the named one were taken away.
 
@@ -91,11 +113,10 @@ class FastJudge:
             KeyError: no such object.
         """
         scene[name]
-        shapes, p_T = self._arrays(scene.objects)
-        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
-        if fault != equilibrium.SOUND:
-            reason = CannotJudgeReason.FLOATING if fault == equilibrium.UNSUPPORTED else _CANNOT[fault]
-            return CannotJudge(reason, scene.objects[culprit].name)
+        standing = self._standing(scene)
+        if isinstance(standing, CannotJudge):
+            return standing
+        shapes, p_T, pairs, stack = standing
         taken = scene.names.index(name)
         left = [row for row in np.flatnonzero(stack == stack[taken]).tolist() if row != taken]
         fallen = []
@@ -116,11 +137,10 @@ class FastJudge:
 
         Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm.
         """
-        shapes, p_T = self._arrays(scene.objects)
-        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
-        if fault != equilibrium.SOUND:
-            reason = CannotJudgeReason.FLOATING if fault == equilibrium.UNSUPPORTED else _CANNOT[fault]
-            return CannotJudge(reason, scene.objects[culprit].name)
+        standing = self._standing(scene)
+        if isinstance(standing, CannotJudge):
+            return standing
+        shapes, p_T, pairs, stack = standing
         found = {}
         for row, scene_object in enumerate(scene.objects):
             rows = np.flatnonzero(stack == stack[row])
@@ -130,13 +150,71 @@ class FastJudge:
                 margin = np.zeros(len(rows))
                 margin[own] = (low + high) / 2
                 aside = np.zeros((len(rows), 2))
-                rest = equilibrium.residuals(self._shapes.table, shapes[rows], p_T[rows], members, margin, aside, 0.0)
+                rest = equilibrium.residuals(
+                    self._shapes.table, shapes[rows], p_T[rows], members, margin, aside, 0.0, equilibrium.NO_LOADS
+                )
                 low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
             found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
         return found
 
+    def never_movable(self, scene: Scene) -> frozenset[str] | CannotJudge:
+        """Objects that no sequence of moves can pick without a collapse, whatever is put down on the others before.
+
+        The largest set of objects of which none can be taken away while the rest of the set stands: not even if the others,
+        which may be gone by then, press wherever the tops are free. What is not in the set may still be impossible to move.
+        """
+        standing = self._standing(scene)
+        if isinstance(standing, CannotJudge):
+            return standing
+        shapes, p_T, pairs, _ = standing
+        fixed = set(range(len(shapes)))
+        while True:
+            free = [row for row in sorted(fixed) if self._could_be_taken(shapes, p_T, pairs, fixed, row)]
+            if not free:
+                return frozenset(scene.objects[row].name for row in fixed)
+            fixed -= set(free)
+
+    def _could_be_taken(self, shapes: Ints, p_T: Floats, pairs: Ints, fixed: set[int], taken: int) -> bool:
+        """Whether the rest of the fixed objects could stand without one of them, what is not fixed helping."""
+        stack = {taken}
+        while True:  # all fixed objects that it is in contact with, directly or not
+            more = {row for pair in pairs.tolist() if stack & set(pair) - {equilibrium.GROUND} for row in pair if row in fixed}
+            if more <= stack:
+                break
+            stack |= more
+        rest = sorted(stack - {taken})
+        if not rest:
+            return True
+        # What is not fixed holds like the ground does while it is there.
+        number = {row: k for k, row in enumerate(rest)}
+        contacts = [(number.get(a, equilibrium.GROUND), number[b]) for a, b in pairs.tolist() if b in number and a != taken]
+        loads = [
+            (x, y, p_T[row, 2] + self._shapes.table.high[shapes[row]], number[row])
+            for row in rest
+            for x, y in equilibrium.free_top(self._shapes.table, shapes[row], shapes[taken], p_T[row], p_T[taken])
+        ]
+        residuals = equilibrium.residuals(
+            self._shapes.table,
+            shapes[rest],
+            p_T[rest],
+            np.array(contacts, dtype=np.int64).reshape(-1, 2),
+            np.full(len(rest), self._margin),
+            np.zeros((len(rest), 2)),
+            FRICTION,
+            np.array(loads).reshape(-1, 4),
+        )
+        return bool(residuals.max() == 0)
+
+    def _standing(self, scene: Scene) -> "_Standing | CannotJudge":
+        """Who stands on whom, if all objects are within the model."""
+        shapes, p_T = self._arrays(scene.objects)
+        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
+        if fault != equilibrium.SOUND:
+            return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
+        return _Standing(shapes, p_T, pairs, stack)
+
     def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
-        shapes = self._shapes.indices(objects)
+        shapes = self._shapes.rows(objects)
         if self._generation != self._shapes.generation or len(self._known) > _KEPT:
             self._known.clear()
             self._generation = self._shapes.generation

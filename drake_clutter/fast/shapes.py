@@ -1,6 +1,6 @@
 """What the fast judge knows of an object in an orientation: the faces that it stands on and carries with, and its surface.
 
-Everything lies in flat arrays, so that compiled loops need nothing but an index and a position per object.
+Everything lies in flat arrays, so that compiled loops need nothing but a row and a position per object.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ Ints = NDArray[np.int64]
 LEVEL_WITHIN = np.radians(1.5)
 """rad; a face or an axis that is further from level is taken to lean."""
 RIM_CORNERS = 16
-"""Corners of a can's rim, as in Drake's contact mesh of it."""
+"""Corners of a can's rim, as in Drake's contact mesh of it; and the most that any face that carries is given."""
 STRIP = 0.006
 """m, half the width of the strip on which a cylinder lies. Its centre of mass and its load are above the strip's middle, so the
 width holds no moment; but a cylinder that lies over the gap of a pair touches both its edges."""
+_FOOTPRINT_CORNERS = 32
 _SURFACE_SIDES = 48
 """Sides of a cylinder's surface, as in the mesh that Drake's camera sees."""
-_CAPACITY = 4096
-"""Orientations that are kept before the table starts anew."""
+_MOST_ROWS = 8192
 
 
 class Fault(IntEnum):
@@ -41,33 +41,40 @@ class Fault(IntEnum):
 
 
 class _Surface(NamedTuple):
-    """A class's surface in O: convex faces, counter-clockwise seen from outside, and its centre of mass."""
+    """A class's surface in O.
 
-    faces: list[Floats]
-    normals: Floats
+    Attributes:
+        corner: (V, 3) m, of one convex face after the other, counter-clockwise seen from outside.
+        counts: (F,) corners of each face.
+        normal: (F, 3).
+        p_Ocm: (3,) m, its centre of mass.
+    """
+
+    corner: Floats
+    counts: Ints
+    normal: Floats
     p_Ocm: Floats
 
 
-def _hull_faces(corners: Floats) -> _Surface:
-    """The faces of a convex hull; triangles of one plane are one face."""
+def _hull_surface(corners: Floats) -> _Surface:
+    """Of a convex hull of uniform density; triangles of one plane are one face."""
     hull = ConvexHull(corners)
     planes, member = np.unique(np.round(hull.equations, 5), axis=0, return_inverse=True)
     faces, normals = [], []
     for index in range(len(planes)):
-        normal = hull.equations[member == index][0, :3]
-        points = corners[np.unique(hull.simplices[member == index])]
-        middle = points.mean(axis=0)
-        across = points[0] - middle
-        across /= np.linalg.norm(across)
-        angle = np.arctan2((points - middle) @ np.cross(normal, across), (points - middle) @ across)
+        triangles = np.flatnonzero(member == index)
+        normal = hull.equations[triangles[0], :3]
+        points = corners[np.unique(hull.simplices[triangles])]
+        arms = points - points.mean(axis=0)
+        angle = np.arctan2(arms @ np.cross(normal, arms[0]), arms @ arms[0])
         faces.append(points[np.argsort(angle)])
         normals.append(normal)
-    # Of a solid of uniform density: tetrahedra from an inner point to every triangle.
-    inner = corners.mean(axis=0)
+    # Tetrahedra from an inner point to every triangle.
+    inner = corners[hull.vertices].mean(axis=0)
     triangles = corners[hull.simplices] - inner
     volumes = np.abs(np.linalg.det(triangles))
     p_Ocm = inner + (volumes[:, None] * triangles.sum(axis=1)).sum(axis=0) / (4 * volumes.sum())
-    return _Surface(faces, np.asarray(normals), p_Ocm)
+    return _Surface(np.vstack(faces), np.array([len(face) for face in faces]), np.array(normals), p_Ocm)
 
 
 def _ring(radius: float, z: float, sides: int) -> Floats:
@@ -78,29 +85,30 @@ def _ring(radius: float, z: float, sides: int) -> Floats:
 @cache
 def _surface(object_class: ObjectClass) -> _Surface:
     if object_class.shape is not Shape.CYLINDER:
-        return _hull_faces(object_class.convex_pieces[0])
+        return _hull_surface(object_class.corners)
     radius, half = object_class.size[0] / 2, object_class.size[2] / 2
-    low, high = _ring(radius, -half, _SURFACE_SIDES), _ring(radius, half, _SURFACE_SIDES)
-    after = np.roll(np.arange(_SURFACE_SIDES), -1)
-    sides = [np.array([low[k], low[after[k]], high[after[k]], high[k]]) for k in range(_SURFACE_SIDES)]
-    outward = np.array([np.cross(side[1] - side[0], side[3] - side[0]) for side in sides])
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    return _Surface([high, low[::-1], *sides], np.vstack([[[0, 0, 1.0], [0, 0, -1.0]], outward]), np.zeros(3))
+    surface = _hull_surface(np.vstack([_ring(radius, z, _SURFACE_SIDES) for z in (-half, half)]))
+    return surface._replace(p_Ocm=np.zeros(3))
+
+
+def _outline(points: Floats, most: int) -> Floats:
+    """(C, 2) corners of the points' hull seen from above, counter-clockwise; of too many, evenly chosen ones."""
+    corners = points[ConvexHull(points[:, :2]).vertices, :2]
+    return corners[np.arange(most) * len(corners) // most] if len(corners) > most else corners
 
 
 class Posed(NamedTuple):
-    """One object class in one orientation, lengths in m, axes those of T, origin the object's.
+    """One object class in one orientation; lengths in m, axes those of T, origin the object's.
 
     Attributes:
         fault: see `Fault`.
         rolls: whether it is a cylinder that lies.
         com: (3,) its centre of mass.
-        bottom, top: (V, 2) corners of the face that it stands on, and of the one that carries. A cylinder that lies has a strip,
-            see `STRIP`, and a line of two points.
+        bottom, top: (C, 2) corners of the face that it stands on, and of the one that carries; none if there is no such face. A
+            cylinder that lies has a strip, see `STRIP`, and a line of two points.
         low, high: heights of these faces' middles; where there is none, of the lowest and the highest point.
-        footprint: (V, 2) corners of its outline seen from above, counter-clockwise.
-        faces: of its surface, see `_Surface`.
-        normals: (F, 3) theirs.
+        footprint: (C, 2) corners of its outline seen from above, counter-clockwise.
+        surface: its surface, with axes turned to those of T.
     """
 
     fault: Fault
@@ -111,37 +119,29 @@ class Posed(NamedTuple):
     low: float
     high: float
     footprint: Floats
-    faces: list[Floats]
-    normals: Floats
+    surface: _Surface
 
 
 def pose(object_class: ObjectClass, quaternion: Sequence[float]) -> Posed:
     """The class in an orientation, (4,) w, x, y, z."""
     R_TO = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     surface = _surface(object_class)
-    faces = [face @ R_TO.T for face in surface.faces]
-    normals = surface.normals @ R_TO.T
-    corners = object_class.corners @ R_TO.T
-    bottom, top, rolls = np.empty((0, 3)), np.empty((0, 3)), False
-    if object_class.shape is not Shape.CYLINDER:
-        area = np.array([_area(face) for face in faces])
-        for sign in (-1, 1):
-            level = np.where(sign * normals[:, 2] > np.cos(LEVEL_WITHIN), area, 0.0)
-            if level.any():
-                face = faces[int(np.argmax(level))]
-                bottom, top = (face, top) if sign < 0 else (bottom, face)
+    corner, normal = surface.corner @ R_TO.T, surface.normal @ R_TO.T
+    none = np.empty((0, 3))
+    bottom, top, rolls = none, none, False
+    if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(LEVEL_WITHIN):
+        rolls = True
+        up = np.array([0.0, 0.0, object_class.size[0] / 2])
+        axis, aside = object_class.size[2] / 2 * R_TO[:, 2], STRIP * np.cross([0.0, 0.0, 1.0], R_TO[:, 2])
+        top = np.array([axis, -axis]) + up
+        bottom = np.array([axis + aside, aside - axis, -axis - aside, axis - aside]) - up
     else:
-        radius, half = object_class.size[0] / 2, object_class.size[2] / 2
-        rises = R_TO[2, 2]
-        if abs(rises) > np.cos(LEVEL_WITHIN):
-            rim, end = _ring(radius, 0.0, RIM_CORNERS) @ R_TO.T, np.sign(rises) * half * R_TO[:, 2]
-            bottom, top = rim - end, rim + end
-        elif abs(rises) < np.sin(LEVEL_WITHIN):
-            rolls = True
-            axis, aside = half * R_TO[:, 2], STRIP * np.cross([0.0, 0.0, 1.0], R_TO[:, 2])
-            up = np.array([0.0, 0.0, radius])
-            top = np.array([axis, -axis]) + up
-            bottom = np.array([axis + aside, aside - axis, -axis - aside, axis - aside]) - up
+        level = np.flatnonzero(np.abs(normal[:, 2]) > np.cos(LEVEL_WITHIN))
+        faces = {face: corner[surface.counts[:face].sum() :][: surface.counts[face]] for face in level}
+        below = [face for face in faces if normal[face, 2] < 0]
+        above = [face for face in faces if normal[face, 2] > 0]
+        bottom = faces[max(below, key=lambda face: _area(faces[face]))] if below else none
+        top = faces[max(above, key=lambda face: _area(faces[face]))] if above else none
     fault = Fault.NONE if len(bottom) else Fault.LEANING
     if len(object_class.convex_pieces) > 1:
         fault = Fault.NOT_CONVEX
@@ -149,33 +149,27 @@ def pose(object_class: ObjectClass, quaternion: Sequence[float]) -> Posed:
         fault,
         rolls,
         com=R_TO @ surface.p_Ocm,
-        bottom=_outline(bottom),
-        top=_outline(top),
-        low=float(bottom[:, 2].mean() if len(bottom) else corners[:, 2].min()),
-        high=float(top[:, 2].mean() if len(top) else corners[:, 2].max()),
-        footprint=_outline(corners),
-        faces=faces,
-        normals=normals,
+        bottom=_outline(bottom, RIM_CORNERS) if len(bottom) else none[:, :2],
+        top=top[:, :2] if len(top) < 3 else _outline(top, RIM_CORNERS),
+        low=float(bottom[:, 2].mean() if len(bottom) else corner[:, 2].min()),
+        high=float(top[:, 2].mean() if len(top) else corner[:, 2].max()),
+        footprint=_outline(corner, _FOOTPRINT_CORNERS),
+        surface=surface._replace(corner=corner, normal=normal),
     )
 
 
-def _outline(points: Floats) -> Floats:
-    """(V, 2) corners of the points' hull seen from above, counter-clockwise; fewer than three points stay as they are."""
-    return points[ConvexHull(points[:, :2]).vertices, :2] if len(points) > 2 else points[:, :2]
-
-
 def _area(face: Floats) -> float:
-    crosses = np.cross(face[1:-1] - face[0], face[2:] - face[0])
-    return float(np.linalg.norm(crosses.sum(axis=0)) / 2)
+    return float(np.linalg.norm(np.cross(face[1:-1] - face[0], face[2:] - face[0]).sum(axis=0)) / 2)
 
 
 class Table(NamedTuple):
-    """Posed shapes in arrays, for compiled loops; a row per shape, corners padded with zeros.
+    """Posed shapes in arrays, for compiled loops: a row per shape, with room for more.
 
     Attributes:
-        fault, rolls, mass, com, low, high: (N, ...) see `Posed`; mass in kg.
+        fault, rolls, com, low, high: (N, ...) see `Posed`.
+        mass: (N,) kg.
         reach: (N,) m, radius of the circle about the object's origin that holds its footprint.
-        bottom, top, footprint: (N, C, 2) m.
+        bottom, top, footprint: (N, C, 2) m, corners.
         bottom_count, top_count, footprint_count: (N,) corners in use.
         first_face: (N + 1,) a shape's faces are first_face[i] up to first_face[i + 1].
         first_corner: (F + 1,) a face's corners likewise.
@@ -185,10 +179,10 @@ class Table(NamedTuple):
 
     fault: Ints
     rolls: NDArray[np.bool_]
-    mass: Floats
     com: Floats
     low: Floats
     high: Floats
+    mass: Floats
     reach: Floats
     bottom: Floats
     bottom_count: Ints
@@ -202,73 +196,84 @@ class Table(NamedTuple):
     corner: Floats
 
 
+def _room(rows: int, faces: int, corners: int) -> Table:
+    def whole(*shape: int) -> Ints:
+        return np.zeros(shape, np.int64)
+
+    return Table(
+        fault=whole(rows),
+        rolls=np.zeros(rows, np.bool_),
+        com=np.zeros((rows, 3)),
+        low=np.zeros(rows),
+        high=np.zeros(rows),
+        mass=np.zeros(rows),
+        reach=np.zeros(rows),
+        bottom=np.zeros((rows, RIM_CORNERS, 2)),
+        bottom_count=whole(rows),
+        top=np.zeros((rows, RIM_CORNERS, 2)),
+        top_count=whole(rows),
+        footprint=np.zeros((rows, _FOOTPRINT_CORNERS, 2)),
+        footprint_count=whole(rows),
+        first_face=whole(rows + 1),
+        first_corner=whole(faces + 1),
+        normal=np.zeros((faces, 3)),
+        corner=np.zeros((corners, 3)),
+    )
+
+
 class Shapes:
     """A table of the posed shapes that were asked for, each made once.
 
     Attributes:
-        generation: grows whenever the table starts anew, after which earlier indices mean nothing.
+        table: of all rows given out so far.
+        generation: grows whenever the table starts anew, after which earlier rows mean nothing.
     """
 
     def __init__(self) -> None:
         self.generation = 0
-        self._clear()
+        self._start()
 
-    def _clear(self) -> None:
-        self._index: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
-        self._posed: list[tuple[Posed, float]] = []
-        self._table: Table | None = None
+    def _start(self) -> None:
+        self._row: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
+        self.table = _room(64, 512, 4096)
 
-    def indices(self, objects: Sequence[SceneObject]) -> Ints:
+    def rows(self, objects: Sequence[SceneObject]) -> Ints:
         """(n,) the table's row of each object."""
-        if len(self._index) > _CAPACITY:
-            self._clear()
+        if len(self._row) > _MOST_ROWS:
+            self._start()
             self.generation += 1
-        known = self._index
+        known = self._row
         try:
             return np.array([known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64)
         except KeyError:
             for o in objects:
-                key = (o.object_class, o.X_TO.quaternion)
-                if key not in known:
-                    known[key] = len(self._posed)
-                    self._posed.append((pose(*key), o.object_class.mass))
-            self._table = None
-            return self.indices(objects)
+                if (o.object_class, o.X_TO.quaternion) not in known:
+                    self._add(o)
+            return np.array([known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64)
 
-    @property
-    def table(self) -> Table:
-        """The table of all rows given out so far."""
-        if self._table is None:
-            self._table = _table(self._posed)
-        return self._table
-
-
-def _table(posed: list[tuple[Posed, float]]) -> Table:
-    shapes = [shape for shape, _ in posed]
-    faces = [face for shape in shapes for face in shape.faces]
-    return Table(
-        fault=np.array([shape.fault for shape in shapes], dtype=np.int64),
-        rolls=np.array([shape.rolls for shape in shapes]),
-        mass=np.array([mass for _, mass in posed]),
-        com=np.array([shape.com for shape in shapes]),
-        low=np.array([shape.low for shape in shapes]),
-        high=np.array([shape.high for shape in shapes]),
-        reach=np.array([np.linalg.norm(shape.footprint, axis=1).max() for shape in shapes]),
-        bottom=_padded([shape.bottom for shape in shapes]),
-        bottom_count=np.array([len(shape.bottom) for shape in shapes]),
-        top=_padded([shape.top for shape in shapes]),
-        top_count=np.array([len(shape.top) for shape in shapes]),
-        footprint=_padded([shape.footprint for shape in shapes]),
-        footprint_count=np.array([len(shape.footprint) for shape in shapes]),
-        first_face=np.cumsum([0] + [len(shape.faces) for shape in shapes]),
-        first_corner=np.cumsum([0] + [len(face) for face in faces]),
-        normal=np.vstack([shape.normals for shape in shapes]),
-        corner=np.vstack(faces),
-    )
-
-
-def _padded(polygons: list[Floats]) -> Floats:
-    padded = np.zeros((len(polygons), max(len(polygon) for polygon in polygons), 2))
-    for row, polygon in zip(padded, polygons, strict=True):
-        row[: len(polygon)] = polygon
-    return padded
+    def _add(self, scene_object: SceneObject) -> None:
+        shape = pose(scene_object.object_class, scene_object.X_TO.quaternion)
+        row = len(self._row)
+        face = self.table.first_face[row]
+        corner = self.table.first_corner[face]
+        last_face, last_corner = face + len(shape.surface.counts), corner + len(shape.surface.corner)
+        if row + 1 >= len(self.table.fault) or last_face >= len(self.table.normal) or last_corner > len(self.table.corner):
+            old = self.table
+            self.table = _room(2 * len(old.fault), 2 * (last_face + 1), 2 * last_corner)
+            for array, earlier in zip(self.table, old, strict=True):
+                array[: len(earlier)] = earlier
+        table = self.table
+        table.fault[row], table.rolls[row], table.com[row] = shape.fault, shape.rolls, shape.com
+        table.low[row], table.high[row], table.mass[row] = shape.low, shape.high, scene_object.object_class.mass
+        table.reach[row] = np.linalg.norm(shape.footprint, axis=1).max()
+        for polygon, counts, corners in (
+            (table.bottom, table.bottom_count, shape.bottom),
+            (table.top, table.top_count, shape.top),
+            (table.footprint, table.footprint_count, shape.footprint),
+        ):
+            polygon[row, : len(corners)], counts[row] = corners, len(corners)
+        table.first_face[row + 1] = last_face
+        table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
+        table.normal[face:last_face] = shape.surface.normal
+        table.corner[corner:last_corner] = shape.surface.corner
+        self._row[scene_object.object_class, scene_object.X_TO.quaternion] = row

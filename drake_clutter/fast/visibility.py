@@ -16,6 +16,84 @@ from drake_clutter.fast.shapes import Floats, Shapes
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 
+_MOST_COVERED = 64
+
+
+@njit(cache=True)
+def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  # type: ignore[no-untyped-def]
+    """Casts all rays that may meet one object; where it is nearer than what is known, it is written down.
+
+    Returns:
+        The number of rays that meet it, whatever is before it.
+    """
+    height, width = hit.shape
+    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    u, v = np.empty(64), np.empty(64)
+    rays = 0
+    for face in range(table.first_face[shape], table.first_face[shape + 1]):
+        first, last = table.first_corner[face], table.first_corner[face + 1]
+        nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
+        x, y, z = table.corner[first] + p_TO
+        k = nx * x + ny * y + nz * (z - altitude)
+        if k > -1e-9:
+            continue  # turned away from the camera
+        count = last - first
+        if count > len(u):
+            u, v = np.empty(count), np.empty(count)
+        top, bottom = np.inf, -np.inf
+        for c in range(count):
+            scale = focal_length / (altitude - table.corner[first + c, 2] - p_TO[2])
+            u[c] = middle_u + scale * (table.corner[first + c, 0] + p_TO[0])
+            v[c] = middle_v - scale * (table.corner[first + c, 1] + p_TO[1])
+            top, bottom = min(top, v[c]), max(bottom, v[c])
+        # Inverse distance: its slope along a row and down a column, and its value at pixel (0, 0).
+        along, down = nx / focal_length / k, -ny / focal_length / k
+        start = -nz / k - along * middle_u - down * middle_v
+        for row in range(max(0, math.ceil(top)), min(height - 1, math.floor(bottom)) + 1):
+            left, right = np.inf, -np.inf
+            for c in range(count):
+                d = c + 1 if c + 1 < count else 0
+                # The same way round for both faces at an edge, so that no ray is counted twice or lost.
+                a, b = (c, d) if v[c] < v[d] else (d, c)
+                if v[a] <= row < v[b]:
+                    crossing = u[a] + (row - v[a]) * ((u[b] - u[a]) / (v[b] - v[a]))
+                    left, right = min(left, crossing), max(right, crossing)
+            if left >= right:
+                continue
+            begin, end = max(0, math.ceil(left)), min(width, math.ceil(right))
+            if end <= begin:
+                continue
+            rays += end - begin
+            # Both are always written, so that the compiler can do several pixels at a time.
+            inverse, step = np.float32(start + down * row + along * begin), np.float32(along)
+            depths, hits = nearest[row, begin:end], hit[row, begin:end]
+            for column in range(end - begin):
+                value = inverse + step * np.float32(column)
+                nearer = value > depths[column]
+                depths[column] = value if nearer else depths[column]
+                hits[column] = label if nearer else hits[column]
+    return rays
+
+
+@njit(cache=True)
+def _window(table, shapes, p_T, altitude, focal_length, image_shape):  # type: ignore[no-untyped-def]
+    """First row, last row, first column and last column (ends excluded) of a rectangle that holds all objects."""
+    height, width = image_shape
+    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    top, bottom, left, right = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(len(shapes)):
+        first_face, last_face = table.first_face[shapes[i]], table.first_face[shapes[i] + 1]
+        for c in range(table.first_corner[first_face], table.first_corner[last_face]):
+            scale = focal_length / (altitude - table.corner[c, 2] - p_T[i, 2])
+            u = middle_u + scale * (table.corner[c, 0] + p_T[i, 0])
+            v = middle_v - scale * (table.corner[c, 1] + p_T[i, 1])
+            top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
+    row_begin, row_end = max(0, math.floor(top)), min(height, math.ceil(bottom) + 1)
+    column_begin, column_end = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
+    if row_end <= row_begin or column_end <= column_begin:
+        return 0, 0, 0, 0
+    return row_begin, row_end, column_begin, column_end
+
 
 @njit(cache=True)
 def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen):  # type: ignore[no-untyped-def]
@@ -33,73 +111,15 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
         seen: (n,) zeros; becomes the number of rays that meet the object first.
 
     Returns:
-        First row, last row, first column and last column of the rectangle (ends excluded) that was written to.
+        The rectangle that was written to, see `_window`.
     """
-    height, width = hit.shape
-    middle_u, middle_v = width / 2 - 1, height / 2 - 1
-    u, v = np.empty(64), np.empty(64)
-
-    bounds = np.array([np.inf, -np.inf, np.inf, -np.inf])
-    for i in range(len(shapes)):
-        first_face, last_face = table.first_face[shapes[i]], table.first_face[shapes[i] + 1]
-        for c in range(table.first_corner[first_face], table.first_corner[last_face]):
-            scale = focal_length / (altitude - table.corner[c, 2] - p_T[i, 2])
-            row, column = -scale * (table.corner[c, 1] + p_T[i, 1]), scale * (table.corner[c, 0] + p_T[i, 0])
-            bounds[0], bounds[1] = min(bounds[0], row), max(bounds[1], row)
-            bounds[2], bounds[3] = min(bounds[2], column), max(bounds[3], column)
-    row_begin, row_end = max(0, math.floor(middle_v + bounds[0])), min(height, math.ceil(middle_v + bounds[1]) + 1)
-    column_begin, column_end = max(0, math.floor(middle_u + bounds[2])), min(width, math.ceil(middle_u + bounds[3]) + 1)
-    if row_end <= row_begin or column_end <= column_begin:
-        return 0, 0, 0, 0
+    window = _window(table, shapes, p_T, altitude, focal_length, hit.shape)
+    row_begin, row_end, column_begin, column_end = window
     nearest[row_begin:row_end, column_begin:column_end] = 1 / altitude
     hit[row_begin:row_end, column_begin:column_end] = -1
 
     for i in range(len(shapes)):
-        shape, label = shapes[i], np.int16(i)
-        for face in range(table.first_face[shape], table.first_face[shape + 1]):
-            first, last = table.first_corner[face], table.first_corner[face + 1]
-            nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
-            x0, y0, z0 = (
-                table.corner[first, 0] + p_T[i, 0],
-                table.corner[first, 1] + p_T[i, 1],
-                table.corner[first, 2] + p_T[i, 2],
-            )
-            k = nx * x0 + ny * y0 + nz * (z0 - altitude)
-            if k > -1e-9:
-                continue  # turned away from the camera
-            count = last - first
-            top, bottom = np.inf, -np.inf
-            for c in range(count):
-                scale = focal_length / (altitude - table.corner[first + c, 2] - p_T[i, 2])
-                u[c] = middle_u + scale * (table.corner[first + c, 0] + p_T[i, 0])
-                v[c] = middle_v - scale * (table.corner[first + c, 1] + p_T[i, 1])
-                top, bottom = min(top, v[c]), max(bottom, v[c])
-            # Inverse distance: its slope along a row and down a column, and its value at pixel (0, 0).
-            along, down = nx / focal_length / k, -ny / focal_length / k
-            start = -nz / k - along * middle_u - down * middle_v
-            for row in range(max(0, math.ceil(top)), min(height - 1, math.floor(bottom)) + 1):
-                left, right = np.inf, -np.inf
-                for c in range(count):
-                    d = c + 1 if c + 1 < count else 0
-                    # The same way round for both faces at an edge, so that no ray is counted twice or lost.
-                    a, b = (c, d) if v[c] < v[d] else (d, c)
-                    if v[a] <= row < v[b]:
-                        crossing = u[a] + (row - v[a]) * ((u[b] - u[a]) / (v[b] - v[a]))
-                        left, right = min(left, crossing), max(right, crossing)
-                if left >= right:
-                    continue
-                begin, end = max(0, math.ceil(left)), min(width, math.ceil(right))
-                if end <= begin:
-                    continue
-                alone[i] += end - begin
-                # Both are always written, so that the compiler can do several pixels at a time.
-                inverse, step = np.float32(start + down * row + along * begin), np.float32(along)
-                depths, hits = nearest[row, begin:end], hit[row, begin:end]
-                for column in range(end - begin):
-                    value = inverse + step * np.float32(column)
-                    nearer = value > depths[column]
-                    depths[column] = value if nearer else depths[column]
-                    hits[column] = label if nearer else hits[column]
+        alone[i] = _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(i), nearest, hit)
 
     for row in range(row_begin, row_end):
         run, label = 0, np.int16(-1)
@@ -111,7 +131,32 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
             run += 1
         if label >= 0:
             seen[label] += run
-    return row_begin, row_end, column_begin, column_end
+    return window
+
+
+@njit(cache=True)
+def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  # type: ignore[no-untyped-def]
+    """(rays,) for every ray that would meet the target, the objects before it, as bits."""
+    window = _window(table, shapes[target : target + 1], p_T[target : target + 1], altitude, focal_length, hit.shape)
+    nearest[window[0] : window[1], window[2] : window[3]] = 0
+    hit[window[0] : window[1], window[2] : window[3]] = -1
+    _cast_at(table, shapes[target], p_T[target], altitude, focal_length, np.int16(0), nearest, hit)
+    rows, columns = np.nonzero(hit[window[0] : window[1], window[2] : window[3]] == 0)
+    rows, columns = rows + window[0], columns + window[2]
+    own, before = np.empty(len(rows), np.float32), np.zeros(len(rows), np.uint64)
+    for k in range(len(rows)):
+        own[k] = nearest[rows[k], columns[k]]
+    for i in range(len(shapes)):
+        other = _window(table, shapes[i : i + 1], p_T[i : i + 1], altitude, focal_length, hit.shape)
+        apart = other[0] >= window[1] or window[0] >= other[1] or other[2] >= window[3] or window[2] >= other[3]
+        if i == target or apart:
+            continue
+        _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(1), nearest, hit)
+        for k in range(len(rows)):
+            if hit[rows[k], columns[k]] == 1:
+                before[k] |= np.uint64(1) << np.uint64(i)
+                hit[rows[k], columns[k]], nearest[rows[k], columns[k]] = 0, own[k]
+    return before
 
 
 class RayCaster:
@@ -129,7 +174,7 @@ class RayCaster:
         if p_T is None:
             p_T = np.array([o.X_TO.translation for o in objects])
         alone, seen = np.zeros(len(objects), np.int64), np.zeros(len(objects), np.int64)
-        shapes = self._shapes.indices(objects)
+        shapes = self._shapes.rows(objects)
         arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length)
         row, row_end, column, column_end = _cast(*arguments, self._nearest, self._hit, alone, seen)
         shares = [s / a if a else 1.0 for s, a in zip(seen.tolist(), alone.tolist(), strict=True)]
@@ -144,6 +189,22 @@ class RayCaster:
         """
         shares, _ = self._cast(objects, p_T)
         return {o.name: share for o, share in zip(objects, shares, strict=True)}
+
+    def cover(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
+        """Of the rays that would meet the named object alone: how many meet which other objects before it.
+
+        Raises:
+            ValueError: the scene has more than 64 objects.
+        """
+        if len(scene.objects) > _MOST_COVERED:
+            raise ValueError(f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most")
+        shapes = self._shapes.rows(scene.objects)
+        p_T = np.array([o.X_TO.translation for o in scene.objects])
+        arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length, scene.names.index(name))
+        sets, counts = np.unique(_cover(*arguments, self._nearest, self._hit), return_counts=True)
+        names = scene.names
+        members = [frozenset(names[i] for i in range(len(names)) if bits >> i & 1) for bits in sets.tolist()]
+        return dict(zip(members, counts.tolist(), strict=True))
 
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
         """What the camera shows of a scene, and the visible shares; as `LabelDetector` has it, but with the floor all around."""

@@ -1,13 +1,16 @@
 """Where exactly a picked object lands: decided once, from what the camera sees, for every fidelity."""
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.signal import fftconvolve
 from scipy.spatial import ConvexHull
 
+from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.seams import Detection, Move, Observation
@@ -35,6 +38,7 @@ class _Grid:
     centres: NDArray[np.float64]
 
     @staticmethod
+    @lru_cache(maxsize=16)
     def over(tray_side: float) -> "_Grid":
         count = int(tray_side / CELL)
         return _Grid(np.asarray((np.arange(count) - (count - 1) / 2) * CELL, float))
@@ -43,9 +47,6 @@ class _Grid:
         """(n * n, 3) m, the cells' centres at a height, x varying slowest."""
         x, y = np.meshgrid(self.centres, self.centres, indexing="ij")
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
-
-    def square(self, values: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        return values.reshape(len(self.centres), len(self.centres))
 
 
 def _pixels(observation: Observation, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -61,27 +62,103 @@ def seen_through(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[
     return np.asarray(observation.depth[rows, columns] >= observation.camera.altitude - p_T[:, 2])
 
 
-def _turned(pose: Pose, yaw: float) -> NDArray[np.float64]:
+class _Turned(NamedTuple):
+    """A picked object as it would be put down.
+
+    Attributes:
+        R_TO: (3, 3).
+        lowest, height: m, of its lowest point below its origin (negative), and of the whole object.
+        footprint: (k, 2) cells, relative to the one under its origin, that must be free; the outermost first.
+    """
+
+    R_TO: NDArray[np.float64]
+    lowest: float
+    height: float
+    footprint: NDArray[np.int64]
+
+
+@lru_cache(maxsize=4096)
+def _turned(object_class: ObjectClass, quaternion: tuple[float, float, float, float], yaw: float, clearance: float) -> _Turned:
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    return np.asarray(np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ pose.rotation)
-
-
-def _footprint(corners_xy: NDArray[np.float64], clearance: float) -> NDArray[np.float64]:
-    """Odd-sized kernel, 1 where a cell's centre lies within `clearance` of the convex footprint, about its origin."""
-    reach = int(np.ceil((np.abs(corners_xy).max() + clearance) / CELL))
-    offsets = np.arange(-reach, reach + 1) * CELL
+    R_TO = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ Pose((0.0, 0.0, 0.0), quaternion).rotation
+    corners = object_class.corners @ R_TO.T
+    reach = int(np.ceil((np.abs(corners[:, :2]).max() + clearance) / CELL))
+    offsets = np.arange(-reach, reach + 1)
     x, y = np.meshgrid(offsets, offsets, indexing="ij")
-    lines = ConvexHull(corners_xy).equations
-    outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) + lines[:, 2:]).max(axis=0)
+    lines = ConvexHull(corners[:, :2]).equations
+    outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) * CELL + lines[:, 2:]).max(axis=0)
     # Half a cell more: no part of the footprint lies in a cell that is not looked at.
-    return np.asarray((outside.reshape(x.shape) <= clearance + CELL / 2).astype(float))
+    covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL / 2]
+    outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
+    return _Turned(R_TO, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first])
 
 
-def _clear_of(blocked: NDArray[np.bool_], footprint: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Cells at which the footprint covers no blocked cell and stays on the grid."""
-    pad = footprint.shape[0] // 2
-    padded = np.pad(blocked, pad, constant_values=True).astype(float)
-    return np.asarray(fftconvolve(padded, footprint[::-1, ::-1], mode="valid") < 0.5)
+@lru_cache(maxsize=16)
+def _tray_places(tray_side: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(n, 2) cells of the tray, those furthest from its centre first, and (n,) minus how far, m."""
+    centres = _Grid.over(tray_side).centres
+    cells = np.argwhere(np.ones((len(centres),) * 2, bool))
+    cost = -np.abs(centres[cells]).max(axis=1)
+    order = np.argsort(cost, kind="stable")
+    return cells[order], cost[order]
+
+
+def _top_places(observation: Observation, target: Detection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(n, 2) cells well inside what is seen of an object's top, those nearest to its middle first, and (n,) how near, m."""
+    centres = _Grid.over(observation.tray_side).centres
+    corners = target.X_TO.apply(target.object_class.corners)
+    floor = float(corners[:, 2].max())
+    # A cell more all around: a pixel of the top's edge may lie in a cell whose middle is beside it.
+    x0, y0 = np.maximum(np.searchsorted(centres, corners[:, :2].min(axis=0)) - 1, 0)
+    x1, y1 = np.searchsorted(centres, corners[:, :2].max(axis=0)) + 1
+    x, y = np.meshgrid(centres[x0:x1], centres[y0:y1], indexing="ij")
+    rows, columns = _pixels(observation, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)]))
+    at_top = np.abs(observation.depth[rows, columns] - (observation.camera.altitude - floor)) < _DEPTH_TOLERANCE
+    top = (at_top & target.mask[rows, columns]).reshape(x.shape)
+    if not top.any():
+        return np.empty((0, 2), np.int64), np.empty(0)
+    first = np.array([x0, y0])
+    middle = centres[np.argwhere(top) + first].mean(axis=0)
+    inside = distance_transform_edt(np.pad(top, 1))[1:-1, 1:-1] * CELL > _SUPPORT_MARGIN
+    cells = np.argwhere(inside) + first
+    cost = np.linalg.norm(centres[cells] - middle, axis=1)
+    order = np.argsort(cost, kind="stable")
+    return cells[order], cost[order]
+
+
+@njit(cache=True)
+def _first_fits(depth, altitude, focal_length, centres, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
+    """The first of the cells over which the footprint is free at all levels (m), and those of the same cost: their positions."""
+    height, width = depth.shape
+    n = len(centres)
+    known = np.zeros((n, n), np.int8)  # 1: free, 2: not
+    found = np.empty(len(cells), np.int64)
+    count = 0
+    for position in range(len(cells)):
+        if count and cost[position] > cost[found[0]] + 1e-9:
+            break
+        fits = True
+        for k in range(len(footprint)):
+            i, j = cells[position, 0] + footprint[k, 0], cells[position, 1] + footprint[k, 1]
+            if i < 0 or j < 0 or i >= n or j >= n:
+                fits = False
+                break
+            if known[i, j] == 0:
+                known[i, j] = 1
+                for level in levels:
+                    distance = altitude - level
+                    column = int(np.rint(focal_length * centres[i] / distance + (width / 2 - 1)))
+                    row = int(np.rint(-focal_length * centres[j] / distance + (height / 2 - 1)))
+                    if depth[min(max(row, 0), height - 1), min(max(column, 0), width - 1)] < distance:
+                        known[i, j] = 2
+                        break
+            if known[i, j] == 2:
+                fits = False
+                break
+        if fits:
+            found[count] = position
+            count += 1
+    return found[:count]
 
 
 def top_height(detection: Detection) -> float:
@@ -119,33 +196,21 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
         KeyError: the move names an object that is not in view.
     """
     picked = observation[move.pick]
-    grid = _Grid.over(observation.tray_side)
     if move.place == TRAY:
-        floor, support = 0.0, np.ones((len(grid.centres),) * 2, bool)
-        middle = np.zeros(2)
+        floor, (cells, cost) = 0.0, _tray_places(observation.tray_side)
     else:
         target = observation[move.place]
-        floor = top_height(target)
-        rows, columns = _pixels(observation, grid.points(floor))
-        at_top = np.abs(observation.depth[rows, columns] - (observation.camera.altitude - floor)) < _DEPTH_TOLERANCE
-        top = grid.square(at_top & target.mask[rows, columns])
-        if not top.any():
-            return None
-        support = distance_transform_edt(np.pad(top, 1))[1:-1, 1:-1] * CELL > _SUPPORT_MARGIN
-        middle = grid.centres[np.argwhere(top)].mean(axis=0)
-
+        floor, (cells, cost) = top_height(target), _top_places(observation, target)
+    centres = _Grid.over(observation.tray_side).centres
+    camera = observation.camera
     for yaw in _YAWS:
-        R_TO = _turned(picked.X_TO, yaw)
-        corners = picked.object_class.corners @ R_TO.T
-        height = float(np.ptp(corners[:, 2]))
-        levels = floor + _DEPTH_TOLERANCE + np.arange(0, height + config.release_height, _LEVEL_STEP)
-        free = np.all([grid.square(seen_through(observation, grid.points(z))) for z in levels], axis=0)
-        fits = _clear_of(~free, _footprint(corners[:, :2], config.clearance)) & support
-        if not fits.any():
-            continue
-        places = grid.centres[np.argwhere(fits)]
-        cost = -np.abs(places).max(axis=1) if move.place == TRAY else np.linalg.norm(places - middle, axis=1)
-        best = places[cost <= cost.min() + 1e-9]
-        x, y = best[rng.integers(len(best))]
-        return Pose.of(R_TO, (x, y, floor + config.release_height - float(corners[:, 2].min())))
+        turned = _turned(picked.object_class, picked.X_TO.quaternion, yaw, config.clearance)
+        levels = floor + _DEPTH_TOLERANCE + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
+        arguments = (centres, levels, turned.footprint, cells, cost)
+        best = _first_fits(observation.depth, camera.altitude, camera.focal_length, *arguments)
+        if len(best):
+            # In the order of the cells, so that the draw does not depend on how they were sorted.
+            best = best[np.lexsort(cells[best].T[::-1])]
+            x, y = centres[cells[best[rng.integers(len(best))]]]
+            return Pose.of(turned.R_TO, (x, y, floor + config.release_height - turned.lowest))
     return None

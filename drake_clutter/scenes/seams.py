@@ -23,7 +23,7 @@ class InstabilityReason(Enum):
     NOT_AT_REST = "not at rest in time"
     UNBALANCED = "out of balance"
     ROLLS = "balanced on a lying cylinder"
-    UNSUPPORTED = "between what should carry it"
+    UNSUPPORTED = "stands beside what should carry it"
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,7 @@ class CannotJudgeReason(Enum):
     INTERPENETRATING = "interpenetrates another object or the tray"
     FLOATING = "floats in the air"
     EDGE_CONTACT = "rests on an edge or on a curved side"
+    UNSUPPORTED = "stands beside what should carry it"
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class MoveResult(Enum):
     PLACED = "placed"
     COLLAPSED = "collapsed"
     NO_FREE_SPOT = "no free spot"
+    CANNOT_JUDGE = "cannot be judged"
 
 
 @dataclass(frozen=True)
@@ -152,12 +154,14 @@ class Outcome:
         scene: the scene afterwards; the scene before, if the move could not be carried out.
         instability: what did not stay, when it collapsed.
         motion: the objects' motion, for pictures.
+        cannot_judge: what is beyond the executor's model, when that is the result.
     """
 
     result: MoveResult
     scene: Scene
     instability: Instability | None = None
     motion: tuple[Frame, ...] = ()
+    cannot_judge: CannotJudge | None = None
 
 
 @dataclass(frozen=True)

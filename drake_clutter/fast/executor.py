@@ -1,0 +1,45 @@
+"""Moves by teleport, judged without simulating."""
+
+import numpy as np
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Scene, random_offsets
+from drake_clutter.scenes.seams import CannotJudge, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
+
+
+class FastExecutor:
+    """Carries out a move at fidelity `fast` (a `MoveExecutor`).
+
+    The picked object appears at its place, at rest on what is below. The scene collapses when an object loses its support as
+    the picked one is taken away, or when what it touches afterwards does not balance; where things fall is not followed, so the
+    scene after a collapse shows the picked object at its place and the others where they were. What the judge cannot judge
+    is a result of its own.
+    """
+
+    def __init__(self, config: ClutterConfig, judge: FastJudge | None = None) -> None:
+        """Makes an executor; a judge that is shared remembers more stacks."""
+        self._config = config
+        self._judge = judge or FastJudge(config)
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        """See `MoveExecutor.execute`."""
+        X_TO = choose_placement(observation, move, self._config.exploration, rng)
+        if X_TO is None:
+            return Outcome(MoveResult.NO_FREE_SPOT, scene)
+        (x, y, _) = random_offsets(1, self._config.settle.jitter, rng)[0]
+        moved = scene.at({move.pick: X_TO.moved((x, y, -self._config.exploration.release_height))})
+        found = self.taken_and_placed(scene, moved, move.pick)
+        if isinstance(found, CannotJudge):
+            return Outcome(MoveResult.CANNOT_JUDGE, scene, cannot_judge=found)
+        return Outcome(MoveResult.PLACED if found is None else MoveResult.COLLAPSED, moved, found)
+
+    def taken_and_placed(self, before: Scene, after: Scene, picked: str) -> Instability | CannotJudge | None:
+        """What does not stand when the picked object goes from one place to the other; None if everything does."""
+        losing = self._judge.losing_support(before, picked)
+        if isinstance(losing, CannotJudge):
+            return losing
+        if losing:
+            return Instability(InstabilityReason.UNSUPPORTED, losing[0])
+        return self._judge.stability(after)

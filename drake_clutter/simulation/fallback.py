@@ -1,0 +1,39 @@
+"""The fast judge and executor where they can tell, Drake where they cannot."""
+
+import numpy as np
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.executor import FastExecutor
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult, Observation, Outcome, Verdict
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.simulation.judge import DrakeJudge
+
+
+class FastOrDrakeJudge:
+    """Judges fast, and asks Drake about what the fast judge cannot judge (a `SceneJudge`)."""
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._fast, self._drake = FastJudge(config), DrakeJudge(config)
+
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
+        """See `SceneJudge.judge`."""
+        verdict = self._fast.judge(scene, rng)
+        return self._drake.judge(scene, rng) if isinstance(verdict, CannotJudge) else verdict
+
+
+class FastOrDrakeExecutor:
+    """Carries moves out fast, and asks Drake about what the fast judge cannot judge (a `MoveExecutor`)."""
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._fast, self._settle = FastExecutor(config), SettleExecutor(config)
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        """See `MoveExecutor.execute`."""
+        state = rng.bit_generator.state
+        outcome = self._fast.execute(scene, observation, move, rng)
+        if outcome.result is MoveResult.CANNOT_JUDGE:
+            rng.bit_generator.state = state  # so that the object lands where it would have, had Drake been asked first
+            return self._settle.execute(scene, observation, move, rng)
+        return outcome
