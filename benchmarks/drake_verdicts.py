@@ -6,11 +6,13 @@ python benchmarks/drake_verdicts.py FOLDER --workers 2
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 from calibrate import commit
 from rich.console import Console
@@ -19,9 +21,14 @@ from rich.progress import track
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, config_yaml
 from drake_clutter.files import InputError, write_text
+from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.exploration import legal_moves
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -48,11 +55,13 @@ BATCHES = {
     Batch("ycb7", 15, 0): 300,
     Batch("ycb7", 20, 0): 300,
     Batch("pantry14", 25, 0): 300,
-    Batch("ycb7", 25, 0, "other offsets"): 300,
-    Batch("ycb7", 25, 0, "no early stop"): 200,
-    Batch("ycb7", 25, 0, "1 ms steps"): 200,
+    Batch("ycb7", 25, 0, "other offsets"): 150,
+    Batch("ycb7", 25, 0, "no early stop"): 100,
+    Batch("ycb7", 25, 0, "1 ms steps"): 100,
 }
 """How many scenes of each batch the published experiment asks about."""
+MOVES = 1000
+"""Random moves, in the stable scenes of the first batch."""
 
 
 class DrakeVerdicts:
@@ -61,12 +70,10 @@ class DrakeVerdicts:
     def __init__(self, batch: Batch) -> None:
         self._batch = batch
         self._judge = DrakeJudge(config_of(batch))
-        self._generator = _generator(batch)
 
     def __call__(self, index: int) -> dict[str, Any]:
         """The record of a scene, as it stands in the file."""
-        rng = item_rng(self._batch.seed, index)
-        scene, _ = self._generator.lay_out(rng)
+        scene, rng = laid_out(self._batch, index)
         if self._batch.variant == "other offsets":
             rng = item_rng(self._batch.seed, index, 1)
         settled: dict[str, Pose] = dict(scene.poses)
@@ -91,14 +98,15 @@ def config_of(batch: Batch) -> ClutterConfig:
     return replace(config, settle=replace(config.settle, **VARIANTS[batch.variant]))
 
 
-def _generator(batch: Batch) -> SceneGenerator:
-    return SceneGenerator(GenerationJob("random", batch.objects, None, batch.nodes, batch.seed, ClutterConfig()))
+@lru_cache(maxsize=16)
+def _generator(objects: str, nodes: int, seed: int) -> SceneGenerator:
+    return SceneGenerator(GenerationJob("random", objects, None, nodes, seed, ClutterConfig()))
 
 
-def scenes(batch: Batch, count: int) -> Iterable[Scene]:
-    """The first scenes of a batch, as laid out."""
-    generator = _generator(batch)
-    return (generator.lay_out(item_rng(batch.seed, index))[0] for index in range(count))
+def laid_out(batch: Batch, index: int) -> tuple[Scene, np.random.Generator]:
+    """A scene of a batch, and the generator that the judge draws its offsets from next."""
+    rng = item_rng(batch.seed, index)
+    return _generator(batch.objects, batch.nodes, batch.seed).lay_out(rng)[0], rng
 
 
 @dataclass(frozen=True)
@@ -109,27 +117,90 @@ class _Factory:
         return DrakeVerdicts(self.batch)
 
 
-def drake_verdicts(batch: Batch, count: int, folder: Path, workers: int) -> Iterator[dict[str, Any]]:
-    """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch.
-
-    They are kept in a JSON Lines file; what it lacks is made and added.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
-    head = asdict(batch) | {"config": config_yaml(config_of(batch))}
+def _records(
+    path: Path, head: dict[str, Any], make_worker: Callable[[], Callable[[Any], Any]], items: Sequence[Any], workers: int
+) -> Iterator[dict[str, Any]]:
+    """The head with the commit at which it was begun, then a record per item; what the file lacks is made and added."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         write_text(path, json.dumps(head | {"commit": commit()}) + "\n")
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    if {key: lines[0][key] for key in head} != head:
-        raise InputError(f"{path}: holds verdicts under another config; give another folder")
-    known = lines[1:]
-    yield lines[0]
-    yield from known[:count]
+    if {key: lines[0].get(key) for key in head} != head:
+        raise InputError(f"{path}: holds the results of another config; give another folder")
+    yield from lines[: 1 + len(items)]
     with path.open("a") as file:
-        for record in map_ordered(_Factory(batch), range(len(known), count), workers=workers):
+        for record in map_ordered(make_worker, items[len(lines) - 1 :], workers=workers):
             file.write(json.dumps(record) + "\n")
             file.flush()
             yield record
+
+
+def drake_verdicts(batch: Batch, count: int, folder: Path, workers: int) -> Iterator[dict[str, Any]]:
+    """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch."""
+    path = folder / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
+    head = asdict(batch) | {"config": config_yaml(config_of(batch))}
+    yield from _records(path, head, _Factory(batch), range(count), workers)
+
+
+@dataclass(frozen=True)
+class RandomMove:
+    """The k-th random move in a stable scene of a batch.
+
+    Attributes:
+        batch: of the scene.
+        index: the scene's.
+        draw: k.
+        record: the scene's, see `DrakeVerdicts`.
+    """
+
+    batch: Batch
+    index: int
+    draw: int
+    record: dict[str, Any]
+
+
+class DrakeMoves:
+    """Carries out random moves as `SettleExecutor` does; a worker for the runner."""
+
+    def __init__(self) -> None:
+        config = ClutterConfig()
+        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.camera)
+
+    def __call__(self, item: RandomMove) -> dict[str, Any]:
+        """The record of a move."""
+        scene = settled_scene(laid_out(item.batch, item.index)[0], item.record)
+        observation = self._detector.look(scene).observation
+        move = random_move(observation, item)
+        outcome = self._executor.execute(scene, observation, move, move_rng(item))
+        fall = outcome.instability
+        place = choose_placement(observation, move, ClutterConfig().exploration, move_rng(item))
+        return {
+            "index": item.index,
+            "draw": item.draw,
+            "move": [move.pick, move.place],
+            "result": outcome.result.value,
+            "fall": [fall.reason.value, fall.object, fall.displacement, fall.tilt] if fall else None,
+            "place": [*place.translation, *place.quaternion] if place else None,
+        }
+
+
+def random_move(observation: Observation, item: RandomMove) -> Move:
+    """A legal move, drawn uniformly."""
+    moves = legal_moves(observation)
+    return moves[item_rng(item.batch.seed, item.index, 2, item.draw).integers(len(moves))]
+
+
+def move_rng(item: RandomMove) -> np.random.Generator:
+    """What decides the chances of carrying the move out."""
+    return item_rng(item.batch.seed, item.index, 3, item.draw)
+
+
+def drake_moves(batch: Batch, scenes: int, count: int, folder: Path, workers: int) -> Iterator[dict[str, Any]]:
+    """A head, then `count` random moves, spread over the batch's first `scenes` scenes that Drake calls stable."""
+    stable = [r for r in list(drake_verdicts(batch, scenes, folder, workers))[1:] if "settled" in r]
+    items = [RandomMove(batch, stable[k % len(stable)]["index"], k // len(stable), stable[k % len(stable)]) for k in range(count)]
+    head = asdict(batch) | {"config": config_yaml(config_of(batch)), "scenes": scenes}
+    yield from _records(folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl", head, DrakeMoves, items, workers)
 
 
 def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
@@ -149,6 +220,9 @@ def main(folder: Path, workers: int = 2) -> None:
         records = drake_verdicts(batch, count, folder, workers)
         for _ in track(records, what, total=count + 1, console=Console(stderr=True)):
             pass
+    (batch, scenes), *_ = BATCHES.items()
+    for _ in track(drake_moves(batch, scenes, MOVES, folder, workers), "moves", total=MOVES + 1, console=Console(stderr=True)):
+        pass
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ class EpisodePlayer:
     def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
         self._catalogue = load_catalogue(catalogue_folder)
-        self._executor, self._detector = SettleExecutor(config), LabelDetector(config.camera)
+        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.camera)
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""

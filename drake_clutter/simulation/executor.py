@@ -26,8 +26,15 @@ class SettleExecutor:
     of them falls, the whole scene is settled again, so that neighbours are hit as they would be.
     """
 
-    def __init__(self, config: ClutterConfig) -> None:
-        self._config = config
+    def __init__(self, config: ClutterConfig, *, follow_falls: bool = True) -> None:
+        """Makes an executor.
+
+        Args:
+            config: the world.
+            follow_falls: whether to simulate what a collapse does to the whole scene, which decides nothing; if not, the scene
+                afterwards and the motion are those of the stack that fell, up to the moment when it is known to fall.
+        """
+        self._config, self._follow_falls = config, follow_falls
 
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
@@ -48,6 +55,9 @@ class SettleExecutor:
                 continue
             settled.append(settle(group, scene.tray_side, settle_config, record=True))
             if settled[-1].instability is not None:
+                if not self._follow_falls:
+                    after = moved.at(settled[-1].poses)
+                    return Outcome(MoveResult.COLLAPSED, after, settled[-1].instability, _together(moved.poses, settled))
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
                 whole = settle(moved.objects, scene.tray_side, coarse, record=True, follow_falls=True)
                 return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), settled[-1].instability, whole.motion)

@@ -1,0 +1,285 @@
+"""How far the fast judge and executor agree with Drake, and Drake with itself, on RG scenes and random moves.
+
+python benchmarks/drake_verdicts.py FOLDER --workers 2     # Drake's side, about an hour and a half; resumes
+python benchmarks/judges.py FOLDER --out benchmarks/results/judges.json --picture docs/images/judges_disagree.png
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import typer
+from calibrate import commit
+from drake_verdicts import (
+    BATCHES,
+    MOVES,
+    Batch,
+    RandomMove,
+    config_of,
+    drake_moves,
+    drake_verdicts,
+    hidden,
+    laid_out,
+    move_rng,
+    settled_scene,
+)
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.generation import wilson_interval
+from drake_clutter.fast.executor import FastExecutor
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import write_json
+from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult
+
+SHOWN = 8
+"""Disagreements in the picture."""
+
+
+@dataclass
+class Confusion:
+    """Verdicts of two judges on the same things: (the fast one's, Drake's), each with how often."""
+
+    pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def row(self) -> dict[str, Any]:
+        """Agreement over what was judged, with 95 % interval, and each kind of error."""
+        judged = Counter({pair: n for pair, n in self.pairs.items() if pair[0] != "cannot judge"})
+        equal = sum(n for (fast, drake), n in judged.items() if fast == drake)
+        count, total = judged.total(), self.pairs.total()
+        falling = sum(n for (_, drake), n in judged.items() if drake == "falls")
+        called_stable = sum(n for (fast, _), n in judged.items() if fast == "stable")
+        false_stable = judged["stable", "falls"]
+        return {
+            "count": total,
+            "agreement": equal / count,
+            "agreement_ci95": wilson_interval(equal, count),
+            "cannot_judge_share": 1 - count / total,
+            "false_stable_rate": false_stable / count,
+            "false_stable_of_falling": false_stable / falling if falling else None,
+            "false_stable_of_called_stable": false_stable / called_stable if called_stable else None,
+            "false_fall_rate": judged["falls", "stable"] / count,
+            "confusion": {f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(self.pairs.items())},
+        }
+
+
+@dataclass
+class Disagreement:
+    """A stack of which the judges say different things, for the picture."""
+
+    objects: Scene
+    fast: str
+    drake: str
+
+
+def said(found: Any) -> str:
+    """One word for what a judge found."""
+    return "cannot judge" if isinstance(found, CannotJudge) else "stable" if found is None else "falls"
+
+
+def compare_scenes(
+    batch: Batch, records: Sequence[dict[str, Any]], disagreements: list[Disagreement]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The row of a batch, and its confusions by reason and by class."""
+    config = config_of(batch)
+    judge = FastJudge(config)
+    scenes, stacks = Confusion(), Confusion()
+    by_reason: dict[str, Confusion] = defaultdict(Confusion)
+    by_class: dict[str, Confusion] = defaultdict(Confusion)
+    fast_reasons: dict[str, Confusion] = defaultdict(Confusion)
+    same_hidden = both_stable = 0
+    for record in track(records, f"{batch.objects} {batch.nodes}", console=Console(stderr=True)):
+        scene, rng = laid_out(batch, record["index"])
+        verdict = judge.judge(scene, rng)
+        found = verdict if isinstance(verdict, CannotJudge) else verdict.instability
+        drake = "stable" if "settled" in record else "falls"
+        scenes.pairs[said(found), drake] += 1
+        if not isinstance(verdict, CannotJudge) and verdict.stable and drake == "stable":
+            both_stable += 1
+            same_hidden += verdict.hidden == hidden(record, config.camera.hidden_below)
+        for group in record["groups"]:
+            part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
+            whole = judge.stability(part) if len(part.objects) > 1 or group["fall"] else None
+            fall = group["fall"]
+            pair = said(whole), "stable" if fall is None else "falls"
+            stacks.pairs[pair] += 1
+            if fall is not None:
+                by_reason[fall[0]].pairs[pair] += 1
+                by_class[scene[fall[1]].object_class.name].pairs[pair] += 1
+            if whole is not None:
+                fast_reasons[whole.reason.value].pairs[pair] += 1
+            if pair[0] not in ("cannot judge", pair[1]):
+                why = f"falls: {fall[0]}" if fall else "stable"
+                disagreements.append(Disagreement(part, "stable" if whole is None else str(whole.reason.value), why))
+    row = scenes.row() | {
+        "hidden_agreement": same_hidden / both_stable if both_stable else None,
+        "hidden_agreement_ci95": wilson_interval(same_hidden, both_stable),
+        "stacks": stacks.row(),
+    }
+    details = {
+        "by_drakes_reason": {reason: dict_of(confusion) for reason, confusion in sorted(by_reason.items())},
+        "by_class_that_falls": {name: dict_of(confusion) for name, confusion in sorted(by_class.items())},
+        "by_the_fast_judges_reason": {reason: dict_of(confusion) for reason, confusion in sorted(fast_reasons.items())},
+    }
+    return row, details
+
+
+def dict_of(confusion: Confusion) -> dict[str, int]:
+    """For JSON."""
+    return {f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(confusion.pairs.items())}
+
+
+def compare_variants(batch: Batch, default: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How often Drake, asked in another way, says the same of the same scenes."""
+    pairs = list(zip(default, other, strict=False))
+    equal = [("settled" in a) == ("settled" in b) for a, b in pairs]
+    falls = [(fall(a), fall(b)) for a, b in pairs]
+    below = config_of(batch).camera.hidden_below
+    lists = [hidden(a, below) == hidden(b, below) for a, b in pairs if "settled" in a and "settled" in b]
+    return {
+        "count": len(pairs),
+        "agreement": sum(equal) / len(pairs),
+        "agreement_ci95": wilson_interval(sum(equal), len(pairs)),
+        "stacks_agreement": sum(x == y for a, b in falls for x, y in zip(a, b, strict=True)) / sum(len(a) for a, _ in falls),
+        "hidden_agreement": sum(lists) / len(lists),
+        "hidden_agreement_ci95": wilson_interval(sum(lists), len(lists)),
+    }
+
+
+def fall(record: dict[str, Any]) -> list[bool]:
+    """Whether each object's stack falls, in the order of the names."""
+    return [falls for _, falls in sorted((name, g["fall"] is not None) for g in record["groups"] for name in g["objects"])]
+
+
+def compare_moves(batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[int, dict[str, Any]]) -> dict[str, Any]:
+    """Outcomes of random moves under the fast executor, each on its own observation, against Drake's."""
+    config = config_of(batch)
+    judge = FastJudge(config)
+    executor = FastExecutor(config, judge)
+    outcomes: Counter[tuple[str, str]] = Counter()
+    by_reason: dict[str, Counter[str]] = defaultdict(Counter)
+    same_place = placed = 0
+    for record in track(records, "moves", console=Console(stderr=True)):
+        item = RandomMove(batch, record["index"], record["draw"], scenes[record["index"]])
+        scene = settled_scene(laid_out(batch, item.index)[0], item.record)
+        observation, _ = judge.rays.observe(scene)
+        pick, place = record["move"]
+        outcome = executor.execute(scene, observation, Move(pick, place), move_rng(item))
+        outcomes[outcome.result.value, record["result"]] += 1
+        if outcome.result is not MoveResult.CANNOT_JUDGE and outcome.result.value != record["result"]:
+            found = outcome.instability.reason.value if outcome.instability else outcome.result.value
+            by_reason[f"fast: {found}"][f"drake: {record['fall'][0] if record['fall'] else record['result']}"] += 1
+        where = choose_placement(observation, Move(pick, place), config.exploration, move_rng(item))
+        if where is not None and record["place"] is not None:
+            placed += 1
+            same_place += max(abs(a - b) for a, b in zip(where.translation, record["place"][:3], strict=True)) < 0.001
+    judged = {pair: n for pair, n in outcomes.items() if pair[0] != MoveResult.CANNOT_JUDGE.value}
+    equal, count = sum(n for (a, b), n in judged.items() if a == b), sum(judged.values())
+    return {
+        "count": sum(outcomes.values()),
+        "agreement": equal / count,
+        "agreement_ci95": wilson_interval(equal, count),
+        "cannot_judge_share": 1 - count / sum(outcomes.values()),
+        "false_placed_rate": outcomes[MoveResult.PLACED.value, MoveResult.COLLAPSED.value] / count,
+        "same_place_share": same_place / placed,
+        "confusion": {f"fast {a}, drake {b}": n for (a, b), n in sorted(outcomes.items())},
+        "disagreements": {a: dict(b) for a, b in by_reason.items()},
+    }
+
+
+def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
+    """A picture of stacks that the judges see differently, at most one of each kind and shape first."""
+    seen: set[Any] = set()
+    chosen: list[Disagreement] = []
+    for item in disagreements:
+        kind = (item.fast, item.drake, tuple(sorted(o.object_class.name for o in item.objects.objects)))
+        if kind not in seen:
+            seen.add(kind)
+            chosen.append(item)
+    chosen = sorted(chosen, key=lambda item: item.fast != "stable")[:SHOWN]
+    camera = PictureCamera()
+    figure, axes = plt.subplots(2, SHOWN // 2, figsize=(14, 8.4), layout="constrained")
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, item in zip(axes.flat, chosen, strict=False):
+        x, y, _ = np.mean([o.X_TO.translation for o in item.objects.objects], axis=0)
+        centred = tuple(replace(o, X_TO=o.X_TO.moved((-x, -y, 0.0))) for o in item.objects.objects)
+        picture = camera.oblique(replace(item.objects, objects=centred, graph=None))
+        axis.imshow(picture[60:600, 210:750])
+        axis.set_title(f"fast: {item.fast}\nDrake: {item.drake}", fontsize=13)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="What drake_verdicts.py wrote.")],
+    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG of stacks that the judges see differently.")] = None,
+    workers: int = 2,
+) -> None:
+    """Prints and writes the tables."""
+    disagreements: list[Disagreement] = []
+    sides = {batch: list(drake_verdicts(batch, count, folder, workers)) for batch, count in BATCHES.items()}
+    (first, scenes), *_ = BATCHES.items()
+    moves = list(drake_moves(first, scenes, MOVES, folder, workers))
+    agreement, details, itself = [], {}, []
+    for batch, (head, *records) in sides.items():
+        key = {"objects": batch.objects, "nodes": batch.nodes, "seed": batch.seed, "drake_commit": head["commit"]}
+        if batch.variant == "default":
+            row, found = compare_scenes(batch, records, disagreements)
+            agreement.append(key | row)
+            details[f"{batch.objects}, {batch.nodes} nodes"] = found
+        else:
+            default = sides[replace(batch, variant="default")][1:]
+            itself.append(key | {"variant": batch.variant} | compare_variants(batch, default, records))
+    by_index = {record["index"]: record for record in sides[first][1:]}
+    of_moves = {"drake_commit": moves[0]["commit"]} | compare_moves(first, moves[1:], by_index)
+    result = {
+        "commit": commit(),
+        "config": sides[first][0]["config"],
+        "scene_agreement": {f"{r['objects']}, {r['nodes']} nodes": r["agreement"] for r in agreement},
+        "false_stable_rate": {f"{r['objects']}, {r['nodes']} nodes": r["false_stable_rate"] for r in agreement},
+        "hidden_agreement": {f"{r['objects']}, {r['nodes']} nodes": r["hidden_agreement"] for r in agreement},
+        "move_agreement": of_moves["agreement"],
+        "drake_self_agreement": {row["variant"]: row["agreement"] for row in itself},
+        "scenes": agreement,
+        "moves": of_moves,
+        "drake_itself": itself,
+        "details": details,
+    }
+    if out is not None:
+        write_json(out, result)
+    if picture is not None:
+        draw(picture, disagreements)
+    show(agreement, itself, of_moves)
+
+
+def show(agreement: Sequence[dict[str, Any]], itself: Sequence[dict[str, Any]], of_moves: dict[str, Any]) -> None:
+    """The tables."""
+    table = Table(
+        "objects", "nodes", "scenes", "verdicts", "95 %", "false stable", "cannot judge", "hidden lists", title="fast, Drake"
+    )
+    for row in agreement:
+        low, high = row["agreement_ci95"]
+        shares = [f"{row[key]:.3f}" for key in ("false_stable_rate", "cannot_judge_share", "hidden_agreement")]
+        numbers = (str(row["nodes"]), str(row["count"]), f"{row['agreement']:.3f}", f"{low:.3f} to {high:.3f}")
+        table.add_row(row["objects"], *numbers, *shares)
+    Console().print(table)
+    table = Table("Drake, asked with", "scenes", "verdicts", "stacks", "hidden lists", title="Drake and itself")
+    for row in itself:
+        shares = [f"{row[key]:.3f}" for key in ("agreement", "stacks_agreement", "hidden_agreement")]
+        table.add_row(row["variant"], str(row["count"]), *shares)
+    Console().print(table)
+    print(f"moves: {of_moves['agreement']:.3f} of {of_moves['count']}", of_moves["confusion"], of_moves["disagreements"])
+
+
+if __name__ == "__main__":
+    typer.run(main)
