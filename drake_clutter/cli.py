@@ -5,6 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import redirect_stdout
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,6 +76,10 @@ ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7,
 MaxMovesOption = Annotated[
     int | None, typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given.")
 ]
+WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
+RayOption = Annotated[
+    str | None, typer.Option("--ray", metavar="ADDRESS", help="Put the workers on this Ray cluster, e.g. auto, instead of here.")
+]
 NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
 
 
@@ -133,7 +138,8 @@ def generate(
     nodes: NodesOption = 25,
     count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
     seed: SeedOption = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Local processes; the result is the same for any number.")] = 1,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -148,7 +154,7 @@ def generate(
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return _tracked("scenes", made, done, total)
 
-    summary = command.generate(job, count, out, workers, progress)
+    summary = command.generate(job, count, out, workers, progress, ray)
     shown = {key: value for key, value in summary.items() if key != "config"}
     _print(summary if as_json else shown, as_json, f"{out}")
 
@@ -195,7 +201,8 @@ def evaluate(
     max_moves: MaxMovesOption = None,
     count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
     seed: SeedOption = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Local processes; the result is the same for any number.")] = 1,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -212,7 +219,7 @@ def evaluate(
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return _tracked("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, limit, seed, world, catalogue, workers, out, progress)
+    rows = command.evaluate(played, names, limit, seed, world, catalogue, workers, out, progress, ray)
     if as_json:
         print(json.dumps(rows, indent=2))
         return
@@ -231,9 +238,13 @@ def evaluate(
 
 
 def _tracked(what: str, items: Iterable[Any], done: int, total: int) -> Iterator[Any]:
-    """The items, with a progress bar that appears with the first of them."""
+    """The items, with a progress bar that appears with the first of them.
+
+    While they are made, standard output goes to standard error: Ray writes what it has to say there, and --json's result has to
+    stay alone.
+    """
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_err) as bar:
+    with redirect_stdout(sys.stderr), Progress(*columns, console=_err) as bar:
         yield from bar.track(items, total=total, completed=done)
 
 

@@ -1,4 +1,4 @@
-"""Maps a function over many items in several processes, in order and with the same results for any number of them."""
+"""Maps a function over many items in several processes, here or on a cluster, with the same results for any number of them."""
 
 import os
 import signal
@@ -17,9 +17,9 @@ import numpy as np
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_IN_FLIGHT_PER_WORKER = 4
+IN_FLIGHT_PER_WORKER = 4
 # More threads than cores slow each other down; and a sum's rounding depends on the number of threads.
-_ONE_THREAD_EACH = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+ONE_THREAD_EACH = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 # In a worker process: the factory, and from the first item on the worker that it made.
 _make_worker: Callable[[], Callable[[Any], Any]] | None = None
@@ -32,7 +32,11 @@ def item_rng(seed: int, *path: int) -> np.random.Generator:
 
 
 def map_ordered(
-    make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], *, workers: int
+    make_worker: Callable[[], Callable[[Item], Result]],
+    items: Iterable[Item],
+    *,
+    workers: int,
+    ray_address: str | None = None,
 ) -> Generator[Result, None, None]:
     """Yields `make_worker()(item)` for every item, in the order of the items, each as soon as it is there.
 
@@ -41,16 +45,26 @@ def map_ordered(
     sequence is read only a few items ahead. An exception in a worker is raised here; an exception and closing the generator
     end the processes without waiting for the items at hand.
 
+    On a Ray cluster a worker that dies, alone or with its machine, is replaced, and its item is done again. A worker takes one
+    CPU; those for which the cluster has no room wait for it, without holding up the others. The package is installed on every
+    machine; files that the workers read are at the same place on all.
+
     Args:
         make_worker: a factory that can be pickled: a class, a module's function, or a functools.partial of one.
-        items: the items; with more than one worker they and the results are pickled.
-        workers: number of processes; 1 works in this process.
+        items: the items; with more than one worker, or on a cluster, they and the results are pickled.
+        workers: number of processes; 1 works in this process, or as one process on the cluster.
+        ray_address: of the Ray cluster that the processes run on, e.g. "auto"; None: they run on this machine, without Ray.
 
     Raises:
-        BrokenProcessPool: a worker process was killed.
+        BrokenProcessPool: a worker process was killed; on a cluster, an item lost its worker three times.
+        InputError: Ray is not installed, or there is no cluster at the address.
     """
     if workers < 1:
         raise ValueError(f"workers: {workers}; allowed is 1 or more")
+    if ray_address is not None:
+        from drake_clutter.runner_ray import map_on_ray
+
+        return map_on_ray(make_worker, items, workers, ray_address)
     return _map_here(make_worker, items) if workers == 1 else _map_in_processes(make_worker, items, workers)
 
 
@@ -72,8 +86,8 @@ def _map_in_processes(
     done = 0
     try:
         while True:
-            for item in islice(remaining, workers * _IN_FLIGHT_PER_WORKER - len(futures)):
-                with _environment(_ONE_THREAD_EACH):  # a process starts, and copies it, when an item finds none idle
+            for item in islice(remaining, workers * IN_FLIGHT_PER_WORKER - len(futures)):
+                with environment(ONE_THREAD_EACH):  # a process starts, and copies it, when an item finds none idle
                     futures.append(pool.submit(_work, item))
             if not futures:
                 break
@@ -93,7 +107,7 @@ def _map_in_processes(
 
 
 @contextmanager
-def _environment(variables: dict[str, str]) -> Iterator[None]:
+def environment(variables: dict[str, str]) -> Iterator[None]:
     """Sets environment variables for the length of the block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)

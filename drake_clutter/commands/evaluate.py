@@ -40,11 +40,13 @@ def evaluate(
     workers: int,
     out: Path,
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
+    ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
     """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
     episodes = [Episode(scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]
     make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed)
-    results = list(progress(map_ordered(make_player, episodes, workers=workers), len(episodes)))
+    played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
+    results = list(progress(played, len(episodes)))
     rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]
     fields = {"max_moves": max_moves, "seed": seed, "fidelity": "settle", "config": asdict(config), "rows": rows}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})

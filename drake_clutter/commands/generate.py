@@ -42,7 +42,12 @@ def _job_fields(job: GenerationJob) -> dict[str, Any]:
 
 
 def generate(
-    job: GenerationJob, count: int, out: Path, workers: int, progress: Callable[[Iterable[Any], int, int], Iterable[Any]]
+    job: GenerationJob,
+    count: int,
+    out: Path,
+    workers: int,
+    progress: Callable[[Iterable[Any], int, int], Iterable[Any]],
+    ray_address: str | None = None,
 ) -> dict[str, Any]:
     """Writes `scenes/0000.yaml`, ..., `summary.json` and `contact_sheet.png`.
 
@@ -52,14 +57,15 @@ def generate(
         job: what to generate.
         count: scenes in the folder at the end.
         out: the folder.
-        workers: local processes.
+        workers: processes.
         progress: wraps the scenes that are made, given how many are there and how many there will be.
+        ray_address: of the Ray cluster that the processes run on; None: they run here.
 
     Returns:
         The summary.
 
     Raises:
-        InputError: an option that is not allowed, or a folder that holds something else.
+        InputError: an option that is not allowed, a folder that holds something else, or no Ray cluster at the address.
     """
     if count < 1:
         raise InputError(f"--count {count}; allowed is 1 or more")
@@ -85,7 +91,7 @@ def generate(
     seconds, failures = float(earlier_run.get("seconds", 0.0)), Counter(earlier_run.get("layout_failures", {}))
 
     start = time.monotonic()
-    made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers)
+    made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers, ray_address=ray_address)
     for index, result in enumerate(progress(made, done, count), start=done):
         failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, result.verdict)

@@ -1,0 +1,256 @@
+"""The runner on a Ray cluster of two nodes, all on this machine: the results of one worker here, whatever dies on the way."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pytest
+import ray
+from numpy.typing import NDArray
+from ray.cluster_utils import Cluster
+from test_cli import ABOVE, BELOW, broken, run, scenes_of
+from test_runner import broken_factory, failing_worker
+
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.scene_file import save_scene
+
+Drawn = tuple[int, NDArray[np.float64]]
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws numbers for an item, so many that Ray sends them by its shared memory; some items take longer than others.
+
+    Attributes:
+        begun: a folder that gets a file for every item that was begun.
+        deadly: items that kill their process at the first try.
+        deadliest: the item that kills its process at every try.
+        trap: the node on which an item takes a minute; from then on "sprung" is in the folder. The other node waits for that.
+    """
+
+    begun: Path
+    deadly: tuple[int, ...] = ()
+    deadliest: int | None = None
+    trap: str | None = None
+
+    def __call__(self, item: int) -> Drawn:
+        first_try = not (self.begun / f"{item}").exists()
+        (self.begun / f"{item}").touch()
+        time.sleep(0.1 if item % 4 == 0 else 0.0)
+        if (item in self.deadly and first_try) or item == self.deadliest:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.trap is not None:
+            sprung = self.begun / "sprung"
+            if ray.get_runtime_context().get_node_id() == self.trap:
+                sprung.touch()
+                time.sleep(60.0)
+            wait_for(sprung.exists)
+        return item, item_rng(7, item).normal(size=20_000)
+
+
+def bits(results: Iterable[Drawn]) -> list[tuple[int, bytes]]:
+    return [(item, numbers.tobytes()) for item, numbers in results]
+
+
+def look_around(file: str) -> tuple[int, str, str | None]:
+    return os.getpid(), Path(file).read_text(), os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def make_look_around() -> Callable[[str], tuple[int, str, str | None]]:
+    return look_around
+
+
+def sleep(seconds: float) -> int:
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def make_sleeper() -> Callable[[float], int]:
+    return sleep
+
+
+def wait_for(condition: Callable[[], Found]) -> Found:
+    deadline = time.monotonic() + 60
+    while not (found := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return found
+
+
+def processes_at_work(cluster: Cluster) -> list[int]:
+    """The actors' processes that work on an item: Ray says so in their titles; their parents are the cluster's nodes."""
+    nodes = {node.all_processes["raylet"][0].process.pid for node in cluster.list_all_nodes()}
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent in nodes and (folder / "cmdline").read_text().startswith("ray::_Actor.work"):
+                found.append(int(folder.name))
+    return found
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Two nodes with room for one worker each, whose processes find this module. This process is connected to the first."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        nodes = Cluster()
+        try:
+            nodes.add_node(num_cpus=1, include_dashboard=False)
+            nodes.add_node(num_cpus=1)
+            ray.init(nodes.address, log_to_driver=False)
+            yield nodes
+        finally:
+            ray.shutdown()
+            nodes.shutdown()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, bytes]]:
+    """What one worker here makes of the first items."""
+    return bits(map_ordered(partial(Draws, tmp_path_factory.mktemp("alone")), range(12), workers=1))
+
+
+def test_results_and_their_order_are_those_of_one_worker_here(
+    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+) -> None:
+    """One of the three finds no room, and holds nothing up."""
+    there = list(map_ordered(partial(Draws, tmp_path), iter(range(12)), workers=3, ray_address=cluster.address))
+    assert [item for item, _ in there] == list(range(12))
+    assert bits(there) == alone
+    assert all(numbers.flags.writeable for _, numbers in there)
+
+
+def test_items_of_killed_workers_are_done_again_but_not_for_ever(
+    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+) -> None:
+    make_worker = partial(Draws, tmp_path, deadly=(0, 5), deadliest=12)
+    results = map_ordered(make_worker, range(20), workers=2, ray_address=cluster.address)
+    assert bits(islice(results, 12)) == alone
+    with pytest.raises(BrokenProcessPool, match="an item ended 3 worker processes"):
+        next(results)
+
+
+def test_items_of_a_lost_node_are_done_again(cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]) -> None:
+    """By the worker on the other node, where there is no room for the lost one."""
+    node = next(iter(cluster.worker_nodes))
+
+    def lose() -> None:
+        wait_for((tmp_path / "sprung").exists)
+        cluster.remove_node(node, allow_graceful=False)
+
+    loser = threading.Thread(target=lose)
+    loser.start()
+    try:
+        make_worker = partial(Draws, tmp_path, trap=node.node_id)
+        assert bits(map_ordered(make_worker, range(12), workers=2, ray_address=cluster.address)) == alone
+    finally:
+        loser.join()
+        cluster.add_node(num_cpus=1)
+    assert node not in cluster.list_all_nodes()
+
+
+def test_generate_with_a_killed_worker_writes_the_same_scenes(cluster: Cluster, tmp_path: Path) -> None:
+    job = GenerationJob("random", "ycb7", None, nodes=5, seed=5, config=ClutterConfig())
+    (tmp_path / "alone/scenes").mkdir(parents=True)
+    for index, made in enumerate(map_ordered(partial(SceneGenerator, job), range(3), workers=1)):
+        save_scene(tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, made.verdict)
+    command = [sys.executable, "-c", "from drake_clutter.cli import main; main()"]
+    command += ["generate", "--nodes", "5", "--count", "3", "--seed", "5", "--json", "--out", str(tmp_path / "there")]
+    command += ["--workers", "2", "--ray", cluster.address]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        os.kill(wait_for(lambda: processes_at_work(cluster))[0], signal.SIGKILL)
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert scenes_of(tmp_path / "there") == scenes_of(tmp_path / "alone")
+    assert json.loads(output)["count"] == 3  # what Ray says of the killed worker is not among it
+
+
+def test_exceptions_come_in_their_place_and_as_themselves(cluster: Cluster) -> None:
+    results = map_ordered(partial(failing_worker, 3), range(10), workers=2, ray_address=cluster.address)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(LookupError, match=r"^item 3$"):
+        next(results)
+    with pytest.raises(LookupError, match=r"^no worker$"):
+        next(map_ordered(broken_factory, range(3), workers=1, ray_address=cluster.address))
+
+
+def test_workers_are_like_local_ones(cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes of their own, which start in this folder and are told to use one thread."""
+    monkeypatch.chdir(tmp_path)
+    Path("here.txt").write_text("found")
+    seen = list(map_ordered(make_look_around, ["here.txt"] * 6, workers=2, ray_address=cluster.address))
+    pids = {pid for pid, _, _ in seen}
+    assert len(pids) <= 2
+    assert os.getpid() not in pids
+    assert {(text, threads) for _, text, threads in seen} == {("found", "1")}
+
+
+def test_closing_midway_ends_the_workers(cluster: Cluster) -> None:
+    read: list[float] = []
+
+    def endless() -> Iterator[float]:
+        while True:
+            read.append(60.0 if read else 0.0)
+            yield read[-1]
+
+    results = map_ordered(make_sleeper, endless(), workers=2, ray_address=cluster.address)
+    pid = next(results)
+    assert pid != os.getpid()
+    start = time.monotonic()
+    results.close()
+    assert time.monotonic() - start < 10
+    wait_for(lambda: not Path(f"/proc/{pid}").exists())
+    assert len(read) <= 1 + 8
+
+
+def test_ctrl_c_ends_the_workers(cluster: Cluster) -> None:
+    code = f"""
+import signal
+from test_runner_ray import make_sleeper, map_ordered
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
+for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_address="{cluster.address}"):
+    print(result, flush=True)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert int(process.stdout.readline()) > 0
+        workers = wait_for(lambda: processes_at_work(cluster))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+    assert errors.rstrip().endswith(b"KeyboardInterrupt")
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r'--ray auto: .* pip install "drake-clutter\[scale\]"'):
+        next(map_ordered(make_sleeper, [0.0], workers=1, ray_address="auto"))
+
+
+def test_a_cluster_that_is_not_there_is_not_waited_for(tmp_path: Path) -> None:
+    settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
+    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": settled}
+    (tmp_path / "scene.yaml").write_text(broken(verdict=verdict))
+    start = time.monotonic()
+    result = run("evaluate", tmp_path, "--out", tmp_path / "out.json", "--ray", "127.0.0.1:9", code=2)
+    assert "--ray 127.0.0.1:9: no cluster to work with" in result.stderr
+    assert "allowed is auto, " in result.stderr
+    assert time.monotonic() - start < 60
