@@ -38,7 +38,7 @@ from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult
+from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Move, MoveResult
 
 SHOWN = 8
 """Disagreements in the picture."""
@@ -107,8 +107,12 @@ def compare_scenes(
             same_hidden += verdict.hidden == hidden(record, config.camera.hidden_below)
         for group in record["groups"]:
             part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
-            whole = judge.stability(part) if len(part.objects) > 1 or group["fall"] else None
             fall = group["fall"]
+            whole = judge.stability(part)
+            if isinstance(whole, CannotJudge) and whole.reason is CannotJudgeReason.FLOATING:
+                # What it misses stands in another group: asked again together with all that stands.
+                standing = tuple(scene[n] for other in record["groups"] if not other["fall"] for n in other["objects"])
+                whole = judge.stability(replace(scene, objects=part.objects + standing))
             pair = said(whole), "stable" if fall is None else "falls"
             stacks.pairs[pair] += 1
             if fall is not None:

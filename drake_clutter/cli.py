@@ -50,6 +50,7 @@ class ExplorerName(Enum):
 class Fidelity(Enum):
     """How moves are carried out."""
 
+    FAST = "fast"
     SETTLE = "settle"
 
 
@@ -79,6 +80,10 @@ MaxMovesOption = Annotated[
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
 RayOption = Annotated[
     str | None, typer.Option("--ray", metavar="ADDRESS", help="Put the workers on this Ray cluster, e.g. auto, instead of here.")
+]
+FidelityOption = Annotated[
+    Fidelity,
+    typer.Option(help="Objects are teleported; settle: Drake settles what a move touched; fast: by equilibrium, Drake in doubt."),
 ]
 NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
 
@@ -164,9 +169,7 @@ def explore(
     scene: SceneArgument,
     out: OutOption,
     agent: Annotated[ExplorerName, typer.Option(help="Who chooses the moves.")] = ExplorerName.LARGEST_CLEAR,
-    fidelity: Annotated[Fidelity, typer.Option(help="settle: objects are teleported, Drake settles what a move touched.")] = (
-        Fidelity.SETTLE
-    ),
+    fidelity: FidelityOption = Fidelity.SETTLE,
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
@@ -180,8 +183,9 @@ def explore(
     world, file = load_config(config), _load(scene, catalogue)
     output_directory(out)
     limit = max_moves or world.exploration.max_moves
-    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, limit, seed, world, _report)
-    fields = command.write_episode(out, task, f"{agent.value} explores {scene.name}", agent.value, seed)
+    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, fidelity.value, limit, seed, world, _report)
+    title = f"{agent.value} explores {scene.name}"
+    fields = command.write_episode(out, task, title, agent.value, fidelity.value, seed)
     _print_episode(fields, as_json, out)
 
 
@@ -199,6 +203,7 @@ def evaluate(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON with the rows and every episode.")],
     agents: Annotated[list[ExplorerName] | None, typer.Option("--agent", help="May be repeated; all if not given.")] = None,
     max_moves: MaxMovesOption = None,
+    fidelity: FidelityOption = Fidelity.SETTLE,
     count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
@@ -219,7 +224,7 @@ def evaluate(
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return _tracked("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, limit, seed, world, catalogue, workers, out, progress, ray)
+    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray)
     if as_json:
         print(json.dumps(rows, indent=2))
         return
@@ -255,9 +260,7 @@ def move(
     pick: Annotated[str | None, typer.Option(help="Name of the object to pick.")] = None,
     place: Annotated[str | None, typer.Option(help="Name of the object to put it on, or tray.")] = None,
     moves: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}.")] = None,
-    fidelity: Annotated[Fidelity, typer.Option(help="settle: objects are teleported, Drake settles what a move touched.")] = (
-        Fidelity.SETTLE
-    ),
+    fidelity: FidelityOption = Fidelity.SETTLE,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
@@ -273,9 +276,29 @@ def move(
     chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
     world, file = load_config(config), _load(scene, catalogue)
     output_directory(out)
-    task = command.carry_out(command.at_rest(file.scene, world, seed), chosen, seed, world, _report)
-    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", seed)
+    task = command.carry_out(command.at_rest(file.scene, world, seed), chosen, seed, world, _report, fidelity.value)
+    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed)
     _print_episode(fields, as_json, out)
+
+
+@app.command()
+def solve(
+    scene: SceneArgument,
+    out: OutOption,
+    budget: Annotated[int, typer.Option(min=1, help="Moves that the search may try before it gives up.")] = 5000,
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the fewest moves that reveal everything, for someone who knows everything; Drake confirms the plan."""
+    from drake_clutter.commands import explore, solve
+    from drake_clutter.config import load_config
+
+    world, file = load_config(config), _load(scene, catalogue)
+    output_directory(out)
+    fields = solve.solve(explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, _report)
+    _print(fields, as_json, f"{out}")
 
 
 @app.command()
@@ -295,7 +318,7 @@ def demo(
     made, task, tried = command.demo(seed, nodes, ClutterConfig(), agent, _report)
     save_scene(out / "scene.yaml", made.scene, made.verdict)
     title = f"A random scene of {nodes} nodes, explored"
-    _print_episode(command.write_episode(out, task, title, agent, seed, scenes_tried=tried), as_json, out)
+    _print_episode(command.write_episode(out, task, title, agent, Fidelity.SETTLE.value, seed, scenes_tried=tried), as_json, out)
 
 
 @app.command()

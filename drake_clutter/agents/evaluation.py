@@ -15,8 +15,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, ExplorationTask
 
 
 @dataclass(frozen=True)
@@ -54,12 +53,13 @@ class EpisodeResult:
 
 
 class EpisodePlayer:
-    """Plays episodes at fidelity `settle`; a worker for the runner."""
+    """Plays episodes at a fidelity; a worker for the runner."""
 
-    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int) -> None:
+    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int, fidelity: str) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
         self._catalogue = load_catalogue(catalogue_folder)
-        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.camera)
+        self._executor = EXECUTORS[fidelity](config, follow_falls=False)
+        self._detector = LabelDetector(config.camera)
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""

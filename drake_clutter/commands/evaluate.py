@@ -34,6 +34,7 @@ def evaluate(
     scenes: Sequence[Path],
     agents: Sequence[str],
     max_moves: int,
+    fidelity: str,
     seed: int,
     config: ClutterConfig,
     catalogue_folder: Path | None,
@@ -44,10 +45,10 @@ def evaluate(
 ) -> list[dict[str, Any]]:
     """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
     episodes = [Episode(scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]
-    make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed)
+    make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = list(progress(played, len(episodes)))
     rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]
-    fields = {"max_moves": max_moves, "seed": seed, "fidelity": "settle", "config": asdict(config), "rows": rows}
+    fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

@@ -16,9 +16,8 @@ from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.scenes.seams import Move
-from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, ExplorationTask, Step
 
 Report = Callable[[Step], None]
 
@@ -38,33 +37,38 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     return scene.at(verdict.settled)
 
 
-def _task(scene: Scene, config: ClutterConfig, max_moves: int) -> ExplorationTask:
-    return ExplorationTask(scene, SettleExecutor(config), LabelDetector(config.camera), config.exploration, max_moves)
+def _task(scene: Scene, config: ClutterConfig, max_moves: int, fidelity: str) -> ExplorationTask:
+    return ExplorationTask(scene, EXECUTORS[fidelity](config), LabelDetector(config.camera), config.exploration, max_moves)
 
 
-def explore(scene: Scene, agent_name: str, max_moves: int, seed: int, config: ClutterConfig, report: Report) -> ExplorationTask:
+def explore(
+    scene: Scene, agent_name: str, fidelity: str, max_moves: int, seed: int, config: ClutterConfig, report: Report
+) -> ExplorationTask:
     """Plays an episode on a scene at rest.
 
     Args:
         scene: at rest.
         agent_name: one of `EXPLORATION_AGENTS`.
+        fidelity: one of `EXECUTORS`.
         max_moves: after which it ends.
         seed: of the agent's and the world's chances.
         config: the world.
         report: called after each move.
     """
-    task = _task(scene, config, max_moves)
+    task = _task(scene, config, max_moves, fidelity)
     play(task, EXPLORATION_AGENTS[agent_name](), item_rng(seed), report)
     return task
 
 
-def carry_out(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, report: Report) -> ExplorationTask:
+def carry_out(
+    scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, report: Report, fidelity: str = "settle"
+) -> ExplorationTask:
     """Carries a list of moves out, on a scene at rest, until one makes it collapse.
 
     Raises:
         InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
     """
-    task, rng = _task(scene, config, len(moves)), item_rng(seed)
+    task, rng = _task(scene, config, len(moves), fidelity), item_rng(seed)
     for number, move in enumerate(moves, start=1):
         in_view = [d.name for d in task.look.observation.detections]
         for role, name, allowed in (("pick", move.pick, in_view), ("place", move.place, [TRAY, *in_view])):
@@ -97,7 +101,7 @@ def read_moves(path: Path) -> list[Move]:
     return moves
 
 
-def episode_fields(task: ExplorationTask, agent: str, seed: int) -> dict[str, Any]:
+def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
     """The document of `episode.json`."""
     end = task.end or EpisodeEnd.GAVE_UP
     moves = []
@@ -116,7 +120,7 @@ def episode_fields(task: ExplorationTask, agent: str, seed: int) -> dict[str, An
     return {
         "agent": agent,
         "seed": seed,
-        "fidelity": "settle",
+        "fidelity": fidelity,
         "success": end is EpisodeEnd.ALL_FOUND,
         "ended": end.value,
         "objects": len(task.scene.objects),
@@ -128,9 +132,11 @@ def episode_fields(task: ExplorationTask, agent: str, seed: int) -> dict[str, An
     }
 
 
-def write_episode(out: Path, task: ExplorationTask, title: str, agent: str, seed: int, **more: int) -> dict[str, Any]:
+def write_episode(
+    out: Path, task: ExplorationTask, title: str, agent: str, fidelity: str, seed: int, **more: int
+) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds."""
-    fields = {**more, **episode_fields(task, agent, seed)}
+    fields = {**more, **episode_fields(task, agent, fidelity, seed)}
     save_scene(out / "after.yaml", task.scene)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
     write_json(out / "episode.json", fields)
@@ -154,6 +160,6 @@ def demo(
             continue
         tried += 1
         start = made.scene.at(made.verdict.settled)
-        task = explore(start, agent_name, config.exploration.max_moves, seed, config, report)
+        task = explore(start, agent_name, "settle", config.exploration.max_moves, seed, config, report)
         if task.end is EpisodeEnd.ALL_FOUND or tried == DEMO_TRIES:
             return made, task, tried

@@ -26,8 +26,9 @@ class FastOrDrakeJudge:
 class FastOrDrakeExecutor:
     """Carries moves out fast, and asks Drake about what the fast judge cannot judge (a `MoveExecutor`)."""
 
-    def __init__(self, config: ClutterConfig) -> None:
-        self._fast, self._settle = FastExecutor(config), SettleExecutor(config)
+    def __init__(self, config: ClutterConfig, *, follow_falls: bool = True) -> None:
+        """Makes both; `follow_falls` is Drake's, see `SettleExecutor`."""
+        self._fast, self._settle = FastExecutor(config), SettleExecutor(config, follow_falls=follow_falls)
 
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""

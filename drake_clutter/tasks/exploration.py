@@ -2,13 +2,27 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 import numpy as np
 
-from drake_clutter.config import ExplorationConfig
+from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector, Look
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.seams import Move, MoveExecutor, MoveResult, Observation, Outcome
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.simulation.fallback import FastOrDrakeExecutor
+
+
+class ExecutorMaker(Protocol):
+    """Makes an executor."""
+
+    def __call__(self, config: ClutterConfig, *, follow_falls: bool = True) -> MoveExecutor:
+        """`follow_falls`: whether to simulate what a collapse, which ends the episode, does to the whole scene."""
+
+
+EXECUTORS: dict[str, ExecutorMaker] = {"fast": FastOrDrakeExecutor, "settle": SettleExecutor}
+"""How moves are carried out, by the name of the fidelity."""
 
 
 class EpisodeEnd(Enum):

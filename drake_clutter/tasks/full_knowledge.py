@@ -19,6 +19,8 @@ from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult, Observation
 
+MOST_OBJECTS = 64
+"""Objects in a scene, see `RayCaster.cover`."""
 LONGEST = 30
 """Moves; longer plans are not looked for."""
 

@@ -1,0 +1,56 @@
+"""`drake-clutter solve`: the fewest moves that reveal everything, and whether Drake confirms them."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drake_clutter.commands.explore import Report, carry_out, write_episode
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, write_json, write_text
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.full_knowledge import MOST_OBJECTS, Answer, FullKnowledgeSearch
+
+
+def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: ClutterConfig, report: Report) -> dict[str, Any]:
+    """Searches, carries a plan out at fidelity `settle`, and writes `solution.json`; with a plan also `moves.yaml` and a page.
+
+    Args:
+        scene: at rest.
+        name: of the scene, for the page's title.
+        out: the folder.
+        seed: of the places that are equally good, and of Drake's random offsets.
+        budget: moves that the search may try.
+        config: the world.
+        report: called after each move that is carried out.
+
+    Returns:
+        What `solution.json` holds.
+
+    Raises:
+        InputError: the scene has more objects than the search takes.
+    """
+    if len(scene.objects) > MOST_OBJECTS:
+        raise InputError(f"{name}: objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most")
+    solution = FullKnowledgeSearch(config).solve(scene, seed, budget)
+    fields: dict[str, Any] = {
+        "answer": solution.answer.value,
+        "moves": len(solution.plan) if solution.answer is Answer.SOLVABLE else None,
+        "at_least": solution.at_least,
+        "fewest": solution.fewest,
+        "plan": [str(move) for move in solution.plan],
+        "never_found": list(solution.never_found),
+        "moves_tried": solution.moves_tried,
+        "budget": budget,
+        "seed": seed,
+        "confirmed": None,
+    }
+    if solution.plan:
+        moves = [{"pick": move.pick, "place": move.place} for move in solution.plan]
+        write_text(out / "moves.yaml", yaml.safe_dump(moves, sort_keys=False))
+        task = carry_out(scene, solution.plan, seed, config, report)
+        fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
+        write_episode(out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed)
+    write_json(out / "solution.json", fields)
+    return fields
