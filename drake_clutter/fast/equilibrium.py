@@ -277,7 +277,7 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
         margins: (n,) m, by which the contacts below each object are shrunk.
         aside: (n, 2) m, by which the centres of mass are moved.
         friction: 0, or the coefficient of the pyramids in which the forces lie.
-        loads: (l, 4) points x, y, z, m, at which anything may press from above, and the object that is pressed; may be empty.
+        loads: (l, 4) points x, y, z, m, at which anything may press straight down, and the object that is pressed; may be empty.
 
     Returns:
         (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
@@ -315,8 +315,9 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
             y = (at[k, 1] - p_T[i, 1] - com[1] - aside[i, 1]) / _LENGTH
             z = (at[k, 2] - p_T[i, 2] - com[2]) / _LENGTH
             for side in range(sides):
-                fx = friction * ((side == 0) - (side == 1)) if sides > 1 else 0.0
-                fy = friction * ((side == 2) - (side == 3)) if sides > 1 else 0.0
+                slants = sides > 1 and k >= len(loads)
+                fx = friction * ((side == 0) - (side == 1)) if slants else 0.0
+                fy = friction * ((side == 2) - (side == 3)) if slants else 0.0
                 column = sides * k + side
                 A[rows * i, column] = sign
                 A[rows * i + 1, column] = sign * (y - z * fy)

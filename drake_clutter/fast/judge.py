@@ -161,7 +161,8 @@ class FastJudge:
         """Objects that no sequence of moves can pick without a collapse, whatever is put down on the others before.
 
         The largest set of objects of which none can be taken away while the rest of the set stands: not even if the others,
-        which may be gone by then, press wherever the tops are free. What is not in the set may still be impossible to move.
+        which may be gone by then, press straight down wherever the tops are free. (A bridge to another stack that pushes sideways
+        is not thought of.) What is not in the set may still be impossible to move.
         """
         standing = self._standing(scene)
         if isinstance(standing, CannotJudge):
