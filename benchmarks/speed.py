@@ -1,18 +1,18 @@
-"""How fast scenes are judged, seen and searched: this project's judges and cameras, and PyBullet, on the same scenes and one core.
+"""How fast scenes are judged, seen and searched: this project and PyBullet, on the same scenes and one core.
 
 python benchmarks/speed.py --out benchmarks/results/speed.json
 """
 
-import math
 import os
 
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"})  # before numpy is imported
 
 import itertools
+import math
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,47 +31,50 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.config import CameraConfig, ClutterConfig, SettleConfig, config_yaml
+from drake_clutter.config import CameraConfig, ClutterConfig, config_yaml
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import write_json
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import Pose, Scene, jittered, tilt_between
-from drake_clutter.scenes.seams import CannotJudge, SceneJudge
+from drake_clutter.scenes.seams import CannotJudge, Verdict
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
 
+CONFIG = ClutterConfig()
 NODES = 25
 NEVER = 1_000_000
 REPEATS = 5
-"""Times that what takes less than a millisecond is measured; a scene's time is their median."""
-SLOW = 4
+"""Rounds through all scenes of what takes less than a millisecond; a scene's time is the median."""
+SLOW = 6
 """Scenes of each size that Drake and PyBullet judge; and the scenes that Drake judges beforehand, not timed."""
 BUDGET = 2000
 """Moves that the search may try."""
 HIDDEN = {"1": (1, 1), "2": (2, 2), "3": (3, 3), "4-5": (4, 5), "6+": (6, NEVER)}
-FAST, WARM, EARLY, ACCURATE, BULLET = "FastJudge, cold", "FastJudge, warm", "DrakeJudge", "DrakeJudge, accurate", "PyBullet"
-RAYS, VTK, TINY = "ray caster", "Drake VTK labels", "PyBullet TinyRenderer"
+FAST, WARM, DRAKE, ACCURATE, BULLET = "FastJudge, cold", "FastJudge, warm", "DrakeJudge", "DrakeJudge, accurate", "PyBullet"
+RAYS, VTK, TINY = "ray caster", "Drake VTK labels", "TinyRenderer"
 RAY_SHARES, VTK_SHARES = "shares, ray caster", "shares, Drake VTK"
 NOTES = {
     "core": "one process on one core; times are of the wall clock",
-    "scenes": "RG's, ycb7, as `generate --seed` draws them; every judge gets the same random offsets",
+    "scenes": f"RG's of {NODES} nodes, ycb7, as `generate` draws them; every judge and eye gets the same random offsets",
     "growth": f"half of the scenes of each size stable, half not, by the fast judge; the first {SLOW} for Drake and PyBullet; "
-    "a size may be missed by one object in thirty",
-    FAST: f"its memory of stacks is emptied before every scene, shape table and compiled code are kept; median of {REPEATS}",
-    WARM: f"asked about scenes that it has judged before; median of {REPEATS}",
-    EARLY: "as by default: stops when all is calm; one judge for all scenes, so its memory of objects on their own fills as it "
-    f"goes; the first {SLOW} scenes were judged once before",
-    ACCURATE: "the same without the early stop: whatever does not fall is simulated for 2 s",
-    BULLET: "480 steps of 1/240 s in a new world for every scene, friction 0.5, no early stop; loading the export is not counted "
-    "but given as load_mean_ms; judged by the limits of Drake's judge, and sees nothing",
-    "agreement": "with the accurate form: stable or not; hidden objects, of the scenes that both call stable; both ('unchanged')",
-    "eyes": "640 x 480. Ray caster and Drake: every scene is drawn once before, with the same engine; PyBullet: one frame in every "
-    f"scene's world before the one that is timed, without shadows. Ray caster: median of {REPEATS}. same_pixels: of those on "
-    "which an eye or Drake VTK sees an object, how many show the same one",
-    "search": f"budget {BUDGET} moves; its judge's memory is emptied before every scene",
+    "30 objects may be one more or less, 60 two",
+    FAST: "stability and visibility; its memory of stacks is emptied before every scene, shape table and compiled code are kept",
+    WARM: "asked again about scenes that it has judged",
+    DRAKE: "as by default, stops when all is calm; one judge for all scenes, which remembers objects that stand on their own; "
+    f"the first {SLOW} scenes were judged once before",
+    ACCURATE: "likewise, but without the early stop: what does not fall is simulated for 2 s",
+    BULLET: "480 steps of 1/240 s in a new world for every scene, friction 0.5; loading the exported models is not counted but "
+    "given as load_mean_ms, export not at all; Drake's limits at the end; stability only",
+    "agreement": "with the accurate form. agrees: stable or not; agrees_on_hidden: of the scenes that both call stable, those "
+    "with the same objects hidden; unchanged: both",
+    "eyes": "640 x 480, shares: the visible shares of all objects. Every scene was drawn once before with the same engine, not "
+    "timed; in PyBullet, without shadows, by a frame in the same world. same_pixels: of the pixels on which an eye or Drake "
+    "sees an object, those on which they see the same",
+    "repeats": f"FastJudge and ray caster: a scene's time is the median of {REPEATS} rounds; all else is timed once",
+    "search": f"budget {BUDGET} moves; the judge's memory of stacks is emptied before every scene",
 }
 AIMS = {
     "fast_ms_16_objects": "< 0.5",
@@ -84,6 +87,8 @@ AIMS = {
 T = TypeVar("T")
 Labels = NDArray[np.int16]
 Row = dict[str, Any]
+Found = tuple[bool | None, tuple[str, ...] | None]
+"""Whether a scene is stable, and what it hides; None: the judge cannot say."""
 
 
 @dataclass(frozen=True)
@@ -101,376 +106,309 @@ SIZES = (Size(5, 9, 0.7, 40), Size(10, 18, 0.7, 40), Size(16, 29, 0.7, 40), Size
 
 @dataclass(frozen=True)
 class Case:
-    """A scene as laid out, and the generator that did it: its next draws are the random offsets."""
+    """A scene as laid out, and the generator that did it: what it draws next are the random offsets."""
 
     scene: Scene
     after: np.random.Generator
 
-    def rng(self) -> np.random.Generator:
-        """A generator that draws this scene's offsets."""
-        return deepcopy(self.after)
-
     @cached_property
     def start(self) -> Scene:
         """The scene with its offsets."""
-        return replace(self.scene, objects=tuple(jittered(self.scene.objects, SettleConfig().jitter, self.rng())))
+        return replace(self.scene, objects=tuple(jittered(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))))
 
 
 def generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
     """RG on a tray."""
-    config = ClutterConfig()
-    config.layout.tray_side = tray_side
+    config = replace(CONFIG, layout=replace(CONFIG.layout, tray_side=tray_side))
     return SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
 
 
 def half_stable(size: Size, count: int, seed: int) -> tuple[list[Case], float]:
-    """Scenes of a size, stable and unstable in turn by the fast judge, and the share of all drawn that were stable."""
-    rg, judge = generator(size.nodes, size.tray_side, seed), FastJudge(ClutterConfig())
-    kept: dict[bool, list[Case]] = {True: [], False: []}
+    """Scenes of a size, stable and unstable in turn by the fast judge, and the share of stable ones among all of that size."""
+    rg, judge = generator(size.nodes, size.tray_side, seed), FastJudge(CONFIG)
+    drawn: dict[bool, list[Case]] = {True: [], False: []}
     for draw in itertools.count():
         rng = item_rng(seed, size.objects, draw)
         scene, _ = rg.lay_out(rng)
         if abs(len(scene.objects) - size.objects) <= size.objects // 30:
-            kept[judge.stability(scene) is None].append(Case(scene, rng))
-        if min(map(len, kept.values())) >= count // 2:
+            drawn[judge.stability(scene) is None].append(Case(scene, rng))
+        if min(len(cases) for cases in drawn.values()) >= count // 2:
             break
-    pairs = list(zip(*kept.values(), strict=False))[: count // 2]
-    return [case for pair in pairs for case in pair], len(kept[True]) / sum(map(len, kept.values()))
+    pairs = itertools.islice(zip(drawn[True], drawn[False], strict=False), count // 2)
+    return list(itertools.chain(*pairs)), len(drawn[True]) / sum(len(cases) for cases in drawn.values())
 
 
-def timed(function: Callable[..., T], *arguments: Any) -> tuple[float, T]:
+def timed(ask: Callable[..., T], *arguments: Any) -> tuple[float, T]:
     """Seconds that a call takes, and what it returns."""
     start = time.perf_counter()
-    result = function(*arguments)
+    result = ask(*arguments)
     return time.perf_counter() - start, result
 
 
-def figures(seconds: Sequence[float]) -> Row:
-    """Median, mean and 95th percentile, and how many a second by the mean."""
-    ms = 1000 * np.array(seconds)
-    return {
-        "count": len(ms),
-        "median_ms": float(np.median(ms)),
-        "mean_ms": float(ms.mean()),
-        "p95_ms": float(np.percentile(ms, 95)),
-        "per_second": float(1000 / ms.mean()),
-    }
-
-
-@dataclass
-class Measured:
-    """What a judge took for each scene, whether it called it stable, and what it said is hidden (None: it does not say)."""
-
-    seconds: list[float]
-    stable: list[bool | None]
-    hidden: list[tuple[str, ...] | None]
-
-    def row(self, truth: "Measured | None") -> Row:
-        """Its figures, and how its verdicts agree with another judge's."""
-        calm = [s for s, held in zip(self.seconds, self.stable, strict=True) if held]
-        row = figures(self.seconds) | {"stable_share": self.stable.count(True) / len(self.stable)}
-        row["stable_median_ms"] = 1000 * float(np.median(calm)) if calm else None
-        if truth is not None:
-            same = np.equal(self.stable, truth.stable)
-            row["agrees"] = float(same.mean())
-            if None not in self.hidden:
-                same_hidden = np.array([a == b for a, b in zip(self.hidden, truth.hidden, strict=True)])
-                both = np.array([bool(a and b) for a, b in zip(self.stable, truth.stable, strict=True)])
-                row["agrees_on_hidden"] = float(same_hidden[both].mean()) if both.any() else None
-                row["unchanged"] = float((same & same_hidden).mean())
-        return row
-
-
-def judged(
-    what: str, judge: SceneJudge, cases: Sequence[Case], warm_up: int, repeats: int = 1, before: Callable[[], None] = lambda: None
-) -> Measured:
-    """Has scenes judged, the first `warm_up` of them once more beforehand; `before` is called ahead of each and not timed."""
+def asked(
+    what: str,
+    ask: Callable[[Case, np.random.Generator], T],
+    cases: Sequence[Case],
+    warm_up: int = NEVER,
+    repeats: int = 1,
+    before: Callable[[], None] = lambda: None,
+) -> tuple[list[float], list[T]]:
+    """Seconds and answer for each case; the first `warm_up` were asked once beforehand. `before` each, something not timed."""
     for case in cases[:warm_up]:
-        judge.judge(case.scene, case.rng())
-    measured = Measured([], [], [])
-    for case in track(cases, what, console=Console(stderr=True)):
-        seconds = []
-        for _ in range(repeats):
-            before()
-            took, verdict = timed(judge.judge, case.scene, case.rng())
-            seconds.append(took)
-        measured.seconds.append(float(np.median(seconds)))
-        measured.stable.append(None if isinstance(verdict, CannotJudge) else verdict.stable)
-        measured.hidden.append(() if isinstance(verdict, CannotJudge) else verdict.hidden)
-    return measured
+        ask(case, deepcopy(case.after))
+    seconds, answers = [], []
+    for case in track([*cases] * repeats, what, console=Console(stderr=True)):
+        before()
+        took, answer = timed(ask, case, deepcopy(case.after))
+        seconds.append(took)
+        answers.append(answer)
+    return np.median(np.reshape(seconds, (repeats, -1)), axis=0).tolist(), answers[: len(cases)]
 
 
-class BulletWorld:
-    """A scene in a PyBullet world of its own, loaded from its export."""
+def found_by(verdict: Verdict | CannotJudge) -> Found:
+    """What is compared of a verdict."""
+    return (None, None) if isinstance(verdict, CannotJudge) else (verdict.stable, verdict.hidden)
 
-    def __init__(self, scene: Scene, folder: Path) -> None:
-        self._scene = scene
-        path = str(export_scene(scene, ExportFormat.SDF, folder))
-        self.load_seconds, bodies = timed(self._load, path)
-        assert bodies == tuple(range(len(scene.objects) + 1))  # the tray first
 
-    def _load(self, path: str) -> tuple[int, ...]:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        bodies: tuple[int, ...] = pybullet.loadSDF(path, physicsClientId=self._client)
-        for body in bodies:
-            # The coefficients of the two that touch are multiplied.
-            pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(0.5), physicsClientId=self._client)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
-        pybullet.setTimeStep(1 / 240, physicsClientId=self._client)
-        return bodies
+def bullet_label(camera: CameraConfig) -> Labels:
+    """What the overhead camera sees in PyBullet, labelled as in `Images`."""
+    view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
+    projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
+    size, engine = (camera.width, camera.height), pybullet.ER_TINY_RENDERER
+    *_, bodies = pybullet.getCameraImage(*size, view, projection, shadow=0, renderer=engine)
+    return np.maximum(np.reshape(bodies, size[::-1]) - 1, -1).astype(np.int16)  # body 0 is the tray
 
-    def close(self) -> None:
-        pybullet.disconnect(self._client)
 
-    def label(self, camera: CameraConfig) -> NDArray[np.int64]:
-        """The segmentation that the overhead camera sees."""
-        view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
-        projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
-        image = pybullet.getCameraImage(
-            camera.width,
-            camera.height,
-            view,
-            projection,
-            shadow=0,
-            renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
-        )
-        return np.maximum(np.asarray(image[4]).reshape(camera.height, camera.width) - 1, -1)
+def bullet_load(path: Path) -> None:
+    """Makes a world of an export."""
+    pybullet.connect(pybullet.DIRECT)
+    for body in pybullet.loadSDF(str(path)):
+        pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(0.5))  # those of the two that touch are multiplied
+    pybullet.setGravity(0, 0, -9.81)
+    pybullet.setTimeStep(1 / 240)
 
-    def _step(self, count: int) -> None:
-        for _ in range(count):
-            pybullet.stepSimulation(physicsClientId=self._client)
 
-    def _poses(self) -> list[Pose]:
-        found = []
-        for body in range(1, len(self._scene.objects) + 1):
-            X_TCm = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-            X_OCm = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)[3:5]
-            p, (x, y, z, w) = pybullet.multiplyTransforms(*X_TCm, *pybullet.invertTransform(*X_OCm))
-            found.append(Pose(p, (w, x, y, z)))
-        return found
+def bullet_steps(count: int) -> None:
+    """Simulates."""
+    for _ in range(count):
+        pybullet.stepSimulation()
 
-    def settle(self, config: SettleConfig) -> tuple[float, bool]:
-        """Seconds of stepping through 2 s, and whether everything stayed."""
-        before = self._poses()
-        first, _ = timed(self._step, 360)
-        late = self._poses()
-        last, _ = timed(self._step, 120)
-        stable = all(
-            max(abs(X.p[:2])) <= self._scene.tray_side / 2
+
+def bullet_poses(scene: Scene) -> list[Pose]:
+    """X_TO of the scene's objects."""
+    poses = []
+    for body in range(1, len(scene.objects) + 1):
+        X_TCm, X_OCm = pybullet.getBasePositionAndOrientation(body), pybullet.getDynamicsInfo(body, -1)[3:5]
+        p, (x, y, z, w) = pybullet.multiplyTransforms(*X_TCm, *pybullet.invertTransform(*X_OCm))
+        poses.append(Pose(p, (w, x, y, z)))
+    return poses
+
+
+def in_bullet(case: Case) -> tuple[float, float, float, Labels, bool]:
+    """PyBullet's seconds for loading, a frame and 2 s of stepping; the frame, and whether everything stayed."""
+    scene, limits = case.start, CONFIG.settle
+    with tempfile.TemporaryDirectory() as folder:
+        load, _ = timed(bullet_load, export_scene(scene, ExportFormat.SDF, Path(folder)))
+        bullet_label(CONFIG.camera)
+        frame, labels = timed(bullet_label, CONFIG.camera)
+        first = bullet_poses(scene)
+        steps, _ = timed(bullet_steps, 360)
+        late = bullet_poses(scene)
+        more_steps, _ = timed(bullet_steps, 120)
+        stayed = all(
+            max(abs(X.p[:2])) <= scene.tray_side / 2
             and X.p[2] >= 0
-            and np.linalg.norm(X.p - X_before.p) < config.max_displacement
-            and np.linalg.norm(X.p - X_late.p) <= config.rest_drift
-            and tilt_between(o.object_class, X_before, X) < math.radians(config.max_tilt_deg)
-            for o, X, X_before, X_late in zip(self._scene.objects, self._poses(), before, late, strict=True)
+            and np.linalg.norm(X.p - X_first.p) < limits.max_displacement
+            and np.linalg.norm(X.p - X_late.p) <= limits.rest_drift
+            and tilt_between(o.object_class, X_first, X) < math.radians(limits.max_tilt_deg)
+            for o, X, X_first, X_late in zip(scene.objects, bullet_poses(scene), first, late, strict=True)
         )
-        return first + last, stable
+        pybullet.disconnect()
+    return load, frame, steps + more_steps, labels, stayed
 
 
-@dataclass
-class Seen:
-    """What an eye took for each scene, and the labels that it saw, if it makes an image."""
-
-    seconds: list[float]
-    images: list[Labels]
-
-    def row(self, truth: "Seen") -> Row:
-        """Its figures, and how many pixels are as in the truth."""
-        pairs = list(zip(self.images, truth.images, strict=False))
-        same = [np.mean((a == b)[(a >= 0) | (b >= 0)]) for a, b in pairs]
-        return figures(self.seconds) | ({"same_pixels": float(np.mean(same))} if same else {})
+def figures(seconds: Sequence[float]) -> Row:
+    """What is said of some times."""
+    ms = 1000 * np.array(seconds)
+    row = {"median_ms": np.median(ms), "mean_ms": ms.mean(), "p95_ms": np.percentile(ms, 95), "per_second": 1000 / ms.mean()}
+    return {"count": len(ms)} | {key: float(value) for key, value in row.items()}
 
 
-def in_bullet(what: str, cases: Sequence[Case], config: ClutterConfig) -> tuple[Measured, Seen, list[float]]:
-    """Has PyBullet look at scenes and settle them; also the seconds that loading took."""
-    measured, seen, loads = Measured([], [], []), Seen([], []), []
-    for case in track(cases, what, console=Console(stderr=True)):
-        with tempfile.TemporaryDirectory() as folder:
-            world = BulletWorld(case.start, Path(folder))
-            loads.append(world.load_seconds)
-            world.label(config.camera)
-            seconds, image = timed(world.label, config.camera)
-            seen.seconds.append(seconds)
-            seen.images.append(image.astype(np.int16))
-            seconds, stable = world.settle(config.settle)
-            measured.seconds.append(seconds)
-            measured.stable.append(stable)
-            measured.hidden.append(None)
-            world.close()
-    return measured, seen, loads
+def judge_row(seconds: Sequence[float], found: Sequence[Found], truth: Sequence[Found] | None) -> Row:
+    """Figures of a judge, and how often it agrees with the truth."""
+    row = figures(seconds) | {"stable_share": float(np.mean([stable is True for stable, _ in found]))}
+    on_stable = [s for s, (stable, _) in zip(seconds, found, strict=True) if stable]
+    row["stable_median_ms"] = 1000 * float(np.median(on_stable)) if on_stable else None
+    if truth:
+        pairs = list(zip(found, truth, strict=True))
+        row["agrees"] = float(np.mean([a[0] == b[0] for a, b in pairs]))
+        same_hidden = [a[1] == b[1] for a, b in pairs if a[0] and b[0] and a[1] is not None]
+        row["agrees_on_hidden"] = float(np.mean(same_hidden)) if same_hidden else None
+        row["unchanged"] = float(np.mean([a == b for a, b in pairs]))
+    return row
 
 
-def looked(draw: Callable[[Scene], T], scenes: Sequence[Scene], repeats: int = 1) -> tuple[list[float], list[T]]:
-    """Seconds by scene, and what was seen before these, when each was drawn once without being timed."""
-    first = [draw(scene) for scene in scenes]
-    passes = [[timed(draw, scene)[0] for scene in scenes] for _ in range(repeats)]
-    return np.median(passes, axis=0).tolist(), first
+def eye_row(seconds: Sequence[float], labels: Sequence[Labels], truth: Sequence[Labels]) -> Row:
+    """Figures of an eye, and how many pixels it sees like the truth."""
+    same = [np.mean((a == b)[(a >= 0) | (b >= 0)]) for a, b in zip(labels, truth, strict=False)]
+    return figures(seconds) | {"same_pixels": float(np.mean(same))}
 
 
 def ray_labels(rays: RayCaster, scene: Scene) -> Labels:
-    """The whole label image, from one cast."""
+    """The whole label image, by one cast."""
     _, rectangle = rays._cast(scene.objects, None)
     image = np.full(rays._hit.shape, -1, np.int16)
     image[rectangle] = rays._hit[rectangle]
     return image
 
 
-class Bench:
-    """The judges and eyes, made once."""
+def measure(what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, FastJudge | DrakeJudge]) -> Row:
+    """Figures by judge and by eye, those of Drake and PyBullet's judge only on the first `slow` cases."""
+    found: dict[str, tuple[list[float], list[Found]]] = {}
+    for name, judge in judges.items():
+        if isinstance(judge, FastJudge):
+            options = (cases, NEVER, REPEATS, judge._known.clear if name == FAST else lambda: None)
+        else:
+            options = (cases[:slow], SLOW, 1, lambda: None)
+        seconds, verdicts = asked(f"{what}: {name}", lambda case, rng, judge=judge: judge.judge(case.scene, rng), *options)
+        found[name] = seconds, [found_by(verdict) for verdict in verdicts]
+    progress = track(cases[:slow], f"{what}: {BULLET}", console=Console(stderr=True))
+    loads, frames, steps, labels, stayed = zip(*map(in_bullet, progress), strict=True)
+    found[BULLET] = [*steps], [(held, None) for held in stayed]
+    truth = found[ACCURATE][1] if ACCURATE in found else None
+    rows = {name: judge_row(*pair, truth) for name, pair in found.items()}
+    rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
 
-    def __init__(self, config: ClutterConfig) -> None:
-        accurate = replace(config, settle=replace(config.settle, calm_samples=NEVER))
-        self._config = config
-        self.fast, self._drake, self._accurate = FastJudge(config), DrakeJudge(config), DrakeJudge(accurate)
-
-    def measure(self, what: str, cases: Sequence[Case], slow: int, accurate: bool) -> Row:
-        """Figures by judge and by eye: of all cases, of Drake and PyBullet only for the first `slow`."""
-        found = {}
-        for name, before in ((FAST, self.fast._known.clear), (WARM, lambda: None)):
-            found[name] = judged(f"{what}: {name}", self.fast, cases, len(cases), REPEATS, before)
-        found[EARLY] = judged(f"{what}: {EARLY}", self._drake, cases[:slow], SLOW)
-        if accurate:
-            found[ACCURATE] = judged(f"{what}: {ACCURATE}", self._accurate, cases[:slow], SLOW)
-        found[BULLET], tiny, loads = in_bullet(f"{what}: {BULLET}", cases[:slow], self._config)
-        judges = {name: measured.row(found.get(ACCURATE)) for name, measured in found.items()}
-        judges[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
-
-        rays, camera = RayCaster(self._config.camera), OverheadCamera(self._config.camera)
-        starts = [case.start for case in cases]
-        seen = {
-            VTK: Seen(*looked(lambda scene: camera.label(scene).astype(np.int16), starts)),
-            RAYS: Seen(*looked(lambda scene: ray_labels(rays, scene), starts, REPEATS)),
-            TINY: tiny,
-            VTK_SHARES: Seen(looked(camera.visible_shares, starts)[0], []),
-            RAY_SHARES: Seen(looked(lambda scene: rays.visible_shares(scene.objects), starts, REPEATS)[0], []),
-        }
-        return {"judges": judges, "eyes": {name: eye.row(seen[VTK]) for name, eye in seen.items()}}
+    rays, camera = RayCaster(CONFIG.camera), OverheadCamera(CONFIG.camera)
+    seconds, images = asked(f"{what}: {VTK}", lambda case, _: camera.label(case.start).astype(np.int16), cases)
+    eyes = {VTK: figures(seconds), TINY: eye_row(frames, labels, images)}
+    eyes[RAYS] = eye_row(*asked(f"{what}: {RAYS}", lambda case, _: ray_labels(rays, case.start), cases, repeats=REPEATS), images)
+    eyes[VTK_SHARES] = figures(asked(f"{what}: {VTK_SHARES}", lambda case, _: camera.visible_shares(case.start), cases)[0])
+    shares = asked(f"{what}: {RAY_SHARES}", lambda case, _: rays.visible_shares(case.start.objects), cases, repeats=REPEATS)
+    eyes[RAY_SHARES] = figures(shares[0])
+    return {"judges": rows, "eyes": eyes}
 
 
-def searched(cases: Sequence[Case], config: ClutterConfig) -> list[Row]:
-    """The search on the stable scenes that hide something, by how many objects are hidden."""
-    judge = FastJudge(config)
-    search = FullKnowledgeSearch(config, judge)
-    hiding = []
-    for scene in (case.scene for case in cases if judge.stability(case.scene) is None):
-        hidden = sum(share < config.camera.hidden_below for share in judge.rays.visible_shares(scene.objects).values())
-        if hidden:
-            hiding.append((hidden, scene))
-    for _, scene in hiding[:SLOW]:
-        search.solve(scene, budget=50)
-    found = []
-    for hidden, scene in track(hiding, "search", console=Console(stderr=True)):
-        judge._known.clear()
-        found.append((hidden, *timed(search.solve, scene, 0, BUDGET)))
-    rows = []
+def searched(cases: Sequence[Case]) -> dict[str, Row]:
+    """The search on the scenes that are stable and hide something, as laid out, by how much they hide."""
+    judge = FastJudge(CONFIG)
+    search = FullKnowledgeSearch(CONFIG, judge)
+    hiding: list[tuple[int, Case]] = []
+    for case in cases:
+        shares = judge.rays.visible_shares(case.scene.objects).values()
+        hidden = sum(share < CONFIG.camera.hidden_below for share in shares)
+        if hidden and judge.stability(case.scene) is None:
+            hiding.append((hidden, case))
+    rows = {}
     for name, (least, most) in HIDDEN.items():
-        part = [(seconds, solution) for hidden, seconds, solution in found if least <= hidden <= most]
-        row: Row = {"hidden": name, "count": len(part)}
+        part = [case for hidden, case in hiding if least <= hidden <= most]
+        rows[name] = {"count": len(part)}
         if part:
-            row["median_s"] = float(np.median([seconds for seconds, _ in part]))
-            row["max_s"] = max(seconds for seconds, _ in part)
-            row["median_moves_tried"] = float(np.median([solution.moves_tried for _, solution in part]))
-            row |= {answer.value: sum(solution.answer is answer for _, solution in part) / len(part) for answer in Answer}
-        rows.append(row)
+            search.solve(part[0].scene, budget=20)
+            options = (part, 0, 1, judge._known.clear)
+            seconds, solutions = asked(f"{name} hidden: search", lambda case, _: search.solve(case.scene, 0, BUDGET), *options)
+            rows[name] |= {"median_s": float(np.median(seconds)), "max_s": max(seconds)}
+            rows[name]["median_moves_tried"] = float(np.median([solution.moves_tried for solution in solutions]))
+            for answer in Answer:
+                rows[name][answer.value] = float(np.mean([solution.answer is answer for solution in solutions]))
     return rows
+
+
+def table(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
+    """Rows by name; columns by their head: which figure."""
+    made = Table(title, *columns, padding=0)
+    made.columns[0].no_wrap = True
+    for name, row in rows.items():
+        values = [row.get(key) for key in columns.values()]
+        texts = [v if isinstance(v, str) else "" if v is None else f"{v:,.0f}" if v >= 100 else f"{v:.3g}" for v in values]
+        made.add_row(name, *texts)
+    return made
+
+
+def show(result: Row, console: Console) -> None:
+    """Prints the tables."""
+    times = {"median": "median_ms", "mean": "mean_ms", "95 %": "p95_ms", "per s": "per_second"}
+    agreement = {"stable": "stable_share", "agrees": "agrees", "on hidden": "agrees_on_hidden"}
+    console.print(table("ms per scene", result["judges"], times | {"of stable": "stable_median_ms"} | agreement))
+    console.print(table("ms per frame", result["eyes"], times | {"same pixels": "same_pixels"}))
+    grown = {}
+    for part in ("judges", "eyes"):
+        for name in result["growth"][0][part]:
+            grown[name] = {str(row["objects"]): row[part][name]["mean_ms"] for row in result["growth"]}
+    console.print(table("mean ms by objects", grown, {str(size.objects): str(size.objects) for size in SIZES}))
+    columns = {"scenes": "count", "median s": "median_s", "most": "max_s", "moves": "median_moves_tried"}
+    console.print(table("search: hidden", result["search"], columns | {answer.value: answer.value for answer in Answer}))
+    targets = {name: {"aim": AIMS[name], "measured": value} for name, value in result["targets"].items()}
+    console.print(table("target", targets, {"aim": "aim", "measured": "measured"}))
+
+
+def draw_growth(growth: Sequence[Row], path: Path) -> None:
+    """Time by number of objects, of judges and of eyes."""
+    plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
+    objects = [row["objects"] for row in growth]
+    figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained", sharey=True)
+    parts = (("judges", (DRAKE, BULLET, FAST), "judged"), ("eyes", (TINY, VTK, RAYS), "frame"))
+    for panel, (part, names, what) in zip(panels, parts, strict=True):
+        for name, marker in zip(names, "Dso", strict=True):
+            panel.loglog(objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name)
+        panel.set_xticks(objects, objects)
+        panel.minorticks_off()
+        panel.set(xlabel="objects in the scene", ylabel=f"ms per scene {what}" if part == "judges" else f"ms per {what}")
+        panel.tick_params(labelleft=True)
+        panel.grid(alpha=0.4)
+        panel.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, columnspacing=0.8, handletextpad=0.3, fontsize=16)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def cpu() -> str:
     """The processor's model."""
     info = Path("/proc/cpuinfo")
-    models = (
-        [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line] if info.exists() else []
-    )
-    return models[0] if models else platform.processor()
-
-
-def show(result: Row, console: Console) -> None:
-    """Prints the tables."""
-    table = Table("ms per scene", "median", "mean", "p95", "scenes/s", "stable", "agrees", "on hidden", title=f"{NODES} nodes")
-    for name, row in result["judges"].items():
-        shares = [f"{row[key]:.3f}" if row.get(key) is not None else "" for key in ("stable_share", "agrees", "agrees_on_hidden")]
-        table.add_row(name, *(f"{row[key]:.4g}" for key in ("median_ms", "mean_ms", "p95_ms", "per_second")), *shares)
-    console.print(table)
-    table = Table("ms per frame", "median", "mean", "p95", "frames/s", "same pixels", title=f"{NODES} nodes")
-    for name, row in result["eyes"].items():
-        pixels = f"{row['same_pixels']:.3f}" if "same_pixels" in row else ""
-        table.add_row(name, *(f"{row[key]:.4g}" for key in ("median_ms", "mean_ms", "p95_ms", "per_second")), pixels)
-    console.print(table)
-    table = Table("mean ms", *(str(row["objects"]) for row in result["growth"]), title="by number of objects")
-    for part in ("judges", "eyes"):
-        for name in result["growth"][0][part]:
-            table.add_row(name, *(f"{row[part][name]['mean_ms']:.4g}" for row in result["growth"]))
-    console.print(table)
-    table = Table("hidden", "scenes", "median s", "max s", "moves", *(answer.value for answer in Answer), title="search")
-    for row in result["search"]:
-        keys = ("median_s", "max_s", "median_moves_tried", *(answer.value for answer in Answer))
-        table.add_row(row["hidden"], str(row["count"]), *(f"{row[key]:.3g}" if key in row else "" for key in keys))
-    console.print(table)
-    table = Table("target", "aim", "measured")
-    for name, value in result["targets"].items():
-        table.add_row(name, AIMS[name], "" if value is None else f"{value:.4g}")
-    console.print(table)
-
-
-def draw_growth(growth: Sequence[Row], path: Path) -> None:
-    """Time by number of objects, of judges and of eyes."""
-    plt.rcParams.update({"font.size": 17, "lines.linewidth": 2.5, "lines.markersize": 9})
-    objects = [row["objects_mean"] for row in growth]
-    figure, panels = plt.subplots(1, 2, figsize=(15, 7), layout="constrained")
-    for panel, part, names, unit in (
-        (panels[0], "judges", (BULLET, EARLY, FAST), "scene"),
-        (panels[1], "eyes", (TINY, VTK, RAYS), "frame"),
-    ):
-        for name, marker in zip(names, "sDo", strict=True):
-            panel.loglog(objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name)
-        panel.set_xticks(objects, [f"{n:.0f}" for n in objects])
-        panel.minorticks_off()
-        panel.set(xlabel="objects in the scene", ylabel=f"mean time per {unit} (ms)")
-        panel.grid(alpha=0.4)
-        low, high = panel.get_ylim()
-        panel.set_ylim(low, high * 8)  # room for the legend
-        panel.legend(loc="upper left")
-    figure.savefig(path, dpi=100)
+    lines = info.read_text().splitlines() if info.exists() else []
+    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
 
 
 def main(
-    count: Annotated[int, typer.Option(help=f"Scenes of {NODES} nodes; of the other sizes no more than this.", min=2)] = 60,
+    count: Annotated[int, typer.Option(help=f"Scenes of {NODES} nodes; of the other sizes, no more than this.", min=2)] = 60,
     seed: int = 0,
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG to draw the growth with the number of objects in.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG to write: the growth with the number of objects.")] = None,
 ) -> None:
-    """Prints the tables and writes everything."""
+    """Measures everything in one go; prints the tables and writes them."""
     console = Console(file=os.fdopen(os.dup(1), "w"))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where PyBullet complains, see docs/export.md
-    if hasattr(os, "sched_setaffinity"):  # the renderers would start threads
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what PyBullet prints, see docs/export.md
+    if hasattr(os, "sched_setaffinity"):  # renderers start threads
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    began, config = time.monotonic(), ClutterConfig()
-    packages = {name: version(name) for name in ("drake", "pybullet", "numba", "numpy", "scipy")}
-    head = {"config": config_yaml(config), "seed": seed, "count": count, "commit": commit(), "cpu": cpu(), "notes": NOTES}
-    result: Row = head | {"versions": {"python": platform.python_version()} | packages, "nodes": NODES}
+    began = time.monotonic()
+    packages = {name: version(name) for name in ("drake", "pybullet", "numba", "numpy")}
+    result: Row = {"config": config_yaml(CONFIG), "seed": seed, "count": count, "nodes": NODES, "commit": commit(), "cpu": cpu()}
+    result |= {"versions": {"python": platform.python_version()} | packages, "notes": NOTES}
 
-    bench, rg = Bench(config), generator(NODES, config.layout.tray_side, seed)
-    cases = []
+    fast, drake = FastJudge(CONFIG), DrakeJudge(CONFIG)
+    accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, calm_samples=NEVER)))
+    rg, cases = generator(NODES, CONFIG.layout.tray_side, seed), []
     for index in range(count):
         rng = item_rng(seed, index)
         cases.append(Case(rg.lay_out(rng)[0], rng))
-    result["objects_mean"] = float(np.mean([len(case.scene.objects) for case in cases]))
-    result |= bench.measure(f"{NODES} nodes", cases, count, accurate=True)
+    judges = {FAST: fast, WARM: fast, DRAKE: drake}
+    result |= {"objects_mean": float(np.mean([len(case.scene.objects) for case in cases]))}
+    result |= measure(f"{NODES} nodes", cases, count, judges | {ACCURATE: accurate})
     result["growth"] = []
     for size in SIZES:
         grown, share = half_stable(size, min(size.scenes, count), seed)
-        row = {"objects": size.objects, "objects_mean": float(np.mean([len(case.scene.objects) for case in grown]))}
+        row: Row = {"objects": size.objects, "objects_mean": float(np.mean([len(case.scene.objects) for case in grown]))}
         row |= {"nodes": size.nodes, "tray_side": size.tray_side, "stable_share_of_drawn": share}
-        result["growth"].append(row | bench.measure(f"{size.objects} objects", grown, SLOW, accurate=False))
-    result["search"] = searched(cases, config)
+        result["growth"].append(row | measure(f"{size.objects} objects", grown, SLOW, judges))
+    result["search"] = searched(cases)
 
-    judges, sixteen = result["judges"], next(row for row in result["growth"] if row["objects"] == 16)["judges"][FAST]
+    (sixteen,) = (row["judges"][FAST] for row in result["growth"] if row["objects"] == 16)
+    rows = result["judges"]
     result["targets"] = {
         "fast_ms_16_objects": sixteen["median_ms"],
         "fast_ms_16_objects_stable": sixteen["stable_median_ms"],
-        "ratio_to_pybullet": judges[BULLET]["mean_ms"] / judges[FAST]["mean_ms"],
-        "drake_median_s": judges[EARLY]["median_ms"] / 1000,
-        "drake_verdicts_unchanged": judges[EARLY]["unchanged"],
+        "ratio_to_pybullet": rows[BULLET]["mean_ms"] / rows[FAST]["mean_ms"],
+        "drake_median_s": rows[DRAKE]["median_ms"] / 1000,
+        "drake_verdicts_unchanged": rows[DRAKE]["unchanged"],
     }
     result["seconds"] = time.monotonic() - began
     if out is not None:

@@ -87,10 +87,13 @@ def contact_polygon(table, lower_shape, upper_shape, lower_p, upper_p, margin): 
 
 
 @njit(cache=True)
-def _overlap(table, i, j, p_i, p_j):  # type: ignore[no-untyped-def]
-    """How deep two outlines overlap seen from above, m (separating axes); negative: how far they are apart at least."""
+def _overlap(table, i, j, p_i, p_j, how_far):  # type: ignore[no-untyped-def]
+    """How deep two outlines overlap seen from above, m (separating axes); not positive: they do not.
+
+    With `how_far`, a negative value says how far apart they are at least.
+    """
     apart = np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1]) - table.reach[i] - table.reach[j]
-    if apart > BESIDE:
+    if apart > (BESIDE if how_far else 0.0):
         return -apart
     least = np.inf
     for first in range(2):
@@ -110,6 +113,8 @@ def _overlap(table, i, j, p_i, p_j):  # type: ignore[no-untyped-def]
                     (others[m, 0] + p_b[0] - corners[k, 0] - p_a[0]) * nx + (others[m, 1] + p_b[1] - corners[k, 1] - p_a[1]) * ny,
                 )
             least = min(least, -nearest)
+            if least <= 0 and not how_far:
+                return least
     return least
 
 
@@ -177,7 +182,7 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
             over = min(p_T[j, 2] + table.high[upper], high) - max(low, p_T[i, 2] + table.low[lower])
             if not level and over <= DEEPEST:
                 continue
-            deep = _overlap(table, upper, lower, p_T[j], p_T[i])
+            deep = _overlap(table, upper, lower, p_T[j], p_T[i], level)
             if not level:
                 if deep > DEEPEST and fault == SOUND:
                     fault, culprit = OVERLAPPING, j
@@ -360,3 +365,28 @@ def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
                     return upper, True
             aside[upper] = 0.0
     return -1, False
+
+
+@njit(cache=True)
+def weakest_each(table, shapes, p_T, pairs, order, first, margin, friction):  # type: ignore[no-untyped-def]
+    """See `weakest`, for several stacks: the rows of stack k are order[first[k]] up to order[first[k + 1]].
+
+    Returns:
+        (k,) position in its stack of what is furthest from equilibrium, or -1, and (k,) whether it rolls.
+    """
+    count = len(first) - 1
+    found, rolls = np.empty(count, np.int64), np.empty(count, np.bool_)
+    for k in range(count):
+        rows = order[first[k] : first[k + 1]]
+        position = np.full(len(shapes) + 1, -2)
+        position[GROUND] = GROUND
+        for own, row in enumerate(rows):
+            position[row] = own
+        within = np.empty_like(pairs)
+        contacts = 0
+        for lower, upper in pairs:
+            if position[lower] != -2 and position[upper] != -2:
+                within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
+                contacts += 1
+        found[k], rolls[k] = weakest(table, shapes[rows], p_T[rows], within[:contacts], margin, friction)
+    return found, rolls

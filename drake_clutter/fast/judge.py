@@ -83,12 +83,11 @@ class FastJudge:
             if standing.reason is CannotJudgeReason.UNSUPPORTED:
                 return Instability(InstabilityReason.UNSUPPORTED, standing.object)
             return standing
-        shapes, p_T, pairs, stack = standing
         members: dict[int, list[int]] = defaultdict(list)
-        for index, number in enumerate(stack.tolist()):
-            members[number].append(index)
-        for rows in members.values():
-            weakest, rolls = self._weakest(shapes, p_T, pairs, rows)
+        for row, number in enumerate(standing.stack.tolist()):
+            members[number].append(row)
+        stacks = list(members.values())
+        for weakest, rolls in self._weakest(standing, stacks):
             if weakest >= 0:
                 reason = InstabilityReason.ROLLS if rolls else InstabilityReason.UNBALANCED
                 return Instability(reason, scene.objects[weakest].name)
@@ -116,7 +115,7 @@ class FastJudge:
         standing = self._standing(scene)
         if isinstance(standing, CannotJudge):
             return standing
-        shapes, p_T, pairs, stack = standing
+        _, _, pairs, stack = standing
         taken = scene.names.index(name)
         left = [row for row in np.flatnonzero(stack == stack[taken]).tolist() if row != taken]
         fallen = []
@@ -124,7 +123,7 @@ class FastJudge:
             carried = {upper for lower, upper in pairs.tolist() if upper in left and (lower in left or lower < 0)}
             unsupported = [row for row in left if row not in carried]
             if not unsupported:
-                weakest, _ = self._weakest(shapes, p_T, pairs, left)
+                ((weakest, _),) = self._weakest(standing, [left])
                 if weakest < 0:
                     break
                 unsupported = [weakest]
@@ -221,19 +220,35 @@ class FastJudge:
             self._generation = self._shapes.generation
         return shapes, np.array([o.X_TO.translation for o in objects])
 
-    def _weakest(self, shapes: Ints, p_T: Floats, pairs: Ints, rows: list[int]) -> tuple[int, bool]:
-        """The row of the object of a stack that is furthest from equilibrium, or -1; and whether it rolls."""
-        points = np.rint(p_T[rows] / _GRID).astype(np.int64).tolist()
-        order = sorted(range(len(rows)), key=lambda k: (points[k][2], shapes[rows[k]], points[k]))
-        x0, y0, _ = points[order[0]]
-        key = tuple((int(shapes[rows[k]]), points[k][0] - x0, points[k][1] - y0, points[k][2]) for k in order)
-        if key not in self._known:
-            chosen = [rows[k] for k in order]
-            self._known[key] = equilibrium.weakest(
-                self._shapes.table, shapes[chosen], p_T[chosen], _within(pairs, chosen), self._margin, FRICTION
+    def _weakest(self, standing: "_Standing", stacks: list[list[int]]) -> list[tuple[int, bool]]:
+        """For each stack, given by its rows, the row of what is furthest from equilibrium, or -1, and whether it rolls."""
+        points, shapes = np.rint(standing.p_T / _GRID).astype(np.int64).tolist(), standing.shapes.tolist()
+        keys, orders, unknown = [], [], {}
+        for rows in stacks:
+            order = sorted(rows, key=lambda row: (points[row][2], shapes[row], points[row]))
+            x0, y0, _ = points[order[0]]
+            key = tuple([(shapes[row], points[row][0] - x0, points[row][1] - y0, points[row][2]) for row in order])
+            keys.append(key)
+            orders.append(order)
+            if key not in self._known:
+                unknown[key] = order
+        if unknown:
+            rows_of_all = np.array([row for rows in unknown.values() for row in rows])
+            first = np.cumsum([0] + [len(rows) for rows in unknown.values()])
+            arguments = (
+                self._shapes.table,
+                standing.shapes,
+                standing.p_T,
+                standing.pairs,
+                rows_of_all,
+                first,
+                self._margin,
+                FRICTION,
             )
-        weakest, rolls = self._known[key]
-        return (rows[order[weakest]] if weakest >= 0 else -1), rolls
+            found, rolls = equilibrium.weakest_each(*arguments)
+            self._known.update(zip(unknown, zip(found.tolist(), rolls.tolist(), strict=True), strict=True))
+        known = [self._known[key] for key in keys]
+        return [(rows[at] if at >= 0 else -1, rolls) for rows, (at, rolls) in zip(orders, known, strict=True)]
 
 
 def _within(pairs: Ints, rows: list[int]) -> Ints:
