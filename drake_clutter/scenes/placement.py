@@ -66,12 +66,12 @@ class _Turned(NamedTuple):
     """A picked object as it would be put down.
 
     Attributes:
-        R_TO: (3, 3).
+        quaternion: (4,) of R_TO; the very same if it is not turned.
         lowest, height: m, of its lowest point below its origin (negative), and of the whole object.
         footprint: (k, 2) cells, relative to the one under its origin, that must be free; the outermost first.
     """
 
-    R_TO: NDArray[np.float64]
+    quaternion: tuple[float, float, float, float]
     lowest: float
     height: float
     footprint: NDArray[np.int64]
@@ -90,7 +90,8 @@ def _turned(object_class: ObjectClass, quaternion: tuple[float, float, float, fl
     # Half a cell more: no part of the footprint lies in a cell that is not looked at.
     covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL / 2]
     outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
-    return _Turned(R_TO, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first])
+    turned = quaternion if yaw == 0 else Pose.of(R_TO, (0.0, 0.0, 0.0)).quaternion
+    return _Turned(turned, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first])
 
 
 @lru_cache(maxsize=16)
@@ -212,5 +213,5 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
             # In the order of the cells, so that the draw does not depend on how they were sorted.
             best = best[np.lexsort(cells[best].T[::-1])]
             x, y = centres[cells[best[rng.integers(len(best))]]]
-            return Pose.of(turned.R_TO, (x, y, floor + config.release_height - turned.lowest))
+            return Pose((float(x), float(y), floor + config.release_height - turned.lowest), turned.quaternion)
     return None
