@@ -64,6 +64,14 @@ MOVES = 1000
 """Random moves, in the stable scenes of the first batch."""
 
 
+@dataclass(frozen=True)
+class Pool:
+    """Who works: processes here, or on the Ray cluster at an address."""
+
+    workers: int = 1
+    ray: str | None = None
+
+
 class DrakeVerdicts:
     """Generates a scene of a batch and settles it; a worker for the runner."""
 
@@ -118,7 +126,7 @@ class _Factory:
 
 
 def _records(
-    path: Path, head: dict[str, Any], make_worker: Callable[[], Callable[[Any], Any]], items: Sequence[Any], workers: int
+    path: Path, head: dict[str, Any], make_worker: Callable[[], Callable[[Any], Any]], items: Sequence[Any], pool: Pool
 ) -> Iterator[dict[str, Any]]:
     """The head with the commit at which it was begun, then a record per item; what the file lacks is made and added."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -129,17 +137,17 @@ def _records(
         raise InputError(f"{path}: holds the results of another config; give another folder")
     yield from lines[: 1 + len(items)]
     with path.open("a") as file:
-        for record in map_ordered(make_worker, items[len(lines) - 1 :], workers=workers):
+        for record in map_ordered(make_worker, items[len(lines) - 1 :], workers=pool.workers, ray_address=pool.ray):
             file.write(json.dumps(record) + "\n")
             file.flush()
             yield record
 
 
-def drake_verdicts(batch: Batch, count: int, folder: Path, workers: int) -> Iterator[dict[str, Any]]:
+def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:
     """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch."""
     path = folder / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
     head = asdict(batch) | {"config": config_yaml(config_of(batch))}
-    yield from _records(path, head, _Factory(batch), range(count), workers)
+    yield from _records(path, head, _Factory(batch), range(count), pool)
 
 
 @dataclass(frozen=True)
@@ -195,12 +203,12 @@ def move_rng(item: RandomMove) -> np.random.Generator:
     return item_rng(item.batch.seed, item.index, 3, item.draw)
 
 
-def drake_moves(batch: Batch, scenes: int, count: int, folder: Path, workers: int) -> Iterator[dict[str, Any]]:
+def drake_moves(batch: Batch, scenes: int, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:
     """A head, then `count` random moves, spread over the batch's first `scenes` scenes that Drake calls stable."""
-    stable = [r for r in list(drake_verdicts(batch, scenes, folder, workers))[1:] if "settled" in r]
+    stable = [r for r in list(drake_verdicts(batch, scenes, folder, pool))[1:] if "settled" in r]
     items = [RandomMove(batch, stable[k % len(stable)]["index"], k // len(stable), stable[k % len(stable)]) for k in range(count)]
     head = asdict(batch) | {"config": config_yaml(config_of(batch)), "scenes": scenes}
-    yield from _records(folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl", head, DrakeMoves, items, workers)
+    yield from _records(folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl", head, DrakeMoves, items, pool)
 
 
 def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
@@ -213,15 +221,16 @@ def hidden(record: dict[str, Any], hidden_below: float) -> tuple[str, ...]:
     return tuple(name for name, v in record["settled"].items() if v[0] < hidden_below)
 
 
-def main(folder: Path, workers: int = 2) -> None:
+def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:
     """Collects what `judges.py` needs, about an hour on two cores; a run that was stopped goes on."""
+    pool = Pool(workers, ray)
     for batch, count in BATCHES.items():
         what = f"{batch.objects}, {batch.nodes} nodes, {batch.variant}"
-        records = drake_verdicts(batch, count, folder, workers)
+        records = drake_verdicts(batch, count, folder, pool)
         for _ in track(records, what, total=count + 1, console=Console(stderr=True)):
             pass
     (batch, scenes), *_ = BATCHES.items()
-    for _ in track(drake_moves(batch, scenes, MOVES, folder, workers), "moves", total=MOVES + 1, console=Console(stderr=True)):
+    for _ in track(drake_moves(batch, scenes, MOVES, folder, pool), "moves", total=MOVES + 1, console=Console(stderr=True)):
         pass
 
 

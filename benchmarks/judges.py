@@ -18,6 +18,7 @@ from drake_verdicts import (
     BATCHES,
     MOVES,
     Batch,
+    Pool,
     RandomMove,
     config_of,
     drake_moves,
@@ -227,13 +228,12 @@ def main(
     folder: Annotated[Path, typer.Argument(help="What drake_verdicts.py wrote.")],
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
     picture: Annotated[Path | None, typer.Option(help="PNG of stacks that the judges see differently.")] = None,
-    workers: int = 2,
 ) -> None:
     """Prints and writes the tables."""
     disagreements: list[Disagreement] = []
-    sides = {batch: list(drake_verdicts(batch, count, folder, workers)) for batch, count in BATCHES.items()}
+    sides = {batch: list(drake_verdicts(batch, count, folder, Pool())) for batch, count in BATCHES.items()}
     (first, scenes), *_ = BATCHES.items()
-    moves = list(drake_moves(first, scenes, MOVES, folder, workers))
+    moves = list(drake_moves(first, scenes, MOVES, folder, Pool()))
     agreement, details, itself = [], {}, []
     for batch, (head, *records) in sides.items():
         key = {"objects": batch.objects, "nodes": batch.nodes, "seed": batch.seed, "drake_commit": head["commit"]}
