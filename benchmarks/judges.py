@@ -4,6 +4,7 @@ python benchmarks/drake_verdicts.py FOLDER --workers 2     # Drake's side, about
 python benchmarks/judges.py FOLDER --out benchmarks/results/judges.json --picture docs/images/judges_disagree.png
 """
 
+import itertools
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -41,6 +42,8 @@ from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Move, MoveResult
 
+MARGINS = (0.0005, 0.001, 0.0015, 0.00205, 0.0025, 0.003, 0.004)
+FRICTIONS = (0.0, 0.3, 0.5)
 SHOWN = 8
 """Disagreements in the picture."""
 
@@ -200,6 +203,20 @@ def compare_moves(batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[
     }
 
 
+def sensitivity(batch: Batch, records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What other margins and coefficients of friction would have said of the same scenes."""
+    scenes = [laid_out(batch, record["index"])[0] for record in records]
+    rows = []
+    for margin, friction in itertools.product(MARGINS, FRICTIONS):
+        judge, confusion = FastJudge(config_of(batch), margin, friction), Confusion()
+        for scene, record in zip(scenes, records, strict=True):
+            confusion.pairs[said(judge.stability(scene)), "stable" if "settled" in record else "falls"] += 1
+        row = confusion.row()
+        rates = {key: row[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}
+        rows.append({"margin_mm": 1000 * margin, "friction": friction} | rates)
+    return rows
+
+
 def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
     """A picture of stacks that the judges see differently, at most one of each kind and shape first."""
     seen: set[Any] = set()
@@ -257,6 +274,7 @@ def main(
         "scenes": agreement,
         "moves": of_moves,
         "drake_itself": itself,
+        "sensitivity": sensitivity(first, sides[first][1:]),
         "details": details,
     }
     if out is not None:

@@ -31,14 +31,14 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.config import CameraConfig, ClutterConfig, config_yaml
+from drake_clutter.config import ClutterConfig, config_yaml
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import write_json
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import Pose, Scene, jittered, tilt_between
-from drake_clutter.scenes.seams import CannotJudge, Verdict
+from drake_clutter.scenes.seams import CannotJudge
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
@@ -52,27 +52,27 @@ SLOW = 6
 """Scenes of each size that Drake and PyBullet judge; and the scenes that Drake judges beforehand, not timed."""
 BUDGET = 2000
 """Moves that the search may try."""
-HIDDEN = {"1": (1, 1), "2": (2, 2), "3": (3, 3), "4-5": (4, 5), "6+": (6, NEVER)}
+HIDDEN = ("0", "1", "2", "3", "4-5", "4-5", "6+")
+"""Row of the search's table by hidden objects; the last for more."""
 FAST, WARM, DRAKE, ACCURATE, BULLET = "FastJudge, cold", "FastJudge, warm", "DrakeJudge", "DrakeJudge, accurate", "PyBullet"
 RAYS, VTK, TINY = "ray caster", "Drake VTK labels", "TinyRenderer"
 RAY_SHARES, VTK_SHARES = "shares, ray caster", "shares, Drake VTK"
 NOTES = {
     "core": "one process on one core; times are of the wall clock",
-    "scenes": f"RG's of {NODES} nodes, ycb7, as `generate` draws them; every judge and eye gets the same random offsets",
+    "scenes": f"RG's of {NODES} nodes, ycb7, as `generate` draws them; every judge gets the same random offsets",
     "growth": f"half of the scenes of each size stable, half not, by the fast judge; the first {SLOW} for Drake and PyBullet; "
     "30 objects may be one more or less, 60 two",
     FAST: "stability and visibility; its memory of stacks is emptied before every scene, shape table and compiled code are kept",
     WARM: "asked again about scenes that it has judged",
     DRAKE: "as by default, stops when all is calm; one judge for all scenes, which remembers objects that stand on their own; "
-    f"the first {SLOW} scenes were judged once before",
+    f"the first {SLOW} scenes were judged once before; its engine is built anew when a scene has more of a class than any before",
     ACCURATE: "likewise, but without the early stop: what does not fall is simulated for 2 s",
     BULLET: "480 steps of 1/240 s in a new world for every scene, friction 0.5; loading the exported models is not counted but "
     "given as load_mean_ms, export not at all; Drake's limits at the end; stability only",
     "agreement": "with the accurate form. agrees: stable or not; agrees_on_hidden: of the scenes that both call stable, those "
     "with the same objects hidden; unchanged: both",
     "eyes": "640 x 480, shares: the visible shares of all objects. Every scene was drawn once before with the same engine, not "
-    "timed; in PyBullet, without shadows, by a frame in the same world. same_pixels: of the pixels on which an eye or Drake "
-    "sees an object, those on which they see the same",
+    "timed; in PyBullet, without shadows, by a frame in the same world",
     "repeats": f"FastJudge and ray caster: a scene's time is the median of {REPEATS} rounds; all else is timed once",
     "search": f"budget {BUDGET} moves; the judge's memory of stacks is emptied before every scene",
 }
@@ -85,10 +85,9 @@ AIMS = {
 }
 
 T = TypeVar("T")
-Labels = NDArray[np.int16]
 Row = dict[str, Any]
 Found = tuple[bool | None, tuple[str, ...] | None]
-"""Whether a scene is stable, and what it hides; None: the judge cannot say."""
+"""Whether a scene is stable, and what it hides; None: the judge does not say."""
 
 
 @dataclass(frozen=True)
@@ -147,36 +146,33 @@ def timed(ask: Callable[..., T], *arguments: Any) -> tuple[float, T]:
 
 def asked(
     what: str,
-    ask: Callable[[Case, np.random.Generator], T],
+    ask: Callable[[Scene, np.random.Generator], T],
     cases: Sequence[Case],
     warm_up: int = NEVER,
     repeats: int = 1,
     before: Callable[[], None] = lambda: None,
 ) -> tuple[list[float], list[T]]:
-    """Seconds and answer for each case; the first `warm_up` were asked once beforehand. `before` each, something not timed."""
+    """Seconds and answer by scene; not timed: asking about the first `warm_up` beforehand, and `before`, called before each."""
     for case in cases[:warm_up]:
-        ask(case, deepcopy(case.after))
+        ask(case.scene, deepcopy(case.after))
     seconds, answers = [], []
-    for case in track([*cases] * repeats, what, console=Console(stderr=True)):
+    # Drawing a progress bar would disturb what is over in a moment.
+    for case in track([*cases] * repeats, what, console=Console(stderr=True), disable=repeats > 1):
+        rng = deepcopy(case.after)
         before()
-        took, answer = timed(ask, case, deepcopy(case.after))
+        took, answer = timed(ask, case.scene, rng)
         seconds.append(took)
         answers.append(answer)
     return np.median(np.reshape(seconds, (repeats, -1)), axis=0).tolist(), answers[: len(cases)]
 
 
-def found_by(verdict: Verdict | CannotJudge) -> Found:
-    """What is compared of a verdict."""
-    return (None, None) if isinstance(verdict, CannotJudge) else (verdict.stable, verdict.hidden)
-
-
-def bullet_label(camera: CameraConfig) -> Labels:
-    """What the overhead camera sees in PyBullet, labelled as in `Images`."""
+def bullet_label() -> Any:
+    """The body that the overhead camera sees in each pixel of PyBullet's world."""
+    camera = CONFIG.camera
     view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
     projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
-    size, engine = (camera.width, camera.height), pybullet.ER_TINY_RENDERER
-    *_, bodies = pybullet.getCameraImage(*size, view, projection, shadow=0, renderer=engine)
-    return np.maximum(np.reshape(bodies, size[::-1]) - 1, -1).astype(np.int16)  # body 0 is the tray
+    engine = pybullet.ER_TINY_RENDERER
+    return pybullet.getCameraImage(camera.width, camera.height, view, projection, shadow=0, renderer=engine)[4]
 
 
 def bullet_load(path: Path) -> None:
@@ -186,12 +182,6 @@ def bullet_load(path: Path) -> None:
         pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(0.5))  # those of the two that touch are multiplied
     pybullet.setGravity(0, 0, -9.81)
     pybullet.setTimeStep(1 / 240)
-
-
-def bullet_steps(count: int) -> None:
-    """Simulates."""
-    for _ in range(count):
-        pybullet.stepSimulation()
 
 
 def bullet_poses(scene: Scene) -> list[Pose]:
@@ -204,17 +194,17 @@ def bullet_poses(scene: Scene) -> list[Pose]:
     return poses
 
 
-def in_bullet(case: Case) -> tuple[float, float, float, Labels, bool]:
-    """PyBullet's seconds for loading, a frame and 2 s of stepping; the frame, and whether everything stayed."""
+def in_bullet(case: Case) -> tuple[float, float, float, Found]:
+    """PyBullet's seconds for loading a scene, a frame and 2 s of stepping; and its verdict."""
     scene, limits = case.start, CONFIG.settle
     with tempfile.TemporaryDirectory() as folder:
         load, _ = timed(bullet_load, export_scene(scene, ExportFormat.SDF, Path(folder)))
-        bullet_label(CONFIG.camera)
-        frame, labels = timed(bullet_label, CONFIG.camera)
+        bullet_label()
+        frame, _ = timed(bullet_label)
         first = bullet_poses(scene)
-        steps, _ = timed(bullet_steps, 360)
+        steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(360)])
         late = bullet_poses(scene)
-        more_steps, _ = timed(bullet_steps, 120)
+        more_steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(120)])
         stayed = all(
             max(abs(X.p[:2])) <= scene.tray_side / 2
             and X.p[2] >= 0
@@ -224,7 +214,7 @@ def in_bullet(case: Case) -> tuple[float, float, float, Labels, bool]:
             for o, X, X_first, X_late in zip(scene.objects, bullet_poses(scene), first, late, strict=True)
         )
         pybullet.disconnect()
-    return load, frame, steps + more_steps, labels, stayed
+    return load, frame, steps + more_steps, (stayed, None)
 
 
 def figures(seconds: Sequence[float]) -> Row:
@@ -242,19 +232,14 @@ def judge_row(seconds: Sequence[float], found: Sequence[Found], truth: Sequence[
     if truth:
         pairs = list(zip(found, truth, strict=True))
         row["agrees"] = float(np.mean([a[0] == b[0] for a, b in pairs]))
-        same_hidden = [a[1] == b[1] for a, b in pairs if a[0] and b[0] and a[1] is not None]
-        row["agrees_on_hidden"] = float(np.mean(same_hidden)) if same_hidden else None
-        row["unchanged"] = float(np.mean([a == b for a, b in pairs]))
+        same_hidden = [a[1] == b[1] for a, b in pairs if a[0] and b[0]]
+        if found[0][1] is not None:
+            row["agrees_on_hidden"] = float(np.mean(same_hidden)) if same_hidden else None
+            row["unchanged"] = float(np.mean([a == b for a, b in pairs]))
     return row
 
 
-def eye_row(seconds: Sequence[float], labels: Sequence[Labels], truth: Sequence[Labels]) -> Row:
-    """Figures of an eye, and how many pixels it sees like the truth."""
-    same = [np.mean((a == b)[(a >= 0) | (b >= 0)]) for a, b in zip(labels, truth, strict=False)]
-    return figures(seconds) | {"same_pixels": float(np.mean(same))}
-
-
-def ray_labels(rays: RayCaster, scene: Scene) -> Labels:
+def ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
     """The whole label image, by one cast."""
     _, rectangle = rays._cast(scene.objects, None)
     image = np.full(rays._hit.shape, -1, np.int16)
@@ -267,50 +252,52 @@ def measure(what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, Fa
     found: dict[str, tuple[list[float], list[Found]]] = {}
     for name, judge in judges.items():
         if isinstance(judge, FastJudge):
-            options = (cases, NEVER, REPEATS, judge._known.clear if name == FAST else lambda: None)
+            forget = judge._known.clear if name == FAST else lambda: None
+            seconds, verdicts = asked(f"{what}: {name}", judge.judge, cases, repeats=REPEATS, before=forget)
         else:
-            options = (cases[:slow], SLOW, 1, lambda: None)
-        seconds, verdicts = asked(f"{what}: {name}", lambda case, rng, judge=judge: judge.judge(case.scene, rng), *options)
-        found[name] = seconds, [found_by(verdict) for verdict in verdicts]
+            seconds, verdicts = asked(f"{what}: {name}", judge.judge, cases[:slow], SLOW)
+        found[name] = seconds, [(None, None) if isinstance(v, CannotJudge) else (v.stable, v.hidden) for v in verdicts]
     progress = track(cases[:slow], f"{what}: {BULLET}", console=Console(stderr=True))
-    loads, frames, steps, labels, stayed = zip(*map(in_bullet, progress), strict=True)
-    found[BULLET] = [*steps], [(held, None) for held in stayed]
+    loads, frames, steps, in_bullet_found = zip(*map(in_bullet, progress), strict=True)
+    found[BULLET] = [*steps], [*in_bullet_found]
     truth = found[ACCURATE][1] if ACCURATE in found else None
     rows = {name: judge_row(*pair, truth) for name, pair in found.items()}
     rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
 
     rays, camera = RayCaster(CONFIG.camera), OverheadCamera(CONFIG.camera)
-    seconds, images = asked(f"{what}: {VTK}", lambda case, _: camera.label(case.start).astype(np.int16), cases)
-    eyes = {VTK: figures(seconds), TINY: eye_row(frames, labels, images)}
-    eyes[RAYS] = eye_row(*asked(f"{what}: {RAYS}", lambda case, _: ray_labels(rays, case.start), cases, repeats=REPEATS), images)
-    eyes[VTK_SHARES] = figures(asked(f"{what}: {VTK_SHARES}", lambda case, _: camera.visible_shares(case.start), cases)[0])
-    shares = asked(f"{what}: {RAY_SHARES}", lambda case, _: rays.visible_shares(case.start.objects), cases, repeats=REPEATS)
-    eyes[RAY_SHARES] = figures(shares[0])
-    return {"judges": rows, "eyes": eyes}
+    eyes: dict[str, tuple[Callable[[Scene, np.random.Generator], Any], int]] = {
+        RAYS: (lambda scene, _: ray_labels(rays, scene), REPEATS),
+        VTK: (lambda scene, _: camera.label(scene), 1),
+        RAY_SHARES: (lambda scene, _: rays.visible_shares(scene.objects), REPEATS),
+        VTK_SHARES: (lambda scene, _: camera.visible_shares(scene), 1),
+    }
+    seen = {TINY: figures(frames)}
+    for name, (look, repeats) in eyes.items():
+        seen[name] = figures(asked(f"{what}: {name}", look, cases, repeats=repeats)[0])
+    return {"judges": rows, "eyes": seen}
 
 
 def searched(cases: Sequence[Case]) -> dict[str, Row]:
     """The search on the scenes that are stable and hide something, as laid out, by how much they hide."""
     judge = FastJudge(CONFIG)
     search = FullKnowledgeSearch(CONFIG, judge)
-    hiding: list[tuple[int, Case]] = []
+    parts: dict[str, list[Case]] = {name: [] for name in HIDDEN}
     for case in cases:
-        shares = judge.rays.visible_shares(case.scene.objects).values()
-        hidden = sum(share < CONFIG.camera.hidden_below for share in shares)
-        if hidden and judge.stability(case.scene) is None:
-            hiding.append((hidden, case))
-    rows = {}
-    for name, (least, most) in HIDDEN.items():
-        part = [case for hidden, case in hiding if least <= hidden <= most]
-        rows[name] = {"count": len(part)}
+        if judge.stability(case.scene) is None:
+            shares = judge.rays.visible_shares(case.scene.objects).values()
+            hidden = sum(share < CONFIG.camera.hidden_below for share in shares)
+            parts[HIDDEN[min(hidden, len(HIDDEN) - 1)]].append(case)
+    del parts["0"]
+    rows: dict[str, Row] = {name: {"count": len(part)} for name, part in parts.items()}
+    for name, part in parts.items():
         if part:
             search.solve(part[0].scene, budget=20)
-            options = (part, 0, 1, judge._known.clear)
-            seconds, solutions = asked(f"{name} hidden: search", lambda case, _: search.solve(case.scene, 0, BUDGET), *options)
-            rows[name] |= {"median_s": float(np.median(seconds)), "max_s": max(seconds)}
+            took, solutions = asked(
+                f"{name} hidden", lambda scene, _: search.solve(scene, 0, BUDGET), part, 0, before=judge._known.clear
+            )
+            rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
             rows[name]["median_moves_tried"] = float(np.median([solution.moves_tried for solution in solutions]))
-            for answer in Answer:
-                rows[name][answer.value] = float(np.mean([solution.answer is answer for solution in solutions]))
+            rows[name] |= {answer.value: float(np.mean([s.answer is answer for s in solutions])) for answer in Answer}
     return rows
 
 
@@ -330,7 +317,7 @@ def show(result: Row, console: Console) -> None:
     times = {"median": "median_ms", "mean": "mean_ms", "95 %": "p95_ms", "per s": "per_second"}
     agreement = {"stable": "stable_share", "agrees": "agrees", "on hidden": "agrees_on_hidden"}
     console.print(table("ms per scene", result["judges"], times | {"of stable": "stable_median_ms"} | agreement))
-    console.print(table("ms per frame", result["eyes"], times | {"same pixels": "same_pixels"}))
+    console.print(table("ms per frame", result["eyes"], times))
     grown = {}
     for part in ("judges", "eyes"):
         for name in result["growth"][0][part]:
@@ -347,13 +334,13 @@ def draw_growth(growth: Sequence[Row], path: Path) -> None:
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
     objects = [row["objects"] for row in growth]
     figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained", sharey=True)
-    parts = (("judges", (DRAKE, BULLET, FAST), "judged"), ("eyes", (TINY, VTK, RAYS), "frame"))
+    parts = (("judges", (BULLET, DRAKE, FAST), "scene judged"), ("eyes", (TINY, VTK, RAYS), "frame"))
     for panel, (part, names, what) in zip(panels, parts, strict=True):
-        for name, marker in zip(names, "Dso", strict=True):
+        for name, marker in zip(names, "sDo", strict=True):
             panel.loglog(objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name)
         panel.set_xticks(objects, objects)
         panel.minorticks_off()
-        panel.set(xlabel="objects in the scene", ylabel=f"ms per scene {what}" if part == "judges" else f"ms per {what}")
+        panel.set(xlabel="objects in the scene", ylabel=f"mean ms per {what}")
         panel.tick_params(labelleft=True)
         panel.grid(alpha=0.4)
         panel.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, columnspacing=0.8, handletextpad=0.3, fontsize=16)
@@ -379,6 +366,8 @@ def main(
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what PyBullet prints, see docs/export.md
     if hasattr(os, "sched_setaffinity"):  # renderers start threads
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    for path in filter(None, (out, picture)):
+        path.parent.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     packages = {name: version(name) for name in ("drake", "pybullet", "numba", "numpy")}
     result: Row = {"config": config_yaml(CONFIG), "seed": seed, "count": count, "nodes": NODES, "commit": commit(), "cpu": cpu()}
@@ -390,7 +379,7 @@ def main(
     for index in range(count):
         rng = item_rng(seed, index)
         cases.append(Case(rg.lay_out(rng)[0], rng))
-    judges = {FAST: fast, WARM: fast, DRAKE: drake}
+    judges: dict[str, FastJudge | DrakeJudge] = {FAST: fast, WARM: fast, DRAKE: drake}
     result |= {"objects_mean": float(np.mean([len(case.scene.objects) for case in cases]))}
     result |= measure(f"{NODES} nodes", cases, count, judges | {ACCURATE: accurate})
     result["growth"] = []

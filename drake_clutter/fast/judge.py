@@ -54,13 +54,20 @@ class FastJudge:
     remembered by stack, wherever it stands on the tray: after a change, only the stacks that changed are judged again.
     """
 
-    def __init__(self, config: ClutterConfig) -> None:
+    def __init__(self, config: ClutterConfig, margin: float | None = None, friction: float = FRICTION) -> None:
+        """Makes a judge.
+
+        Args:
+            config: the world.
+            margin: m, by which contacts are shrunk; None: twice the radius of the random offsets, and rounding.
+            friction: coefficient that is relied on.
+        """
         self._config = config
+        self._margin, self._friction = 2 * config.settle.jitter + _ROUNDING if margin is None else margin, friction
         self._shapes = Shapes()
         self.rays = RayCaster(config.camera, self._shapes)
         self._known: dict[_StackKey, tuple[int, bool]] = {}
         self._generation = 0
-        self._margin = 2 * config.settle.jitter + _ROUNDING
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
         """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
@@ -200,7 +207,7 @@ class FastJudge:
             np.array(contacts, dtype=np.int64).reshape(-1, 2),
             np.full(len(rest), self._margin),
             np.zeros((len(rest), 2)),
-            FRICTION,
+            self._friction,
             np.array(loads).reshape(-1, 4),
         )
         return bool(residuals.max() == 0)
@@ -243,7 +250,7 @@ class FastJudge:
                 rows_of_all,
                 first,
                 self._margin,
-                FRICTION,
+                self._friction,
             )
             found, rolls = equilibrium.weakest_each(*arguments)
             self._known.update(zip(unknown, zip(found.tolist(), rolls.tolist(), strict=True), strict=True))
