@@ -141,7 +141,7 @@ class FastJudge:
     def margins(self, scene: Scene) -> dict[str, float] | CannotJudge:
         """How much narrower the contacts under each object may become before its stack loses balance, m, by name.
 
-        Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm.
+        Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm.
         """
         standing = self._standing(scene)
         if isinstance(standing, CannotJudge):
