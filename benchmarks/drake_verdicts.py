@@ -55,9 +55,9 @@ BATCHES = {
     Batch("ycb7", 15, 0): 300,
     Batch("ycb7", 20, 0): 300,
     Batch("pantry14", 25, 0): 300,
-    Batch("ycb7", 25, 0, "other offsets"): 150,
-    Batch("ycb7", 25, 0, "no early stop"): 100,
-    Batch("ycb7", 25, 0, "1 ms steps"): 100,
+    Batch("ycb7", 25, 0, "other offsets"): 100,
+    Batch("ycb7", 25, 0, "no early stop"): 60,
+    Batch("ycb7", 25, 0, "1 ms steps"): 60,
 }
 """How many scenes of each batch the published experiment asks about."""
 MOVES = 1000
@@ -225,12 +225,17 @@ def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:
     """Collects what `judges.py` needs, about an hour on two cores; a run that was stopped goes on."""
     pool = Pool(workers, ray)
     for batch, count in BATCHES.items():
-        what = f"{batch.objects}, {batch.nodes} nodes, {batch.variant}"
-        records = drake_verdicts(batch, count, folder, pool)
-        for _ in track(records, what, total=count + 1, console=Console(stderr=True)):
-            pass
+        if batch.variant == "default":
+            show(drake_verdicts(batch, count, folder, pool), f"{batch.objects}, {batch.nodes} nodes", count)
     (batch, scenes), *_ = BATCHES.items()
-    for _ in track(drake_moves(batch, scenes, MOVES, folder, pool), "moves", total=MOVES + 1, console=Console(stderr=True)):
+    show(drake_moves(batch, scenes, MOVES, folder, pool), "moves", MOVES)
+    for batch, count in BATCHES.items():
+        show(drake_verdicts(batch, count, folder, pool), batch.variant, count)
+
+
+def show(records: Iterator[dict[str, Any]], what: str, count: int) -> None:
+    """Takes the records, with a progress bar."""
+    for _ in track(records, what, total=count + 1, console=Console(stderr=True)):
         pass
 
 
