@@ -235,7 +235,7 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
         x, y, _ = np.mean([o.X_TO.translation for o in item.objects.objects], axis=0)
         centred = tuple(replace(o, X_TO=o.X_TO.moved((-x, -y, 0.0))) for o in item.objects.objects)
         picture = camera.oblique(replace(item.objects, objects=centred, graph=None))
-        axis.imshow(picture[60:600, 210:750])
+        axis.imshow(picture[110:510, 290:690])
         axis.set_title(f"fast: {item.fast}\nDrake: {item.drake}", fontsize=13)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)

@@ -68,7 +68,7 @@ NOTES = {
     f"the first {SLOW} scenes were judged once before; its engine is built anew when a scene has more of a class than any before",
     ACCURATE: "likewise, but without the early stop: what does not fall is simulated for 2 s",
     BULLET: "480 steps of 1/240 s in a new world for every scene, friction 0.5; loading the exported models is not counted but "
-    "given as load_mean_ms, export not at all; Drake's limits at the end; stability only",
+    "given as load_mean_ms, export not at all; Drake's limits at the end; stability only. Lying markers roll away in it",
     "agreement": "with the accurate form. agrees: stable or not; agrees_on_hidden: of the scenes that both call stable, those "
     "with the same objects hidden; unchanged: both",
     "eyes": "640 x 480, shares: the visible shares of all objects. Every scene was drawn once before with the same engine, not "
