@@ -36,13 +36,15 @@ def _clip(polygon, count, x, y, nx, ny, room):  # type: ignore[no-untyped-def]
         here = (polygon[k, 0] - x) * nx + (polygon[k, 1] - y) * ny - room
         there = (polygon[after, 0] - x) * nx + (polygon[after, 1] - y) * ny - room
         if here <= 0 and found < len(kept):
-            kept[found] = polygon[k]
+            kept[found, 0], kept[found, 1] = polygon[k, 0], polygon[k, 1]
             found += 1
         if (here < 0 < there or there < 0 < here) and found < len(kept):
             share = here / (here - there)
-            kept[found] = polygon[k] + share * (polygon[after] - polygon[k])
+            for axis in range(2):
+                kept[found, axis] = polygon[k, axis] + share * (polygon[after, axis] - polygon[k, axis])
             found += 1
-    polygon[:found] = kept[:found]
+    for k in range(found):
+        polygon[k, 0], polygon[k, 1] = kept[k, 0], kept[k, 1]
     return found
 
 
@@ -189,7 +191,10 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
                 continue
             beside |= deep > -BESIDE
             above |= deep > 0
-            if deep > 0 and len(contact_polygon(table, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
+            if deep <= 0:
+                continue
+            whole = table.flat[upper] and table.flat[lower]  # what overlaps seen from above is in contact
+            if whole or len(contact_polygon(table, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
                 supported = True
@@ -299,7 +304,8 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
         polygon = contact_polygon(table, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper])
         for k in range(len(polygon)):
-            at[count, :2], at[count, 2] = polygon[k], p_T[upper, 2] + table.low[shapes[upper]]
+            at[count, 0], at[count, 1] = polygon[k, 0], polygon[k, 1]
+            at[count, 2] = p_T[upper, 2] + table.low[shapes[upper]]
             ends[count, 0], ends[count, 1] = upper, lower
             count += 1
     total = 0.0
@@ -340,6 +346,50 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
 
 
 @njit(cache=True)
+def _holds(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
+    """Whether a point lies in a convex polygon, moved by p, by at least the margin."""
+    for k in range(count):
+        after = (k + 1) % count
+        ex, ey = corners[after, 0] - corners[k, 0], corners[after, 1] - corners[k, 1]
+        across = ex * (y - p[1] - corners[k, 1]) - ey * (x - p[0] - corners[k, 0])
+        if across < margin * np.hypot(ex, ey):
+            return False
+    return count > 2
+
+
+@njit(cache=True)
+def _stands_one_on_one(table, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
+    """Whether a stack stands in which no object has more than one contact below: then loads simply add up from the top.
+
+    False also if there is such an object, or a cylinder that carries: then it takes a solver to know.
+    """
+    n = len(shapes)
+    below = np.full(n, -2)
+    for lower, upper in pairs:
+        if below[upper] != -2 or (lower >= 0 and table.rolls[shapes[lower]]):
+            return False
+        below[upper] = lower
+    force, moment = np.empty(n), np.empty((n, 2))  # of the object and all that it carries
+    for i in range(n):
+        force[i] = table.mass[shapes[i]]
+        for axis in range(2):
+            moment[i, axis] = force[i] * (p_T[i, axis] + table.com[shapes[i], axis])
+    for i in np.argsort(p_T[:, 2])[::-1]:
+        x, y = moment[i, 0] / force[i], moment[i, 1] / force[i]
+        shape, lower = shapes[i], below[i]
+        if not _holds(table.bottom[shape], table.bottom_count[shape], p_T[i], x, y, margin):
+            return False
+        if lower >= 0:
+            carrier = shapes[lower]
+            if not _holds(table.top[carrier], table.top_count[carrier], p_T[lower], x, y, margin):
+                return False
+            force[lower] += force[i]
+            moment[lower, 0] += moment[i, 0]
+            moment[lower, 1] += moment[i, 1]
+    return True
+
+
+@njit(cache=True)
 def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
     """The object of a stack that is furthest from equilibrium, and whether it rolls; -1 if the stack stands.
 
@@ -347,6 +397,8 @@ def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
     bridges them. All contacts are shrunk by the margin (m). The line along which a cylinder carries has no width to shrink:
     instead, what lies on one must also be held with its centre of mass moved by the margin to either side of the line.
     """
+    if _stands_one_on_one(table, shapes, p_T, pairs, margin):
+        return -1, False
     n = len(shapes)
     margins, aside = np.full(n, margin), np.zeros((n, 2))
     rest = residuals(table, shapes, p_T, pairs, margins, aside, 0.0, NO_LOADS)

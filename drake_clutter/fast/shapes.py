@@ -168,6 +168,7 @@ class Table(NamedTuple):
     Attributes:
         fault, rolls, com, low, high: (N, ...) see `Posed`.
         mass: (N,) kg.
+        flat: (N,) whether bottom and top are as large as the footprint.
         reach: (N,) m, radius of the circle about the object's origin that holds its footprint.
         bottom, top, footprint: (N, C, 2) m, corners.
         bottom_count, top_count, footprint_count: (N,) corners in use.
@@ -183,6 +184,7 @@ class Table(NamedTuple):
     low: Floats
     high: Floats
     mass: Floats
+    flat: NDArray[np.bool_]
     reach: Floats
     bottom: Floats
     bottom_count: Ints
@@ -207,6 +209,7 @@ def _room(rows: int, faces: int, corners: int) -> Table:
         low=np.zeros(rows),
         high=np.zeros(rows),
         mass=np.zeros(rows),
+        flat=np.zeros(rows, np.bool_),
         reach=np.zeros(rows),
         bottom=np.zeros((rows, RIM_CORNERS, 2)),
         bottom_count=whole(rows),
@@ -265,6 +268,7 @@ class Shapes:
         table = self.table
         table.fault[row], table.rolls[row], table.com[row] = shape.fault, shape.rolls, shape.com
         table.low[row], table.high[row], table.mass[row] = shape.low, shape.high, scene_object.object_class.mass
+        table.flat[row] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
         table.reach[row] = np.linalg.norm(shape.footprint, axis=1).max()
         for polygon, counts, corners in (
             (table.bottom, table.bottom_count, shape.bottom),

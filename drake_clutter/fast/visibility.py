@@ -29,12 +29,13 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
     height, width = hit.shape
     middle_u, middle_v = width / 2 - 1, height / 2 - 1
     u, v = np.empty(64), np.empty(64)
+    begin, end = np.empty(height, np.int64), np.empty(height, np.int64)  # columns of a face, row by row
     rays = 0
     for face in range(table.first_face[shape], table.first_face[shape + 1]):
         first, last = table.first_corner[face], table.first_corner[face + 1]
         nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
-        x, y, z = table.corner[first] + p_TO
-        k = nx * x + ny * y + nz * (z - altitude)
+        corner = table.corner[first]
+        k = nx * (corner[0] + p_TO[0]) + ny * (corner[1] + p_TO[1]) + nz * (corner[2] + p_TO[2] - altitude)
         if k > -1e-9:
             continue  # turned away from the camera
         count = last - first
@@ -49,29 +50,30 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
         # Inverse distance: its slope along a row and down a column, and its value at pixel (0, 0).
         along, down = nx / focal_length / k, -ny / focal_length / k
         start = -nz / k - along * middle_u - down * middle_v
-        for row in range(max(0, math.ceil(top)), min(height - 1, math.floor(bottom)) + 1):
-            left, right = np.inf, -np.inf
-            for c in range(count):
-                d = c + 1 if c + 1 < count else 0
-                # The same way round for both faces at an edge, so that no ray is counted twice or lost.
-                a, b = (c, d) if v[c] < v[d] else (d, c)
-                if v[a] <= row < v[b]:
-                    crossing = u[a] + (row - v[a]) * ((u[b] - u[a]) / (v[b] - v[a]))
-                    left, right = min(left, crossing), max(right, crossing)
-            if left >= right:
+        first_row, last_row = max(0, math.ceil(top)), min(height - 1, math.floor(bottom))
+        begin[first_row : last_row + 1], end[first_row : last_row + 1] = width, 0
+        for c in range(count):
+            d = c + 1 if c + 1 < count else 0
+            # Downwards, and so the same for both faces at an edge: no ray is counted twice or lost.
+            a, b = (c, d) if v[c] < v[d] else (d, c)
+            if v[a] == v[b]:
                 continue
-            begin, end = max(0, math.ceil(left)), min(width, math.ceil(right))
-            if end <= begin:
+            slope = (u[b] - u[a]) / (v[b] - v[a])
+            for row in range(max(first_row, math.ceil(v[a])), min(last_row + 1, math.ceil(v[b]))):
+                column = math.ceil(u[a] + (row - v[a]) * slope)
+                begin[row], end[row] = min(begin[row], max(column, 0)), max(end[row], min(column, width))
+        for row in range(first_row, last_row + 1):
+            first_column, last_column = begin[row], end[row]
+            if last_column <= first_column:
                 continue
-            rays += end - begin
+            rays += last_column - first_column
+            inverse, step = np.float32(start + down * row + along * first_column), np.float32(along)
             # Both are always written, so that the compiler can do several pixels at a time.
-            inverse, step = np.float32(start + down * row + along * begin), np.float32(along)
-            depths, hits = nearest[row, begin:end], hit[row, begin:end]
-            for column in range(end - begin):
-                value = inverse + step * np.float32(column)
-                nearer = value > depths[column]
-                depths[column] = value if nearer else depths[column]
-                hits[column] = label if nearer else hits[column]
+            for column in range(first_column, last_column):
+                value = inverse + step * np.float32(column - first_column)
+                nearer = value > nearest[row, column]
+                nearest[row, column] = value if nearer else nearest[row, column]
+                hit[row, column] = label if nearer else hit[row, column]
     return rays
 
 
@@ -121,16 +123,13 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
     for i in range(len(shapes)):
         alone[i] = _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(i), nearest, hit)
 
-    for row in range(row_begin, row_end):
-        run, label = 0, np.int16(-1)
-        for column in range(column_begin, column_end):
-            if hit[row, column] != label:
-                if label >= 0:
-                    seen[label] += run
-                run, label = 0, hit[row, column]
-            run += 1
-        if label >= 0:
-            seen[label] += run
+    for i in range(len(shapes)):
+        window_i = _window(table, shapes[i : i + 1], p_T[i : i + 1], altitude, focal_length, hit.shape)
+        total = 0
+        for row in range(window_i[0], window_i[1]):
+            for column in range(window_i[2], window_i[3]):
+                total += hit[row, column] == i
+        seen[i] = total
     return window
 
 
