@@ -138,6 +138,31 @@ def free_top(table, shape, above, p_T, above_p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def touching(table, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
+    """(n,) whether each object may touch that of a row, directly or through others: axis-aligned boxes within the margin (m)."""
+    n = len(shapes)
+    lower, upper = np.empty((n, 3)), np.empty((n, 3))
+    for i in range(n):
+        for axis in range(2):
+            outline = table.footprint[shapes[i], : table.footprint_count[shapes[i]], axis]
+            lower[i, axis], upper[i, axis] = p_T[i, axis] + outline.min(), p_T[i, axis] + outline.max()
+        lower[i, 2], upper[i, 2] = p_T[i, 2] + table.low[shapes[i]], p_T[i, 2] + table.high[shapes[i]]
+    reached = np.zeros(n, np.bool_)
+    reached[row] = True
+    waiting = [row]
+    while len(waiting) > 0:
+        i = waiting.pop()
+        for j in range(n):
+            apart = -np.inf
+            for axis in range(3):
+                apart = max(apart, lower[i, axis] - upper[j, axis], lower[j, axis] - upper[i, axis])
+            if apart <= margin and not reached[j]:
+                reached[j] = True
+                waiting.append(j)
+    return reached
+
+
+@njit(cache=True)
 def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
     """Who stands on whom.
 

@@ -5,8 +5,17 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Scene, random_offsets
-from drake_clutter.scenes.seams import CannotJudge, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.scene import TRAY, Scene, random_offsets
+from drake_clutter.scenes.seams import (
+    CannotJudge,
+    CannotJudgeReason,
+    Instability,
+    InstabilityReason,
+    Move,
+    MoveResult,
+    Observation,
+    Outcome,
+)
 
 
 class FastExecutor:
@@ -30,16 +39,26 @@ class FastExecutor:
             return Outcome(MoveResult.NO_FREE_SPOT, scene)
         (x, y, _) = random_offsets(1, self._config.settle.jitter, rng)[0]
         moved = scene.at({move.pick: X_TO.moved((x, y, -self._config.exploration.release_height))})
-        found = self.taken_and_placed(scene, moved, move.pick)
+        found = self._judged(scene, moved, move)
         if isinstance(found, CannotJudge):
             return Outcome(MoveResult.CANNOT_JUDGE, scene, cannot_judge=found)
         return Outcome(MoveResult.PLACED if found is None else MoveResult.COLLAPSED, moved, found)
 
-    def taken_and_placed(self, before: Scene, after: Scene, picked: str) -> Instability | CannotJudge | None:
-        """What does not stand when the picked object goes from one place to the other; None if everything does."""
-        losing = self._judge.losing_support(before, picked)
+    def _judged(self, before: Scene, after: Scene, move: Move) -> Instability | CannotJudge | None:
+        """What does not stand when the picked object goes from one place to the other; None if everything does.
+
+        As under Drake, what the move does not touch stays at rest. What rests before the move although the judge would let it
+        fall is beyond the judge.
+        """
+        for name in {move.pick, move.place} - {TRAY}:
+            found = self._judge.stability(self._judge.group(before, name))
+            if isinstance(found, Instability):
+                return CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, found.object)
+            if found is not None:
+                return found
+        losing = self._judge.losing_support(before, move.pick)
         if isinstance(losing, CannotJudge):
             return losing
         if losing:
             return Instability(InstabilityReason.UNSUPPORTED, losing[0])
-        return self._judge.stability(after)
+        return self._judge.stability(self._judge.group(after, move.pick))

@@ -1,7 +1,9 @@
 """The judge that training needs: verdicts from equilibrium and rays, without simulating."""
 
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,8 @@ FRICTION = 0.3
 hold them."""
 _ROUNDING = 5e-5
 """m, added to the margin: stacks that differ from balance by just the offsets' reach are common, since sizes are round."""
+_TOUCHING = 0.003
+"""m; objects further apart do not touch."""
 _GRID = 1e-6
 """m; stacks whose objects stand alike to within this share their verdict."""
 _MARGIN_RANGE = (-0.030, 0.150)
@@ -110,15 +114,26 @@ class FastJudge:
             found[scene.names[upper]].add(TRAY if lower < 0 else scene.names[lower])
         return {name: frozenset(below) for name, below in found.items()}
 
+    def group(self, scene: Scene, name: str) -> Scene:
+        """The named object and all that may touch it, directly or through others.
+
+        Raises:
+            KeyError: no such object.
+        """
+        scene[name]
+        shapes, p_T = self._arrays(scene.objects)
+        reached = equilibrium.touching(self._shapes.table, shapes, p_T, scene.names.index(name), _TOUCHING)
+        return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
+
     def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
-        """The objects, in the scene's order, that would not stay if the named one were taken away.
+        """The objects, in the scene's order, that would not stay if the named one were taken away; its group alone is looked at.
 
         Of a stack that loses its balance these are what is furthest from equilibrium, without it the next, and so on.
 
         Raises:
             KeyError: no such object.
         """
-        scene[name]
+        scene = self.group(scene, name)
         standing = self._standing(scene)
         if isinstance(standing, CannotJudge):
             return standing

@@ -82,6 +82,7 @@ class CannotJudgeReason(Enum):
     FLOATING = "floats in the air"
     EDGE_CONTACT = "rests on an edge or on a curved side"
     UNSUPPORTED = "stands beside what should carry it"
+    RESTS_NEVERTHELESS = "rests where the judge would let it fall"
 
 
 @dataclass(frozen=True)
