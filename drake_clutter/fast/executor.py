@@ -50,7 +50,7 @@ class FastExecutor:
         As under Drake, what the move does not touch stays at rest. What rests before the move although the judge would let it
         fall is beyond the judge.
         """
-        for name in {move.pick, move.place} - {TRAY}:
+        for name in (move.pick,) if move.place == TRAY else (move.pick, move.place):
             found = self._judge.stability(self._judge.group(before, name))
             if isinstance(found, Instability):
                 return CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, found.object)
