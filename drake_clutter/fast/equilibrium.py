@@ -121,8 +121,8 @@ def _overlap(table, i, j, p_i, p_j, how_far):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def free_top(table, shape, above, p_T, above_p):  # type: ignore[no-untyped-def]
-    """Corners (V, 2) m in T of what an object's top has beside another object that covers some of it."""
+def free_top(table, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
+    """Corners (V, 2) m in T of what an object's top has beside another object that covers some of it, and the margin (m)."""
     top, count = table.top[shape], table.top_count[shape]
     outline, outline_count = table.footprint[above], table.footprint_count[above]
     found = np.empty((0, 2))
@@ -132,7 +132,7 @@ def free_top(table, shape, above, p_T, above_p):  # type: ignore[no-untyped-def]
         length = np.hypot(ex, ey)
         polygon = np.zeros((48, 2))
         polygon[:count] = top[:count] + p_T[:2]
-        beyond = _clip(polygon, count, outline[k, 0] + above_p[0], outline[k, 1] + above_p[1], -ey / length, ex / length, 0.0)
+        beyond = _clip(polygon, count, outline[k, 0] + above_p[0], outline[k, 1] + above_p[1], -ey / length, ex / length, -margin)
         found = np.vstack((found, polygon[:beyond]))
     return found
 
@@ -286,7 +286,7 @@ def _nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
                 s[r] = value / L[r, r]
             step = 1.0
             for r in range(m):
-                if s[r] <= 0:
+                if s[r] < 0:
                     step = min(step, x[members[r]] / (x[members[r]] - s[r]))
             for r in range(m):
                 x[members[r]] += step * (s[r] - x[members[r]])
@@ -431,7 +431,7 @@ def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
     if rest.max() > 0:
         needed = friction
         if residuals(table, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
-            return np.argmax(rest), False
+            return np.nonzero(rest > rest.max() - 1e-9)[0][0], False  # of twins the first, whatever rounding says
     for lower, upper in pairs:
         if lower >= 0 and table.rolls[shapes[lower]]:
             line = table.top[shapes[lower], 1] - table.top[shapes[lower], 0]

@@ -75,7 +75,7 @@ class FastJudge:
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
         """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
-        p_T = np.array([o.X_TO.translation for o in scene.objects])
+        p_T = np.array([o.X_TO.translation for o in scene.objects]).reshape(-1, 3)
         found = self.stability(scene)
         if isinstance(found, CannotJudge):
             return found
@@ -156,7 +156,8 @@ class FastJudge:
     def margins(self, scene: Scene) -> dict[str, float] | CannotJudge:
         """How much narrower the contacts under each object may become before its stack loses balance, m, by name.
 
-        Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm.
+        Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm. What rolls
+        has none.
         """
         standing = self._standing(scene)
         if isinstance(standing, CannotJudge):
@@ -176,6 +177,9 @@ class FastJudge:
                 )
                 low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
             found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
+            ((weakest, rolls),) = self._weakest(standing, [rows.tolist()])
+            if rolls and weakest == row:
+                found[scene_object.name] = 0.0
         return found
 
     def never_movable(self, scene: Scene) -> frozenset[str] | CannotJudge:
@@ -213,7 +217,7 @@ class FastJudge:
         loads = [
             (x, y, p_T[row, 2] + self._shapes.table.high[shapes[row]], number[row])
             for row in rest
-            for x, y in equilibrium.free_top(self._shapes.table, shapes[row], shapes[taken], p_T[row], p_T[taken])
+            for x, y in equilibrium.free_top(self._shapes.table, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
         ]
         residuals = equilibrium.residuals(
             self._shapes.table,
@@ -240,7 +244,7 @@ class FastJudge:
         if self._generation != self._shapes.generation or len(self._known) > _KEPT:
             self._known.clear()
             self._generation = self._shapes.generation
-        return shapes, np.array([o.X_TO.translation for o in objects])
+        return shapes, np.array([o.X_TO.translation for o in objects]).reshape(-1, 3)
 
     def _weakest(self, standing: "_Standing", stacks: list[list[int]]) -> list[tuple[int, bool]]:
         """For each stack, given by its rows, the row of what is furthest from equilibrium, or -1, and whether it rolls."""

@@ -29,6 +29,8 @@ width holds no moment; but a cylinder that lies over the gap of a pair touches b
 _FOOTPRINT_CORNERS = 32
 _SURFACE_SIDES = 48
 """Sides of a cylinder's surface, as in the mesh that Drake's camera sees."""
+_SAME_PLANE = 1e-4
+"""By which normals (and offsets, in sizes of the object) of one face's triangles may differ: files round corners to 0.1 um."""
 _MOST_ROWS = 8192
 
 
@@ -59,9 +61,13 @@ class _Surface(NamedTuple):
 def _hull_surface(corners: Floats) -> _Surface:
     """Of a convex hull of uniform density; triangles of one plane are one face."""
     hull = ConvexHull(corners)
-    planes, member = np.unique(np.round(hull.equations, 5), axis=0, return_inverse=True)
+    planes = hull.equations * [1.0, 1.0, 1.0, 1.0 / np.ptp(corners, axis=0).max()]
+    member = np.full(len(planes), -1)
+    for triangle in range(len(planes)):
+        if member[triangle] < 0:
+            member[(np.abs(planes - planes[triangle]).max(axis=1) < _SAME_PLANE) & (member < 0)] = triangle
     faces, normals = [], []
-    for index in range(len(planes)):
+    for index in np.unique(member):
         triangles = np.flatnonzero(member == index)
         normal = hull.equations[triangles[0], :3]
         points = corners[np.unique(hull.simplices[triangles])]
@@ -262,7 +268,7 @@ class Shapes:
         last_face, last_corner = face + len(shape.surface.counts), corner + len(shape.surface.corner)
         if row + 1 >= len(self.table.fault) or last_face >= len(self.table.normal) or last_corner > len(self.table.corner):
             old = self.table
-            self.table = _room(2 * len(old.fault), 2 * (last_face + 1), 2 * last_corner)
+            self.table = _room(2 * len(old.fault), 2 * max(last_face + 1, len(old.normal)), 2 * max(last_corner, len(old.corner)))
             for array, earlier in zip(self.table, old, strict=True):
                 array[: len(earlier)] = earlier
         table = self.table

@@ -170,6 +170,8 @@ class RayCaster:
 
     def _cast(self, objects: Sequence[SceneObject], p_T: Floats | None) -> tuple[list[float], tuple[slice, slice]]:
         """Fills the buffers in a rectangle, which it returns after the visible share of each object."""
+        if not objects:
+            return [], (slice(0, 0), slice(0, 0))
         if p_T is None:
             p_T = np.array([o.X_TO.translation for o in objects])
         alone, seen = np.zeros(len(objects), np.int64), np.zeros(len(objects), np.int64)
@@ -193,8 +195,10 @@ class RayCaster:
         """Of the rays that would meet the named object alone: how many meet which other objects before it.
 
         Raises:
+            KeyError: no such object.
             ValueError: the scene has more than 64 objects.
         """
+        scene[name]
         if len(scene.objects) > _MOST_COVERED:
             raise ValueError(f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most")
         shapes = self._shapes.rows(scene.objects)
@@ -213,8 +217,8 @@ class RayCaster:
         label = np.full(self._hit.shape, -1, np.int16)
         label[rectangle] = self._hit[rectangle]
         detections = tuple(
-            Detection(o.name, o.object_class, o.X_TO, label == index)
+            Detection(o.name, o.object_class, o.X_TO, mask)
             for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))
-            if share >= self.config.hidden_below
+            if share >= self.config.hidden_below and (mask := label == index).any()
         )
         return Observation(depth, detections, self.config, scene.tray_side), dict(zip(scene.names, shares, strict=True))

@@ -124,18 +124,20 @@ class FullKnowledgeSearch:
         self._left += budget - budget // 2
         try:
             while not exhausted and at_least < (len(plan) if plan is not None else LONGEST + 1):
+                self._doubts = 0
                 shorter = self._dive(start, at_least, only_blockers=False)
                 if shorter is not None:
                     plan = shorter
                     break
+                if self._doubts:
+                    break  # what was not tried might have been shorter
                 exhausted = not self._cut and plan is None
-                at_least += 1
+                at_least += not exhausted
         except _OutOfBudgetError:
             pass
         if plan is not None:
             return Solution(Answer.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
-        proved = exhausted and not self._doubts
-        return Solution(Answer.UNSOLVABLE if proved else Answer.UNDECIDED, (), at_least, (), budget - self._left)
+        return Solution(Answer.UNSOLVABLE if exhausted else Answer.UNDECIDED, (), at_least, (), budget - self._left)
 
     def _state(self, scene: Scene, known: frozenset[str], rng: Mapping[str, Any]) -> _State:
         observation, _ = self._rays.observe(scene)

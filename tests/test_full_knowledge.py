@@ -1,0 +1,280 @@
+"""The fewest moves: on scenes made by hand, against trying everything, and played again by the same seed."""
+
+import numpy as np
+import pytest
+from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.fast.executor import FastExecutor
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
+from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch, Solution
+
+CONFIG = ClutterConfig()
+JUDGE = FastJudge(CONFIG)
+SEARCH = FullKnowledgeSearch(CONFIG, JUDGE)
+EXECUTOR = FastExecutor(CONFIG, JUDGE)
+
+
+def covered(x: float = 0.0, y: float = 0.0, tag: str = "") -> list[SceneObject]:
+    """A small box under a large one."""
+    return [
+        resting("gelatin_box", xy=(x, y), name=f"small{tag}"),
+        resting("cracker_box", xy=(x, y), floor=0.028, name=f"cover{tag}"),
+    ]
+
+
+ON_TOP = resting("cereal_box_large", floor=0.088, name="on top")
+IN_VIEW = resting("tomato_soup_can", xy=(0.25, 0.25), name="in view")
+# Name: the objects, the fewest moves, and the objects that these have to pick.
+KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
+    "nothing hidden": ([resting("cracker_box", name="a"), IN_VIEW], 0, set()),
+    "no objects but one": ([resting("large_marker", name="m")], 0, set()),
+    "under a box": (covered(), 1, {"cover"}),
+    "under a box, beside others": ([*covered(), IN_VIEW], 1, {"cover"}),
+    "under two boxes": ([*covered(), ON_TOP], 2, {"cover", "on top"}),
+    "under a box that carries two": (
+        [*covered(), *(resting("tomato_soup_can", xy=(x, 0.0), floor=0.088, name=f"can {x}") for x in (-0.06, 0.06))],
+        3,
+        {"cover", "can -0.06", "can 0.06"},
+    ),
+    "two under one box": (
+        [
+            *(resting("gelatin_box", xy=(0.0, y), name=f"small {y}") for y in (-0.05, 0.05)),
+            resting("cracker_box", floor=0.028, name="cover"),
+        ],
+        1,
+        {"cover"},
+    ),
+    "two stacks": ([*covered(-0.2), *covered(0.2, tag=" 2")], 2, {"cover", "cover 2"}),
+    "three stacks": (
+        [*covered(-0.2, 0.2), *covered(0.2, 0.2, " 2"), *covered(0.0, -0.2, " 3")],
+        3,
+        {"cover", "cover 2", "cover 3"},
+    ),
+    "one deep, one not": ([*covered(), ON_TOP, *covered(0.2, 0.25, " 2")], 3, {"cover", "on top", "cover 2"}),
+    "hidden under hidden": (
+        # Of the middle box a corner shows once the upper is gone, of the small one nothing before the middle one is.
+        [*covered(), resting("cereal_box_large", floor=0.088, name="on top"), IN_VIEW],
+        2,
+        {"cover", "on top"},
+    ),
+    "behind a bridge's two feet": (
+        [
+            resting("gelatin_box", Orientation.FLAT_90, name="small"),
+            *(resting("sugar_box", Orientation.UPRIGHT_90, (x, 0.0), name=f"foot {x}") for x in (-0.09, 0.09)),
+            resting("cereal_box_large", floor=0.175, name="bridge"),
+        ],
+        1,
+        {"bridge"},
+    ),
+}
+
+
+@pytest.mark.parametrize(("objects", "moves", "picked"), KNOWN.values(), ids=list(KNOWN))
+def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[str]) -> None:
+    scene = scene_of(*objects)
+    assert JUDGE.stability(scene) is None
+    solution = SEARCH.solve(scene)
+    assert solution.answer is Answer.SOLVABLE
+    assert (len(solution.plan), solution.at_least, solution.fewest, solution.never_found) == (moves, moves, True, ())
+    assert {move.pick for move in solution.plan} == picked
+    assert solution.moves_tried >= moves
+    assert replayed(scene, solution, 0) == set(scene.names)
+
+
+def replayed(scene: Scene, solution: Solution, seed: int) -> set[str]:
+    """What has been in view when the plan is done; no move of it fails."""
+    generator = item_rng(seed)
+    known = {d.name for d in JUDGE.rays.observe(scene)[0].detections}
+    for move in solution.plan:
+        observation = JUDGE.rays.observe(scene)[0]
+        assert move in legal_moves(observation)
+        outcome = EXECUTOR.execute(scene, observation, move, generator)
+        assert outcome.result is MoveResult.PLACED
+        scene = outcome.scene
+        known |= {d.name for d in JUDGE.rays.observe(scene)[0].detections}
+    return known
+
+
+def test_no_plan_for_nothing_costs_nothing() -> None:
+    solution = SEARCH.solve(scene_of(IN_VIEW), budget=0)
+    assert solution == Solution(Answer.SOLVABLE, (), 0, (), 0)
+
+
+# --- Unsolvable ---
+
+# The box is held down by its weight alone, which hides it: neither can ever go. What lies below is never found.
+HELD_DOWN = [
+    resting("sugar_box", Orientation.UPRIGHT_0, (-0.0445, 0.0), name="foot"),
+    resting("cracker_box", xy=(0.032, 0.0), floor=0.175, name="held"),
+    resting("cereal_box_large", xy=(-0.060, 0.0), floor=0.235, name="weight"),
+]
+BELOW_IT = resting("gelatin_box", xy=(0.055, 0.0), name="below it")
+
+
+def test_what_lies_under_what_never_moves_is_never_found() -> None:
+    solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, IN_VIEW))
+    assert solution.answer is Answer.UNSOLVABLE
+    assert solution.never_found == ("foot", "held", "below it")
+    assert (solution.plan, solution.fewest, solution.moves_tried) == ((), False, 0)
+
+
+def test_what_is_hidden_elsewhere_is_not_named() -> None:
+    solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, *covered(0.2, 0.25)))
+    assert solution.answer is Answer.UNSOLVABLE
+    assert solution.never_found == ("foot", "held", "below it")
+
+
+def test_no_room_for_any_move() -> None:
+    """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
+    solution = SEARCH.solve(scene_of(*covered(), tray_side=0.26))
+    assert (solution.answer, solution.plan, solution.never_found) == (Answer.UNSOLVABLE, (), ())
+    assert not solution.fewest
+    assert solution.moves_tried > 0
+
+
+def test_a_stack_that_collapses_whatever_is_picked() -> None:
+    """A pair that overhangs its foot under a box: whoever takes one of the four makes others fall, and nothing else is there to
+    put down on them first. Proved by trying nothing."""
+    pair = [resting("sugar_box", xy=(0.0, y), floor=0.038, name=name) for name, y in (("left", -0.0455), ("right", 0.0455))]
+    scene = scene_of(resting("sugar_box", name="foot"), *pair, resting("cracker_box", floor=0.076, name="load"))
+    assert JUDGE.stability(scene) is None
+    assert all(JUDGE.losing_support(scene, name) for name in scene.names)
+    solution = SEARCH.solve(scene)
+    assert (solution.answer, solution.moves_tried) == (Answer.UNSOLVABLE, 0)
+
+
+# --- The budget ---
+
+
+@pytest.mark.parametrize("budget", [0, 1])
+def test_undecided_on_a_small_budget(budget: int) -> None:
+    solution = SEARCH.solve(scene_of(*KNOWN["under two boxes"][0]), budget=budget)
+    assert solution == Solution(Answer.UNDECIDED, (), 2, (), budget)
+    assert not solution.fewest
+
+
+def test_no_more_moves_than_the_budget_are_tried() -> None:
+    scene = scene_of(*KNOWN["one deep, one not"][0])
+    answers = []
+    for budget in range(12):
+        solution = SEARCH.solve(scene, budget=budget)
+        assert solution.moves_tried <= budget
+        assert solution.at_least <= 3
+        answers.append(solution.answer)
+    decided = answers.index(Answer.SOLVABLE)
+    assert decided >= 3
+    assert set(answers[:decided]) == {Answer.UNDECIDED}
+    assert set(answers[decided:]) == {Answer.SOLVABLE}
+
+
+def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
+    """Because of a box that leans 3 mm beside it, the fast judge cannot tell whether the cover can go; Drake can."""
+    R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    leaning = SceneObject("leaning", CLASSES["gelatin_box"], Pose.of(R_TO, (0.1335, 0.0, 0.0372)))
+    scene = scene_of(*covered(), leaning)
+    outcome = SettleExecutor(CONFIG).execute(scene, JUDGE.rays.observe(scene)[0], Move("cover"), rng())
+    if outcome.result is not MoveResult.PLACED or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3:
+        pytest.fail("one move does not find everything", pytrace=False)
+    solution = SEARCH.solve(scene)
+    if (solution.answer, solution.moves_tried) != (Answer.UNDECIDED, 0):
+        pytest.fail("the fast judge could tell", pytrace=False)
+    assert solution.at_least <= 1
+
+
+# --- Against trying everything ---
+
+
+def laid_out(seed: int) -> Scene:
+    generator = rng(seed)
+    while True:
+        derivation = GRAMMARS["ycb7"].derive(NodeBudget(int(generator.integers(4, 9))), uniform_choice(generator))
+        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator)
+        if isinstance(scene, Scene):
+            return scene
+
+
+# Stable, with something hidden, and with few enough objects in view to try every move. That of seed 45 takes more than two.
+RANDOM = {seed: laid_out(seed) for seed in (2, 17, 22, 33, 39, 45, 67)}
+
+
+def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
+    """The least number of moves, up to `most`, of all sequences of legal moves that reveal everything without a collapse."""
+    observation = JUDGE.rays.observe(scene)[0]
+    known = frozenset(d.name for d in observation.detections)
+    level = [(scene, observation, known, item_rng(seed).bit_generator.state)]
+    for moves in range(most + 1):
+        if any(len(known) == len(scene.objects) for _, _, known, _ in level):
+            return moves
+        after = []
+        for scene, observation, known, state in level if moves < most else ():
+            for move in legal_moves(observation):
+                generator = np.random.default_rng()
+                generator.bit_generator.state = state
+                outcome = EXECUTOR.execute(scene, observation, move, generator)
+                if outcome.result is MoveResult.PLACED:
+                    look = JUDGE.rays.observe(outcome.scene)[0]
+                    seen = known | {d.name for d in look.detections}
+                    after.append((outcome.scene, look, seen, generator.bit_generator.state))
+        level = after
+    return None
+
+
+@pytest.mark.parametrize("seed", RANDOM)
+def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
+    """With the same draws, so that places agree. Two moves of four objects in view are some 270 to try."""
+    scene = RANDOM[seed]
+    assert JUDGE.stability(scene) is None
+    solution = SEARCH.solve(scene, seed=2, budget=300)
+    fewest = fewest_by_trying(scene, 2, 2)
+    if fewest is None:
+        assert seed == 45
+        assert solution.at_least > 2
+        assert len(solution.plan) > 2 or solution.answer is not Answer.SOLVABLE
+        return
+    assert fewest == (1 if seed == 2 else 2)
+    assert (solution.answer, solution.at_least, len(solution.plan)) == (Answer.SOLVABLE, fewest, fewest)
+    assert solution.fewest
+    assert replayed(scene, solution, 2) == set(scene.names)
+
+
+# --- Repeatable ---
+
+
+def test_the_same_seed_gives_the_same_solution() -> None:
+    """Whatever was searched before, and by a judge of its own."""
+    scene = RANDOM[33]
+    solution = SEARCH.solve(scene, seed=5)
+    SEARCH.solve(scene_of(*KNOWN["two stacks"][0]), seed=1)
+    assert SEARCH.solve(scene, seed=5) == solution
+    assert FullKnowledgeSearch(CONFIG).solve(scene, seed=5) == solution
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_plan_holds_for_its_seed(seed: int) -> None:
+    for scene in (RANDOM[22], RANDOM[39]):
+        solution = SEARCH.solve(scene, seed=seed)
+        assert solution.answer is Answer.SOLVABLE
+        assert replayed(scene, solution, seed) == set(scene.names)
+
+
+def test_drake_confirms_a_plan(detector: LabelDetector) -> None:
+    scene = scene_of(*covered(), *covered(0.2, 0.25, " 2"))
+    solution = SEARCH.solve(scene, seed=4)
+    task = ExplorationTask(scene, SettleExecutor(CONFIG), detector, CONFIG.exploration, len(solution.plan))
+    assert task.hidden_at_start == ("small", "small 2")
+    generator = item_rng(4)
+    for move in solution.plan:
+        assert task.end is None
+        assert task.step(move, generator).outcome.result is MoveResult.PLACED
+    assert task.end is EpisodeEnd.ALL_FOUND
+    assert len(solution.plan) == 2

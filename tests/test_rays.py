@@ -1,0 +1,277 @@
+"""The ray caster against the rendered camera, against geometry, and against itself without what is in the way."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.config import CameraConfig, LayoutConfig
+from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.simulation.camera import OverheadCamera
+
+CAMERA = CameraConfig()
+RAYS = RayCaster(CAMERA)
+# Detects whatever it meets, so that its masks are a label image.
+OPEN_MINDED = RayCaster(replace(CAMERA, hidden_below=1e-9))
+ALL_SHAPES = ("cracker_box", "sugar_box", "gelatin_box", "tomato_soup_can", "master_chef_can", "large_marker")
+
+
+def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
+    """The index of the object that each ray meets first, -1 for none."""
+    found = np.full((caster.config.height, caster.config.width), -1)
+    for detection in caster.observe(scene)[0].detections:
+        found[detection.mask] = scene.names.index(detection.name)
+    return found
+
+
+def tumbled(seed: int, spread: float = 0.22) -> Scene:
+    """Two of each shape in the air over the tray, turned any way; some may cut each other, which a ray does not mind."""
+    generator = rng(seed)
+    turns = Rotation.random(2 * len(ALL_SHAPES), rng=generator).as_matrix()
+    objects = []
+    for index, (class_name, turn) in enumerate(zip(2 * ALL_SHAPES, turns, strict=True)):
+        p_TO = (*generator.uniform(-spread, spread, 2), generator.uniform(0.16, 0.40))
+        objects.append(SceneObject(f"{class_name} {index}", CLASSES[class_name], Pose.of(turn, p_TO)))
+    return scene_of(*objects)
+
+
+def laid_out(seed: int) -> Scene:
+    generator = rng(seed)
+    while True:
+        derivation = GRAMMARS["ycb7"].derive(NodeBudget(16), uniform_choice(generator))
+        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator)
+        if isinstance(scene, Scene):
+            return scene
+
+
+RESTING = scene_of(
+    resting("cracker_box", Orientation.UPRIGHT_90, (-0.2, -0.2), name="tall"),
+    resting("cracker_box", Orientation.FLAT_30, name="below"),
+    resting("sugar_box", Orientation.SIDE_90, (0.03, 0.0), 0.060, "on it"),
+    resting("master_chef_can", xy=(0.2, 0.2), name="chef"),
+    resting("tomato_soup_can", xy=(0.21, 0.18), floor=0.139, name="soup"),
+    resting("gelatin_box", Orientation.FLAT_60, (-0.2, 0.2), name="gelatin"),
+    resting("large_marker", Orientation.FLAT_120, (-0.2, 0.2), 0.028, "marker"),
+    resting("sugar_box", Orientation.UPRIGHT_0, (0.25, -0.25), name="wall"),
+    resting("gelatin_box", xy=(0.27, -0.31), name="in its shadow"),
+)
+SCENES: Mapping[str, Scene] = {"resting": RESTING, "tumbled 0": tumbled(0), "tumbled 1": tumbled(1), "laid out": laid_out(1)}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
+def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(scene: Scene, detector: LabelDetector) -> None:
+    """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
+    look = detector.look(scene)
+    observation, shares = RAYS.observe(scene)
+    assert shares == RAYS.visible_shares(scene.objects)
+    assert shares == pytest.approx(look.visible_share, abs=0.003)
+    assert min(shares.values()) < 0.9 < 1.0 <= max(shares.values())
+    rendered = look.images.label
+    cast = labels(scene)
+    assert (cast == rendered).mean() >= 0.9999
+    for index, o in enumerate(scene.objects):
+        mine, theirs = cast == index, rendered == index
+        assert abs(int(mine.sum()) - int(theirs.sum())) <= 3, o.name
+    assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
+    for detection, seen in zip(observation.detections, look.observation.detections, strict=True):
+        assert (detection.object_class, detection.X_TO) == (seen.object_class, seen.X_TO)
+        assert np.array_equal(detection.mask, cast == scene.names.index(detection.name))
+    assert (observation.camera, observation.tray_side) == (look.observation.camera, look.observation.tray_side)
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
+def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> None:
+    """In 32 bit a depth of 1.6 m is known to 0.12 um, and its inverse to as much: 1 um. On a face that is seen at a grazing angle
+    the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
+    look = detector.look(scene)
+    observation, _ = RAYS.observe(scene)
+    rendered, cast = look.images.label, labels(scene)
+    assert observation.depth.dtype == look.observation.depth.dtype == np.float32
+    errors = []
+    for index in range(len(scene.objects)):
+        inside = binary_erosion((rendered == index) & (cast == index))
+        errors.append(np.abs(observation.depth - look.observation.depth)[inside])
+    error = np.concatenate(errors)
+    assert error.size > 5000
+    assert np.quantile(error, 0.99) < 1.5e-6
+    assert error.max() < 1e-4
+    nothing = (rendered == -1) & (cast == -1)
+    assert (observation.depth[nothing] == np.float32(CAMERA.altitude)).all()
+
+
+@pytest.mark.parametrize("config", [CameraConfig(320, 240, 60.0, 1.1), CameraConfig(200, 300, 20.0, 1.6)], ids=["wide", "narrow"])
+def test_another_camera(config: CameraConfig) -> None:
+    """The narrow one sees 0.38 m of the tray by 0.56 m: objects are cut off by the frame, and a share is one of the pixels in it.
+    Fewer pixels: one is up to a hundredth of an object."""
+    scene = tumbled(2)
+    camera, caster = OverheadCamera(config), RayCaster(config)
+    assert caster.visible_shares(scene.objects) == pytest.approx(camera.visible_shares(scene), abs=0.02)
+    rendered = camera.label(scene)
+    assert (labels(scene, RayCaster(replace(config, hidden_below=1e-9))) == rendered).mean() >= 0.9995
+    cut = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).any() for m in (rendered == k for k in range(len(scene.objects)))]
+    assert any(cut) == (config.fov_y_deg == 20.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "width", "height"),
+    [("cracker_box", 0.230, 0.160, 0.060), ("sugar_box", 0.175, 0.089, 0.038), ("gelatin_box", 0.085, 0.073, 0.028)],
+)
+@pytest.mark.parametrize("orientation", [Orientation.FLAT_0, Orientation.FLAT_30, Orientation.FLAT_90])
+def test_a_box_from_straight_above_covers_its_top(
+    name: str, length: float, width: float, height: float, orientation: Orientation
+) -> None:
+    """Only its top is seen, as large as the pinhole makes it. Pixels at its outline count or not: less than half its length in
+    pixels is right."""
+    scene = scene_of(resting(name, orientation, name="box"))
+    scale = CAMERA.focal_length / (CAMERA.altitude - height)
+    pixels = int((labels(scene) == 0).sum())
+    assert pixels == pytest.approx(length * width * scale**2, abs=(length + width) * scale)
+    depth = RAYS.observe(scene)[0].depth[labels(scene) == 0]
+    assert depth == pytest.approx(np.full(pixels, CAMERA.altitude - height), abs=1e-6)
+
+
+def test_a_box_in_a_corner_shows_its_sides() -> None:
+    """The hull of its eight corners in the picture, by the shoelace formula."""
+    box = resting("cracker_box", Orientation.UPRIGHT_0, (0.2, 0.15), name="box")
+    low, high = (CAMERA.project(np.array([[x, y, z] for x in (0.12, 0.28) for y in (0.12, 0.18)])) for z in (0.0, 0.23))
+    # The top is nearer and seems larger, away from the middle: of the bottom, the corner beyond the top's is inside.
+    outline = np.array([low[0], low[1], high[1], high[3], high[2], low[2]])
+    following = np.roll(outline, -1, axis=0)
+    area = abs((outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum()) / 2
+    perimeter = np.linalg.norm(outline - following, axis=1).sum()
+    assert (labels(scene_of(box)) == 0).sum() == pytest.approx(area, abs=perimeter / 4)
+
+
+def test_every_ray_meets_an_object_once() -> None:
+    """No ray is lost or counted twice where two faces meet: the rays that a convex object meets fill every row without a gap."""
+    for seed in range(3):
+        for o in tumbled(seed).objects:
+            mask = labels(scene_of(o)) == 0
+            columns = [np.flatnonzero(row) for row in mask if row.any()]
+            assert len(columns) > 5
+            assert all(np.array_equal(row, np.arange(row[0], row[-1] + 1)) for row in columns)
+            cover = RAYS.cover(scene_of(o), o.name)
+            assert cover == {frozenset(): int(mask.sum())}
+            assert RAYS.visible_shares([o]) == {o.name: 1.0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_the_objects_is_no_matter(seed: int) -> None:
+    scene = tumbled(seed)
+    order = rng(seed).permutation(len(scene.objects))
+    other = replace(scene, objects=tuple(scene.objects[k] for k in order))
+    assert RAYS.visible_shares(other.objects) == RAYS.visible_shares(scene.objects)
+    one, same = RAYS.observe(scene)[0], RAYS.observe(other)[0]
+    assert np.array_equal(one.depth, same.depth)
+    for detection in one.detections:
+        assert np.array_equal(detection.mask, same[detection.name].mask)
+    name = scene.names[seed]
+    assert RAYS.cover(other, name) == RAYS.cover(scene, name)
+
+
+def test_what_was_cast_before_is_no_matter() -> None:
+    """The buffers are used again: nothing of a fuller scene stays in them."""
+    caster = RayCaster(CAMERA)
+    before = caster.observe(scene_of(resting("gelatin_box", name="box")))
+    for seed in range(2):
+        caster.observe(tumbled(seed))
+        caster.cover(tumbled(seed), tumbled(seed).names[0])
+    after = caster.observe(scene_of(resting("gelatin_box", name="box")))
+    assert np.array_equal(before[0].depth, after[0].depth)
+    assert np.array_equal(before[0]["box"].mask, after[0]["box"].mask)
+    assert before[1] == after[1]
+
+
+def test_other_places_than_those_of_the_poses() -> None:
+    scene = tumbled(1)
+    offsets = rng(3).uniform(-0.05, 0.05, (len(scene.objects), 3))
+    moved = scene.at({o.name: o.X_TO.moved(offset) for o, offset in zip(scene.objects, offsets, strict=True)})
+    p_T = np.array([o.X_TO.p for o in moved.objects])
+    assert RAYS.visible_shares(scene.objects, p_T) == RAYS.visible_shares(moved.objects)
+    assert RAYS.visible_shares(scene.objects, p_T) != RAYS.visible_shares(scene.objects)
+
+
+FAR = scene_of(resting("gelatin_box", name="near"), resting("sugar_box", xy=(5.0, 0.0), name="far"))
+
+
+def test_out_of_the_frame_nothing_is_hidden() -> None:
+    assert RAYS.visible_shares(FAR.objects) == {"near": 1.0, "far": 1.0}
+    assert RAYS.visible_shares([FAR["far"]]) == {"far": 1.0}
+    assert RAYS.cover(FAR, "far") == {}
+    assert (RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.altitude)).all()
+
+
+def test_only_what_a_ray_meets_is_detected() -> None:
+    """As `LabelDetector` has it, from which an explorer that is to carry out a plan knows what is in view."""
+    assert [d.name for d in LabelDetector(CAMERA).look(FAR).observation.detections] == ["near"]
+    assert [d.name for d in RAYS.observe(FAR)[0].detections] == ["near"]
+
+
+def test_half_covered() -> None:
+    """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
+    objects = [resting("cracker_box", name="below"), resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above")]
+    shares = RAYS.visible_shares(objects)
+    assert shares["below"] == pytest.approx(0.5, abs=1 / 92)  # the box is 92 pixels long
+    assert shares["above"] == 1.0
+
+
+# --- What is before an object ---
+
+HEAP = scene_of(
+    resting("gelatin_box", name="hidden"),
+    resting("sugar_box", Orientation.FLAT_30, (0.03, 0.02), 0.028, "one"),
+    resting("pudding_box", Orientation.FLAT_60, (-0.03, 0.0), 0.066, "two"),
+    resting("large_marker", Orientation.FLAT_150, (0.0, -0.02), 0.101, "three"),
+    resting("tomato_soup_can", xy=(-0.01, 0.02), floor=0.119, name="four"),
+    resting("cracker_box", Orientation.UPRIGHT_0, (0.2, 0.2), name="far"),
+)
+
+
+@pytest.mark.parametrize(
+    ("scene", "name"), [(HEAP, "hidden"), (HEAP, "one"), (tumbled(0, 0.08), "sugar_box 1")], ids=["0", "1", "2"]
+)
+def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> None:
+    """Without a set of others, the object is met by the rays before which there are none but these; by all subsets of five."""
+    cover = RAYS.cover(scene, name)
+    total = sum(cover.values())
+    assert total == int((labels(scene_of(scene[name])) == 0).sum())
+    before_most = sorted((o for o in scene.objects if o.name != name), key=lambda o: -sum(cover[c] for c in cover if o.name in c))
+    others, kept = before_most[:5], before_most[5:]
+    free = []
+    for count in range(len(others) + 1):
+        for gone in combinations([o.name for o in others], count):
+            left = scene_of(scene[name], *kept, *(o for o in others if o.name not in gone))
+            met = sum(rays for before, rays in cover.items() if before <= set(gone))
+            assert int((labels(left) == 0).sum()) == met
+            assert RAYS.visible_shares(left.objects)[name] == pytest.approx(met / total, abs=1e-12)
+            free.append(met)
+    assert min(free) < max(free)
+
+
+def test_cover_of_a_lone_cover() -> None:
+    scene = scene_of(resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover"))
+    pixels = 0.085 * 0.073 * (CAMERA.focal_length / (CAMERA.altitude - 0.028)) ** 2
+    cover = RAYS.cover(scene, "box")
+    assert cover == {frozenset({"cover"}): pytest.approx(pixels, rel=0.05)}
+    assert set(RAYS.cover(scene, "cover")) == {frozenset()}
+
+
+def test_cover_takes_64_objects_at_most() -> None:
+    """They lie on each other like cards; the lowest is covered by all, each of which has its own bit."""
+    cards = [resting("gelatin_box", floor=0.005 * k, name=f"{k}") for k in range(65)]
+    cover = RAYS.cover(scene_of(*cards[:64]), "0")
+    assert max(cover, key=lambda before: cover[before]) == frozenset(str(k) for k in range(1, 64))
+    assert math.isclose(sum(cover.values()), int((labels(scene_of(cards[0])) == 0).sum()))
+    with pytest.raises(ValueError, match="65 objects; allowed are 64 at most"):
+        RAYS.cover(scene_of(*cards), "0")
