@@ -85,11 +85,14 @@ def test_generate_goes_on_after_a_kill(tmp_path: Path) -> None:
     assert scenes_of(out) == scenes_of(tmp_path / "whole")
 
 
-def test_explore_finds_what_is_below(scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("fidelity", ["settle", "fast"])
+def test_explore_finds_what_is_below(fidelity: str, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "episode"
-    printed = json.loads(run("explore", scene, "--agent", "largest-clear", "--json", "--out", out).stdout)
+    options = ("--agent", "largest-clear", "--fidelity", fidelity, "--json")
+    printed = json.loads(run("explore", scene, *options, "--out", out).stdout)
     episode = json.loads((out / "episode.json").read_text())
     assert printed == episode
+    assert episode["fidelity"] == fidelity
     assert episode["success"] is True
     assert episode["hidden_at_start"] == episode["found"] == ["below"]
     (only,) = episode["moves"]
@@ -98,6 +101,16 @@ def test_explore_finds_what_is_below(scene: Path, tmp_path: Path) -> None:
     assert only["newly_found"] == ["below"]
     assert only["visible_share"]["below"] > 0.99
     assert only["reward"] == 1.0
+    assert (out / "index.html").is_file()
+
+
+def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "solution"
+    printed = json.loads(run("solve", scene, "--json", "--out", out).stdout)
+    assert printed == json.loads((out / "solution.json").read_text())
+    assert (printed["answer"], printed["moves"], printed["fewest"], printed["confirmed"]) == ("solvable", 1, True, True)
+    assert yaml.safe_load((out / "moves.yaml").read_text()) == [{"pick": "above", "place": "tray"}]
+    assert json.loads((out / "episode.json").read_text())["found"] == ["below"]
     assert (out / "index.html").is_file()
 
 
