@@ -181,19 +181,19 @@ class FullKnowledgeSearch:
             seen += rays[moves]
             if seen >= self._hidden_below * total:
                 return moves, involved
-        return 0, involved  # out of the frame
+        return 0, involved  # out of the frame, see `_never_found`
 
     def _never_found(self, start: _State) -> tuple[str, ...]:
-        """What stays hidden behind objects that can never be moved."""
+        """What is out of the camera's frame, or stays hidden behind objects that can never be moved."""
         fixed = self._judge.never_movable(start.scene)
-        if isinstance(fixed, CannotJudge) or not fixed:
-            return ()
         found = []
         for name in start.scene.names:
-            if name not in start.known:
-                left = [o for o in start.scene.objects if o.name in fixed or o.name == name]
-                if self._rays.visible_shares(left)[name] < self._hidden_below:
-                    found.append(name)
+            if name in start.known:
+                continue
+            left = [o for o in start.scene.objects if o.name == name or (isinstance(fixed, frozenset) and o.name in fixed)]
+            out_of_frame = not self._rays.cover(start.scene, name)
+            if out_of_frame or self._rays.visible_shares(left)[name] < self._hidden_below:
+                found.append(name)
         return tuple(found)
 
     def _dive(self, start: _State, limit: int, *, only_blockers: bool) -> list[Move] | None:
