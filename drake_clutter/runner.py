@@ -18,8 +18,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 IN_FLIGHT_PER_WORKER = 4
-# More threads than cores slow each other down; and a sum's rounding depends on the number of threads.
-ONE_THREAD_EACH = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+# More threads than cores slow each other down; and a sum's rounding depends on the number of threads. Mesa's software renderer
+# (LP: llvmpipe) was twice seen waiting for one of its own threads for ever.
+ONE_THREAD_EACH = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
 
 # In a worker process: the factory, and from the first item on the worker that it made.
 _make_worker: Callable[[], Callable[[Any], Any]] | None = None
