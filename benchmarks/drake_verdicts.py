@@ -56,8 +56,8 @@ BATCHES = {
     Batch("ycb7", 20, 0): 300,
     Batch("pantry14", 25, 0): 300,
     Batch("ycb7", 25, 0, "other offsets"): 60,
-    Batch("ycb7", 25, 0, "no early stop"): 40,
-    Batch("ycb7", 25, 0, "1 ms steps"): 40,
+    Batch("ycb7", 25, 0, "no early stop"): 24,
+    Batch("ycb7", 25, 0, "1 ms steps"): 24,
 }
 """How many scenes of each batch the published experiment asks about."""
 MOVES = 1000
