@@ -1,5 +1,6 @@
 """Maps a function over many items in several processes, here or on a cluster, with the same results for any number of them."""
 
+import gc
 import os
 import signal
 import threading
@@ -80,6 +81,7 @@ def _map_here(make_worker: Callable[[], Callable[[Item], Result]], items: Iterab
 def _map_in_processes(
     make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
+    gc.collect()  # a renderer that is left for one of the pool's threads to collect can abort the process
     # A forked copy of a process that runs threads (VTK, torch) can hang: the processes are started afresh.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(make_worker,))
     remaining = iter(items)

@@ -1,6 +1,7 @@
 """Objects and scenes that the tests share; what is costly to make is made once for the whole run."""
 
-from collections.abc import Sequence
+import gc
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -44,6 +45,13 @@ def scene_of(*objects: SceneObject, tray_side: float = 0.70) -> Scene:
 def rng(seed: int = 0) -> np.random.Generator:
     """A generator for what a test leaves to chance."""
     return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _collected_here() -> Iterator[None]:
+    """Renderers that a module's tests leave behind are collected in this thread: in another one they abort the process."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(scope="session")

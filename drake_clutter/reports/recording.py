@@ -25,7 +25,7 @@ from drake_clutter.scenes.seams import Frame, MoveResult
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 from drake_clutter.tasks.exploration import Step
 
-FRAMES_PER_SECOND = 30
+FRAMES_PER_SECOND = 40
 _CARRY_TIME = 0.5
 """s, for each of up, across and down."""
 _PAUSE, _LONG_PAUSE = 0.6, 1.5
@@ -78,7 +78,7 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
 
 
 def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
-    """The illustrated way of an object from where it is to its place, at 30 Hz: up, across, down."""
+    """The illustrated way of an object from where it is to its place, at 40 Hz: up, across, down."""
     picked = scene[pick]
     # Its lowest point may lie below its origin by as much as its farthest corner.
     reach = float(np.linalg.norm(picked.object_class.corners, axis=1).max())
