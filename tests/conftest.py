@@ -9,6 +9,7 @@ from hypothesis import settings
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import Orientation, SceneGrammar, resting_rotation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -64,6 +65,12 @@ def config() -> ClutterConfig:
 def judge(config: ClutterConfig) -> DrakeJudge:
     """One judge for all tests: none of its verdicts may depend on the earlier ones."""
     return DrakeJudge(config)
+
+
+@pytest.fixture(scope="session")
+def fast(config: ClutterConfig) -> FastJudge:
+    """One fast judge for all tests, for the same reason."""
+    return FastJudge(config)
 
 
 @pytest.fixture(scope="session")

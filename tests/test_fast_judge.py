@@ -1,34 +1,25 @@
 """The fast judge against statics done by hand, against itself where nothing may matter, and against Drake."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
-from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
-import trimesh
 from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.optimize import linprog, nnls
+from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 
-from drake_clutter.assets import build_assets
-from drake_clutter.catalogue import ObjectClass, Shape, load_catalogue
 from drake_clutter.config import ClutterConfig, LayoutConfig
-from drake_clutter.fast.equilibrium import _nnls
 from drake_clutter.fast.judge import FastJudge
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
 from drake_clutter.scenes.layout import lay_out
-from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
-from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
 from drake_clutter.simulation.judge import DrakeJudge
 
@@ -39,14 +30,8 @@ STEP = 0.0001
 """m, to which `margins` knows them."""
 
 
-@pytest.fixture(scope="module")
-def fast(config: ClutterConfig) -> FastJudge:
-    """One judge for all tests: none of its verdicts may depend on the earlier ones."""
-    return FastJudge(config)
-
-
 FAST = FastJudge(ClutterConfig())
-"""Likewise, for hypothesis, which warns of fixtures that it does not make anew."""
+"""As the fixture `fast`, for hypothesis, which warns of fixtures that it does not make anew."""
 
 
 def stands(*objects: SceneObject) -> bool:
@@ -432,186 +417,6 @@ def test_an_empty_tray_is_stable(config: ClutterConfig, judge: DrakeJudge) -> No
     assert FastJudge(config).judge(scene_of(), rng()) == Verdict(None, {}, {}, ())
 
 
-# --- Margins, supports, what falls when something goes ---
-
-
-@pytest.mark.parametrize(
-    ("objects", "margins"),
-    [
-        # Half the smaller of the sides, 89 mm and 160 mm; below, all of it counts.
-        ([BELOW, resting("sugar_box", floor=0.060, name="above")], {"below": 80.0, "above": 44.5}),
-        # The overhang's middle is 20 mm inside; of both, the middle is 52.8 mm off.
-        (
-            [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
-            {"below": 115 - 95 * 514 / (514 + 411), "above": 20.0},
-        ),
-        ([BELOW, resting("sugar_box", xy=(0.0, 0.077), floor=0.060, name="above")], {"below": 37.2, "above": 3.0}),
-        # 5 mm and 20 mm beyond the edge: no contact elsewhere makes up for it.
-        ([BELOW, resting("sugar_box", xy=(0.120, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -5.0}),
-        ([BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -20.0}),
-        ([resting("cracker_box", name="a"), resting("gelatin_box", xy=(0.2, 0.2), name="b")], {"a": 80.0, "b": 36.5}),
-        ([resting("cereal_box_large", name="a")], {"a": 97.5}),
-        ([resting("tomato_soup_can", name="a")], {"a": 33.0 * math.cos(math.pi / 16)}),  # of 16 corners
-        ([resting("large_marker", name="a")], {"a": 6.0}),  # its strip
-    ],
-)
-def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
-    found = FAST.margins(scene_of(*objects))
-    assert not isinstance(found, CannotJudge)
-    assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(margins, abs=0.11)
-
-
-def test_what_rolls_has_no_margin() -> None:
-    margins = FAST.margins(scene_of(*TABLE["a box on a marker"][0]))
-    assert not isinstance(margins, CannotJudge)
-    assert min(margins.values()) < MARGIN
-
-
-COUNTERWEIGHT = scene_of(BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight"))
-BRIDGE = scene_of(*STANDING_PAIR, resting("cracker_box", floor=0.175, name="bridge"))
-TWO_STACKS = scene_of(
-    *(resting("cracker_box", xy=(0.0, -0.2), name="a"), resting("sugar_box", xy=(0.0, -0.2), floor=0.060, name="b")),
-    *(resting("cracker_box", xy=(0.0, 0.2), name="c"), resting("sugar_box", xy=(0.0, 0.2), floor=0.060, name="d")),
-    resting("gelatin_box", xy=(0.0, -0.2), floor=0.098, name="e"),
-)
-
-
-@pytest.mark.parametrize(
-    ("scene", "losing"),
-    [
-        (TWO_STACKS, {"a": ("b", "e"), "b": ("e",), "c": ("d",), "d": (), "e": ()}),
-        (BRIDGE, {"left": ("bridge",), "right": ("bridge",), "bridge": ()}),
-        (COUNTERWEIGHT, {"below": ("over", "weight"), "over": ("weight",), "weight": ("over",)}),
-        (
-            scene_of(*MARKER_PAIR, resting("gelatin_box", floor=0.018, name="box")),
-            {"left": ("box",), "right": ("box",), "box": ()},
-        ),
-    ],
-    ids=["two stacks", "bridge", "counterweight", "pair of markers"],
-)
-def test_losing_support(scene: Scene, losing: dict[str, tuple[str, ...]]) -> None:
-    assert FAST.stability(scene) is None
-    assert {name: FAST.losing_support(scene, name) for name in scene.names} == losing
-
-
-def test_losing_support_is_in_the_scenes_order_and_of_one_stack() -> None:
-    """Taking the lowest of five: all fall, also those that only lie on what falls; the stack beside it stays."""
-    tower = [resting("gelatin_box", floor=0.028 * k, name=f"{k}") for k in range(5)]
-    scene = scene_of(*tower[::-1], resting("cracker_box", xy=(0.2, 0.2), name="beside"))
-    assert FAST.losing_support(scene, "0") == ("4", "3", "2", "1")
-    assert FAST.losing_support(scene, "3") == ("4",)
-    assert FAST.losing_support(scene, "beside") == ()
-
-
-def test_only_an_object_of_the_scene_can_be_taken() -> None:
-    with pytest.raises(KeyError, match="'ghost' is not in the scene; it holds a, b, c, d, e"):
-        FAST.losing_support(TWO_STACKS, "ghost")
-    with pytest.raises(KeyError, match="'tray'"):
-        FAST.losing_support(TWO_STACKS, TRAY)
-
-
-@pytest.mark.parametrize(
-    ("scene", "supports"),
-    [
-        (TWO_STACKS, {"a": {TRAY}, "b": {"a"}, "c": {TRAY}, "d": {"c"}, "e": {"b"}}),
-        (BRIDGE, {"left": {TRAY}, "right": {TRAY}, "bridge": {"left", "right"}}),
-        # Its lower side is level with the marker's top within 2 mm, but the marker is beside it.
-        (
-            scene_of(resting("large_marker", name="m"), resting("gelatin_box", xy=(0.0, 0.06), name="g")),
-            {"m": {TRAY}, "g": {TRAY}},
-        ),
-        (
-            # A step of 1 mm between the two that carry is none: both do.
-            scene_of(
-                *(
-                    resting("sugar_box", xy=(0.0, -0.05), name="low"),
-                    resting("sugar_box", xy=(0.0, 0.05), floor=0.001, name="high"),
-                ),
-                resting("cracker_box", floor=0.039, name="on both"),
-            ),
-            {"low": {TRAY}, "high": {TRAY}, "on both": {"low", "high"}},
-        ),
-    ],
-    ids=["two stacks", "bridge", "side by side", "a small step"],
-)
-def test_supports(scene: Scene, supports: dict[str, set[str]]) -> None:
-    assert FAST.supports(scene) == {name: frozenset(below) for name, below in supports.items()}
-
-
-# --- What can never be moved ---
-
-# A box on a foot, 32 mm too far out, under a larger one that holds it down and leaves free only what is beyond the foot.
-HELD_DOWN = scene_of(
-    resting("sugar_box", UPRIGHT, (-0.0445, 0.0), name="foot"),
-    resting("cracker_box", xy=(0.032, 0.0), floor=0.175, name="held"),
-    resting("cereal_box_large", xy=(-0.060, 0.0), floor=0.235, name="weight"),
-)
-
-
-def test_what_only_its_load_holds_down_is_fixed() -> None:
-    """Whatever is pressed onto the box beyond its load makes it fall sooner: nothing can begin."""
-    assert FAST.stability(HELD_DOWN) is None
-    assert FAST.never_movable(HELD_DOWN) == frozenset({"foot", "held", "weight"})
-    assert FAST.never_movable(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
-    beside = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.25, -0.25), name="beside"))
-    on_top = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top"))
-    for scene in (beside, on_top):
-        assert FAST.stability(scene) is None
-        assert FAST.never_movable(scene) == frozenset({"foot", "held", "weight"})
-
-
-def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
-    """A weight of 140 mm leaves strips of a box of 160 mm free over the foot: something may press there when it goes."""
-    narrower = scene_of(*HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight"))
-    assert FAST.stability(narrower) is None
-    assert FAST.losing_support(narrower, "weight") == ("held",)
-    assert FAST.never_movable(narrower) == frozenset()
-
-
-def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
-    """A class without assets, which the fast judge does not need."""
-    return ObjectClass(name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere"))
-
-
-def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64]) -> Scene:
-    """Two boxes, each with its middle beyond a foot of 20 mm x 90 mm, and over the gap between them what holds them down."""
-    foot = SceneObject("foot", block("foot", Shape.BOX, (0.09, 0.02, 0.10), 0.2), Pose((0.0, 0.0, 0.05)))
-    pair = [resting("gelatin_box", xy=(0.0, s * 0.0375), floor=0.10, name=f"half {s}") for s in (-1, 1)]
-    half = float(np.abs(R_TO[2] * np.array(class_of_load.size)).sum()) / 2
-    return scene_of(foot, *pair, SceneObject("load", class_of_load, Pose.of(R_TO, (0.0, 0.0, 0.128 + half))))
-
-
-def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
-    """A heavy roll over the gap covers what is free over the foot, and when one of the pair goes, nothing keeps it up: what can
-    be put on it presses on its top, over the gap. On a flat load something could be put down first, over the other half."""
-    lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    rolled = a_pair_on_a_narrow_foot(block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying)
-    assert FAST.stability(rolled) is None
-    assert FAST.never_movable(rolled) == frozenset(rolled.names)
-    flat = a_pair_on_a_narrow_foot(block("bar", Shape.BOX, (0.12, 0.018, 0.018), 3.0), np.eye(3))
-    assert FAST.stability(flat) is None
-    assert FAST.never_movable(flat) == frozenset()
-    assert all(FAST.losing_support(flat, name) for name in flat.names)  # though as it is, nothing can be taken
-
-
-@pytest.mark.parametrize("scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())])
-def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
-    assert FAST.never_movable(scene) == frozenset()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
-    scene = random_scene(seed)
-    fixed = FAST.never_movable(scene)
-    if isinstance(fixed, CannotJudge):
-        assert FAST.supports(scene) == fixed
-        return
-    loose = {name for name in scene.names if FAST.losing_support(scene, name) == ()}
-    if FAST.stability(scene) is None:
-        assert loose
-        assert loose.isdisjoint(fixed)
-
-
 # --- What it cannot judge ---
 
 
@@ -752,179 +557,3 @@ def test_what_the_fast_judge_cannot_judge_drake_does(name: str, config: ClutterC
 
 def test_what_the_fast_judge_can_judge_drake_is_not_asked(config: ClutterConfig, fast: FastJudge) -> None:
     assert FastOrDrakeJudge(config).judge(HIDING, rng(2)) == fast.judge(HIDING, rng(2))
-
-
-# --- A user's own meshes ---
-
-
-def hull(corners: NDArray[np.float64]) -> trimesh.Trimesh:
-    made: trimesh.Trimesh = trimesh.convex.convex_hull(corners)
-    return made
-
-
-def regular(sides: int, radius: float, z: float) -> NDArray[np.float64]:
-    angle = np.arange(sides) * (2 * math.pi / sides)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides, z)])
-
-
-ASKEW = Rotation.from_euler("zyx", (40, 40, 40), degrees=True).as_matrix()
-
-
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
-    """A hexagonal prism, a frustum, a wedge that is high at -x, a box askew in its frame, and a bracket, not convex."""
-    folder = tmp_path_factory.mktemp("user") / "own"
-    folder.mkdir()
-    wedge = [[x, y, z] for y in (-0.03, 0.03) for x, z in ((-0.06, 0.0), (0.06, 0.0), (-0.06, 0.08))]
-    outline = [[0.0, 0.0], [0.10, 0.0], [0.10, 0.03], [0.03, 0.03], [0.03, 0.08], [0.0, 0.08]]
-    corners = [[x, y, z] for y in (-0.03, 0.03) for x, z in outline]
-    front = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    sides = [triangle for i in range(6) for j in [(i + 1) % 6] for triangle in ([i, i + 6, j], [j, i + 6, j + 6])]
-    bracket = trimesh.Trimesh(corners, front + [[6 + c, 6 + b, 6 + a] for a, b, c in front] + sides)
-    bracket.fix_normals()
-    meshes = {
-        "prism": hull(np.vstack([regular(6, 0.05, z) for z in (0.0, 0.07)])),
-        "frustum": hull(np.vstack([regular(4, 0.06, 0.0), regular(4, 0.03, 0.06)])),
-        "wedge": hull(np.array(wedge)),
-        "bracket": bracket,
-        "askew": hull(np.array(list(product((-0.025, 0.025), (-0.030, 0.030), (-0.035, 0.035)))) @ ASKEW.T),
-    }
-    for name, mesh in meshes.items():
-        mesh.export(folder / f"{name}.stl")
-    entries = [f"  {name}: {{shape: mesh, mesh: {name}.stl, mass_g: 200}}\n" for name in meshes]
-    (folder / "catalogue.yaml").write_text("classes:\n" + "".join(entries))
-    build_assets(folder)
-    catalogue = load_catalogue(folder)
-    return {name: catalogue.classes[name] for name in meshes}
-
-
-def as_made(
-    object_class: ObjectClass, xy: tuple[float, float], floor: float, degrees: float = 0.0, name: str = "own"
-) -> SceneObject:
-    """On its z, turned about it."""
-    R_TO = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return SceneObject(name, object_class, Pose.of(R_TO, (*xy, floor - float(object_class.corners[:, 2].min()))))
-
-
-@pytest.mark.parametrize(
-    ("class_name", "x", "degrees", "stable"),
-    [
-        ("prism", 0.105, 10.0, True),
-        ("prism", 0.125, 10.0, False),
-        ("frustum", 0.123, 0.0, False),
-        # A wedge's centre of mass is a third of the way from its high end: 20 mm off its middle.
-        ("wedge", 0.123, 0.0, True),
-        ("wedge", 0.107, 180.0, False),
-    ],
-)
-def test_own_meshes_near_the_edge_of_a_box(
-    class_name: str, x: float, degrees: float, stable: bool, own: dict[str, ObjectClass], fast: FastJudge, judge: DrakeJudge
-) -> None:
-    """The edge is at 115 mm."""
-    scene = scene_of(BELOW, as_made(own[class_name], (x, 0.0), 0.060, degrees))
-    mine, drakes = fast.judge(scene, rng(1)), judge.judge(scene, rng(1))
-    assert isinstance(mine, Verdict)
-    assert mine.stable is drakes.stable is stable
-    assert mine.visible_share == pytest.approx(drakes.visible_share, abs=0.01)
-
-
-@pytest.mark.parametrize(("x", "stable"), [(0.012, True), (0.030, False)])
-def test_a_box_on_a_frustums_small_top(
-    x: float, stable: bool, own: dict[str, ObjectClass], fast: FastJudge, judge: DrakeJudge
-) -> None:
-    """Its top is a square of 42 mm on its corner; its outline would carry the box at 30 mm."""
-    scene = scene_of(as_made(own["frustum"], (0.0, 0.0), 0.0), resting("gelatin_box", xy=(x, 0.0), floor=0.060, name="box"))
-    mine = fast.judge(scene, rng(1))
-    assert isinstance(mine, Verdict)
-    assert mine.stable is judge.judge(scene, rng(1)).stable is stable
-
-
-def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: FastJudge) -> None:
-    """From the centre of mass to the nearest side: of a hexagon, its inner radius; of the wedge, 40 mm from its high end."""
-    for class_name, margin in (
-        ("prism", 0.050 * math.cos(math.pi / 6)),
-        ("frustum", 0.060 * math.cos(math.pi / 4)),
-        ("wedge", 0.03),
-    ):
-        found = fast.margins(scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0)))
-        assert not isinstance(found, CannotJudge)
-        assert found["own"] == pytest.approx(margin, abs=1.01 * STEP)
-    over = fast.margins(scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060)))
-    assert not isinstance(over, CannotJudge)
-    assert over["own"] == pytest.approx(0.115 - (0.123 - 0.020), abs=1.01 * STEP)
-
-
-def test_a_mesh_stands_on_a_face_askew_in_its_frame(own: dict[str, ObjectClass], fast: FastJudge) -> None:
-    """On each of its six faces."""
-    for turn in ("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270):
-        R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
-        lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
-        margins = fast.margins(scene_of(SceneObject("own", own["askew"], Pose.of(R_TO, (0.0, 0.0, -lowest)))))
-        assert not isinstance(margins, CannotJudge)
-        assert margins["own"] >= 0.025 - 1.01 * STEP, turn
-
-
-def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: FastJudge) -> None:
-    found = fast.stability(scene_of(as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")))
-    assert found == CannotJudge(CannotJudgeReason.EDGE_CONTACT, "box")
-
-
-def test_the_caster_sees_own_meshes_as_the_camera_does(own: dict[str, ObjectClass], config: ClutterConfig) -> None:
-    """Turned any way. Of a few hundred pixels hardly one is judged otherwise."""
-    turns = Rotation.random(4, rng=rng(2)).as_matrix()
-    tumbled = [
-        SceneObject(name, own[name], Pose.of(turn, (x, 0.02, 0.15)))
-        for name, turn, x in zip(("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False)
-    ]
-    scene = scene_of(*tumbled, resting("sugar_box", xy=(0.05, 0.0), floor=0.25, name="before"))
-    shares = RayCaster(config.camera).visible_shares(scene.objects)
-    assert shares == pytest.approx(OverheadCamera(config.camera).visible_shares(scene), abs=0.01)
-    assert sum(0.02 < share < 0.98 for share in shares.values()) >= 2
-
-
-def test_what_is_not_convex_is_left_to_drake(own: dict[str, ObjectClass], config: ClutterConfig, judge: DrakeJudge) -> None:
-    scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
-    answer = CannotJudge(CannotJudgeReason.NOT_CONVEX, "bracket")
-    fast = FastJudge(config)
-    assert fast.stability(scene) == fast.supports(scene) == fast.judge(scene, rng()) == answer
-    verdict = FastOrDrakeJudge(config).judge(scene, rng(4))
-    assert verdict == judge.judge(scene, rng(4))
-    assert verdict.stable
-
-
-# --- The solver ---
-
-
-def optimal(A: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
-    """Karush, Kuhn and Tucker: no coordinate could grow, and none that is not 0 could shrink, to any use."""
-    gradient = A.T @ (b - A @ x)
-    return bool((x >= 0).all() and gradient.max() < 1e-8 and np.abs(gradient * x).max() < 1e-8)
-
-
-@pytest.mark.parametrize("kind", ["full rank", "low rank", "twin columns", "small whole numbers", "one direction"])
-@pytest.mark.parametrize("within_reach", [True, False])
-def test_nnls(kind: str, within_reach: bool) -> None:
-    """As good as SciPy's, where that one's answer has not grown so large (of a low rank, beyond 1e13) that it means nothing."""
-    generator = rng(0)
-    compared = 0
-    for _ in range(150):
-        rows, columns = int(generator.integers(1, 25)), int(generator.integers(1, 60))
-        A = generator.standard_normal((rows, columns))
-        if kind == "low rank":
-            rank = max(1, min(rows, columns) // 2)
-            A = generator.standard_normal((rows, rank)) @ generator.standard_normal((rank, columns))
-        elif kind == "twin columns":
-            A[:, generator.integers(columns, size=columns // 2)] = A[:, generator.integers(columns, size=columns // 2)]
-        elif kind == "small whole numbers":
-            A = np.round(A)
-        elif kind == "one direction":
-            A += 3 * generator.standard_normal((rows, 1))
-        b = A @ np.maximum(generator.standard_normal(columns), 0) if within_reach else generator.standard_normal(rows)
-        b /= max(1.0, float(np.linalg.norm(b)))
-        x = _nnls(A, b, 1e-9)
-        assert optimal(A, b, x)
-        theirs, residual = nnls(A, b, maxiter=3000)
-        if theirs.max() < 1e6:
-            compared += 1
-            assert np.linalg.norm(A @ x - b) == pytest.approx(residual, abs=1e-8)
-    assert compared > 140

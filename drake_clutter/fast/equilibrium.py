@@ -2,11 +2,13 @@
 
 All contacts are level. A force may act anywhere in a contact polygon, that is, at its corners. Equilibrium under vertical forces
 is a non-negative least-squares problem: three rows per object (force, two moments about its centre of mass) and a column per
-corner (Lawson and Hanson, Solving Least Squares Problems, ch. 23). With friction there are six rows, and four columns a corner.
+corner. With friction there are six rows, and four columns a corner.
 """
 
 import numpy as np
 from numba import njit
+
+from drake_clutter.fast.nnls import nnls
 
 LEVEL_GAP = 0.002
 """m; surfaces whose heights differ by less touch each other."""
@@ -234,73 +236,6 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
-    """x >= 0 that minimises |A x - b|, by Lawson and Hanson's active sets on the normal equations."""
-    rows, columns = A.shape
-    G, c = A.T @ A, A.T @ b
-    x, chosen = np.zeros(columns), np.zeros(columns, np.bool_)
-    blocked = np.zeros(columns, np.bool_)
-    for _ in range(6 * rows + 30):
-        w = c - G @ x
-        entering, most = -1, tolerance
-        for k in range(columns):
-            if not chosen[k] and not blocked[k] and w[k] > most:
-                entering, most = k, w[k]
-        if entering < 0:
-            break
-        chosen[entering] = True
-        while True:
-            members = np.nonzero(chosen)[0]
-            m = len(members)
-            # Cholesky, in place; a column that depends on the others is left out.
-            L, s = np.empty((m, m)), np.empty(m)
-            dependent = -1
-            for r in range(m):
-                for q in range(r + 1):
-                    value = G[members[r], members[q]]
-                    for t in range(q):
-                        value -= L[r, t] * L[q, t]
-                    if r == q:
-                        if value < 1e-11:
-                            dependent = r
-                            break
-                        L[r, r] = np.sqrt(value)
-                    else:
-                        L[r, q] = value / L[q, q]
-                if dependent >= 0:
-                    break
-            if dependent >= 0:
-                chosen[entering] = False
-                x[entering] = 0.0
-                blocked[entering] = True
-                break
-            for r in range(m):
-                value = c[members[r]]
-                for t in range(r):
-                    value -= L[r, t] * s[t]
-                s[r] = value / L[r, r]
-            for r in range(m - 1, -1, -1):
-                value = s[r]
-                for t in range(r + 1, m):
-                    value -= L[t, r] * s[t]
-                s[r] = value / L[r, r]
-            step = 1.0
-            for r in range(m):
-                if s[r] < 0:
-                    step = min(step, x[members[r]] / (x[members[r]] - s[r]))
-            for r in range(m):
-                x[members[r]] += step * (s[r] - x[members[r]])
-            if step >= 1.0:
-                blocked[:] = False
-                break
-            for r in range(m):
-                if x[members[r]] <= 1e-12:
-                    x[members[r]] = 0.0
-                    chosen[members[r]] = False
-    return x
-
-
-@njit(cache=True)
 def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # type: ignore[no-untyped-def]
     """How much of each object's weight and moment no contact forces can hold.
 
@@ -362,7 +297,7 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
                     A[rows * i + 3, column] = sign * fx
                     A[rows * i + 4, column] = sign * fy
                     A[rows * i + 5, column] = sign * (x * fy - y * fx)
-    rest = b - A @ _nnls(A, b, 1e-9) if count > 0 else b
+    rest = b - A @ nnls(A, b, 1e-9) if count > 0 else b
     found = np.empty(n)
     for i in range(n):
         norm = np.sqrt((rest[rows * i : rows * i + rows] ** 2).sum())

@@ -1,0 +1,193 @@
+"""What the fast judge says step by step: margins, supports, what falls when something goes, what can never be moved."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CLASSES, resting, scene_of
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from test_fast_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT, random_scene
+from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
+
+from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import CannotJudge
+
+
+@pytest.mark.parametrize(
+    ("objects", "margins"),
+    [
+        # Half the smaller of the sides, 89 mm and 160 mm; below, all of it counts.
+        ([BELOW, resting("sugar_box", floor=0.060, name="above")], {"below": 80.0, "above": 44.5}),
+        # The overhang's middle is 20 mm inside; of both, the middle is 52.8 mm off.
+        (
+            [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
+            {"below": 115 - 95 * 514 / (514 + 411), "above": 20.0},
+        ),
+        ([BELOW, resting("sugar_box", xy=(0.0, 0.077), floor=0.060, name="above")], {"below": 37.2, "above": 3.0}),
+        # 5 mm and 20 mm beyond the edge: no contact elsewhere makes up for it.
+        ([BELOW, resting("sugar_box", xy=(0.120, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -5.0}),
+        ([BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -20.0}),
+        ([resting("cracker_box", name="a"), resting("gelatin_box", xy=(0.2, 0.2), name="b")], {"a": 80.0, "b": 36.5}),
+        ([resting("cereal_box_large", name="a")], {"a": 97.5}),
+        ([resting("tomato_soup_can", name="a")], {"a": 33.0 * math.cos(math.pi / 16)}),  # of 16 corners
+        ([resting("large_marker", name="a")], {"a": 6.0}),  # its strip
+    ],
+)
+def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
+    found = FAST.margins(scene_of(*objects))
+    assert not isinstance(found, CannotJudge)
+    assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(margins, abs=0.11)
+
+
+def test_what_rolls_has_no_margin() -> None:
+    margins = FAST.margins(scene_of(*TABLE["a box on a marker"][0]))
+    assert not isinstance(margins, CannotJudge)
+    assert min(margins.values()) < MARGIN
+
+
+COUNTERWEIGHT = scene_of(BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight"))
+BRIDGE = scene_of(*STANDING_PAIR, resting("cracker_box", floor=0.175, name="bridge"))
+TWO_STACKS = scene_of(
+    *(resting("cracker_box", xy=(0.0, -0.2), name="a"), resting("sugar_box", xy=(0.0, -0.2), floor=0.060, name="b")),
+    *(resting("cracker_box", xy=(0.0, 0.2), name="c"), resting("sugar_box", xy=(0.0, 0.2), floor=0.060, name="d")),
+    resting("gelatin_box", xy=(0.0, -0.2), floor=0.098, name="e"),
+)
+
+
+@pytest.mark.parametrize(
+    ("scene", "losing"),
+    [
+        (TWO_STACKS, {"a": ("b", "e"), "b": ("e",), "c": ("d",), "d": (), "e": ()}),
+        (BRIDGE, {"left": ("bridge",), "right": ("bridge",), "bridge": ()}),
+        (COUNTERWEIGHT, {"below": ("over", "weight"), "over": ("weight",), "weight": ("over",)}),
+        (
+            scene_of(*MARKER_PAIR, resting("gelatin_box", floor=0.018, name="box")),
+            {"left": ("box",), "right": ("box",), "box": ()},
+        ),
+    ],
+    ids=["two stacks", "bridge", "counterweight", "pair of markers"],
+)
+def test_losing_support(scene: Scene, losing: dict[str, tuple[str, ...]]) -> None:
+    assert FAST.stability(scene) is None
+    assert {name: FAST.losing_support(scene, name) for name in scene.names} == losing
+
+
+def test_losing_support_is_in_the_scenes_order_and_of_one_stack() -> None:
+    """Taking the lowest of five: all fall, also those that only lie on what falls; the stack beside it stays."""
+    tower = [resting("gelatin_box", floor=0.028 * k, name=f"{k}") for k in range(5)]
+    scene = scene_of(*tower[::-1], resting("cracker_box", xy=(0.2, 0.2), name="beside"))
+    assert FAST.losing_support(scene, "0") == ("4", "3", "2", "1")
+    assert FAST.losing_support(scene, "3") == ("4",)
+    assert FAST.losing_support(scene, "beside") == ()
+
+
+def test_only_an_object_of_the_scene_can_be_taken() -> None:
+    with pytest.raises(KeyError, match="'ghost' is not in the scene; it holds a, b, c, d, e"):
+        FAST.losing_support(TWO_STACKS, "ghost")
+    with pytest.raises(KeyError, match="'tray'"):
+        FAST.losing_support(TWO_STACKS, TRAY)
+
+
+@pytest.mark.parametrize(
+    ("scene", "supports"),
+    [
+        (TWO_STACKS, {"a": {TRAY}, "b": {"a"}, "c": {TRAY}, "d": {"c"}, "e": {"b"}}),
+        (BRIDGE, {"left": {TRAY}, "right": {TRAY}, "bridge": {"left", "right"}}),
+        # Its lower side is level with the marker's top within 2 mm, but the marker is beside it.
+        (
+            scene_of(resting("large_marker", name="m"), resting("gelatin_box", xy=(0.0, 0.06), name="g")),
+            {"m": {TRAY}, "g": {TRAY}},
+        ),
+        (
+            # A step of 1 mm between the two that carry is none: both do.
+            scene_of(
+                *(
+                    resting("sugar_box", xy=(0.0, -0.05), name="low"),
+                    resting("sugar_box", xy=(0.0, 0.05), floor=0.001, name="high"),
+                ),
+                resting("cracker_box", floor=0.039, name="on both"),
+            ),
+            {"low": {TRAY}, "high": {TRAY}, "on both": {"low", "high"}},
+        ),
+    ],
+    ids=["two stacks", "bridge", "side by side", "a small step"],
+)
+def test_supports(scene: Scene, supports: dict[str, set[str]]) -> None:
+    assert FAST.supports(scene) == {name: frozenset(below) for name, below in supports.items()}
+
+
+# --- What can never be moved ---
+
+# A box on a foot, 32 mm too far out, under a larger one that holds it down and leaves free only what is beyond the foot.
+HELD_DOWN = scene_of(
+    resting("sugar_box", UPRIGHT, (-0.0445, 0.0), name="foot"),
+    resting("cracker_box", xy=(0.032, 0.0), floor=0.175, name="held"),
+    resting("cereal_box_large", xy=(-0.060, 0.0), floor=0.235, name="weight"),
+)
+
+
+def test_what_only_its_load_holds_down_is_fixed() -> None:
+    """Whatever is pressed onto the box beyond its load makes it fall sooner: nothing can begin."""
+    assert FAST.stability(HELD_DOWN) is None
+    assert FAST.never_movable(HELD_DOWN) == frozenset({"foot", "held", "weight"})
+    assert FAST.never_movable(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
+    beside = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.25, -0.25), name="beside"))
+    on_top = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top"))
+    for scene in (beside, on_top):
+        assert FAST.stability(scene) is None
+        assert FAST.never_movable(scene) == frozenset({"foot", "held", "weight"})
+
+
+def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
+    """A weight of 140 mm leaves strips of a box of 160 mm free over the foot: something may press there when it goes."""
+    narrower = scene_of(*HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight"))
+    assert FAST.stability(narrower) is None
+    assert FAST.losing_support(narrower, "weight") == ("held",)
+    assert FAST.never_movable(narrower) == frozenset()
+
+
+def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
+    """A class without assets, which the fast judge does not need."""
+    return ObjectClass(name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere"))
+
+
+def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64]) -> Scene:
+    """Two boxes, each with its middle beyond a foot of 20 mm x 90 mm, and over the gap between them what holds them down."""
+    foot = SceneObject("foot", block("foot", Shape.BOX, (0.09, 0.02, 0.10), 0.2), Pose((0.0, 0.0, 0.05)))
+    pair = [resting("gelatin_box", xy=(0.0, s * 0.0375), floor=0.10, name=f"half {s}") for s in (-1, 1)]
+    half = float(np.abs(R_TO[2] * np.array(class_of_load.size)).sum()) / 2
+    return scene_of(foot, *pair, SceneObject("load", class_of_load, Pose.of(R_TO, (0.0, 0.0, 0.128 + half))))
+
+
+def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
+    """A heavy roll over the gap covers what is free over the foot, and when one of the pair goes, nothing keeps it up: what can
+    be put on it presses on its top, over the gap. On a flat load something could be put down first, over the other half."""
+    lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    rolled = a_pair_on_a_narrow_foot(block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying)
+    assert FAST.stability(rolled) is None
+    assert FAST.never_movable(rolled) == frozenset(rolled.names)
+    flat = a_pair_on_a_narrow_foot(block("bar", Shape.BOX, (0.12, 0.018, 0.018), 3.0), np.eye(3))
+    assert FAST.stability(flat) is None
+    assert FAST.never_movable(flat) == frozenset()
+    assert all(FAST.losing_support(flat, name) for name in flat.names)  # though as it is, nothing can be taken
+
+
+@pytest.mark.parametrize("scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())])
+def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
+    assert FAST.never_movable(scene) == frozenset()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
+    scene = random_scene(seed)
+    fixed = FAST.never_movable(scene)
+    if isinstance(fixed, CannotJudge):
+        assert FAST.supports(scene) == fixed
+        return
+    loose = {name for name in scene.names if FAST.losing_support(scene, name) == ()}
+    if FAST.stability(scene) is None:
+        assert loose
+        assert loose.isdisjoint(fixed)
