@@ -55,9 +55,9 @@ BATCHES = {
     Batch("ycb7", 15, 0): 300,
     Batch("ycb7", 20, 0): 300,
     Batch("pantry14", 25, 0): 300,
-    Batch("ycb7", 25, 0, "other offsets"): 60,
-    Batch("ycb7", 25, 0, "no early stop"): 24,
-    Batch("ycb7", 25, 0, "1 ms steps"): 24,
+    Batch("ycb7", 25, 0, "other offsets"): 100,
+    Batch("ycb7", 25, 0, "no early stop"): 100,
+    Batch("ycb7", 25, 0, "1 ms steps"): 100,
 }
 """How many scenes of each batch the published experiment asks about."""
 MOVES = 1000
