@@ -35,7 +35,8 @@ def test_nnls(kind: str, within_reach: bool) -> None:
             A += 3 * generator.standard_normal((rows, 1))
         b = A @ np.maximum(generator.standard_normal(columns), 0) if within_reach else generator.standard_normal(rows)
         b /= max(1.0, float(np.linalg.norm(b)))
-        x = nnls(A, b, 1e-9)
+        x, rest = nnls(np.ascontiguousarray(A.T), b, 1e-9)
+        np.testing.assert_allclose(rest, b - A @ x, atol=1e-9)
         assert optimal(A, b, x)
         theirs, residual = scipy_nnls(A, b, maxiter=3000)
         if theirs.max() < 1e6:

@@ -72,10 +72,10 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
 
 
 @njit(cache=True)
-def contact_polygon(table, lower_shape, upper_shape, lower_p, upper_p, margin):  # type: ignore[no-untyped-def]
+def contact_polygon(posed, lower_shape, upper_shape, lower_p, upper_p, margin):  # type: ignore[no-untyped-def]
     """Corners (V, 2) m in T where an object stands on another one (shape -1: on the tray), shrunk by the margin (m)."""
     polygon = np.empty((48, 2))
-    bottom, corners = table.bottom[upper_shape], table.bottom_count[upper_shape]
+    bottom, corners = posed[upper_shape].bottom, posed[upper_shape].bottom_count
     # Larger than the bottom, so that a negative margin makes it grow.
     reach = 0.1
     for k in range(corners):
@@ -85,48 +85,40 @@ def contact_polygon(table, lower_shape, upper_shape, lower_p, upper_p, margin): 
         polygon[k, 1] = upper_p[1] + (reach if k in (2, 3) else -reach)
     count = _clip_to(polygon, 4, bottom, corners, upper_p[0], upper_p[1], margin)
     if lower_shape >= 0:
-        top, corners = table.top[lower_shape], table.top_count[lower_shape]
+        top, corners = posed[lower_shape].top, posed[lower_shape].top_count
         count = _clip_to(polygon, count, top, corners, lower_p[0], lower_p[1], margin) if corners > 0 else 0
     return polygon[:count]
 
 
 @njit(cache=True)
-def _overlap(table, i, j, p_i, p_j, how_far):  # type: ignore[no-untyped-def]
+def _overlap(posed, i, j, p_i, p_j, how_far):  # type: ignore[no-untyped-def]
     """How deep two outlines overlap seen from above, m (separating axes); not positive: they do not.
 
     With `how_far`, a negative value says how far apart they are at least.
     """
-    apart = np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1]) - table.reach[i] - table.reach[j]
+    apart = np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1]) - posed[i].reach - posed[j].reach
     if apart > (BESIDE if how_far else 0.0):
         return -apart
     least = np.inf
-    for first in range(2):
-        a, b = (i, j) if first == 0 else (j, i)
-        p_a, p_b = (p_i, p_j) if first == 0 else (p_j, p_i)
-        corners, count = table.footprint[a], table.footprint_count[a]
-        others, other_count = table.footprint[b], table.footprint_count[b]
-        for k in range(count):
-            after = (k + 1) % count
-            ex, ey = corners[after, 0] - corners[k, 0], corners[after, 1] - corners[k, 1]
-            length = np.hypot(ex, ey)
-            nx, ny = ey / length, -ex / length
+    for a, b, p_a, p_b in ((i, j, p_i, p_j), (j, i, p_j, p_i)):
+        dx, dy = p_b[0] - p_a[0], p_b[1] - p_a[1]
+        sides, corners = posed[a].sides, posed[b].footprint
+        for k in range(posed[a].footprint_count):
+            nx, ny, out = sides[k, 0], sides[k, 1], sides[k, 2]
             nearest = np.inf
-            for m in range(other_count):
-                nearest = min(
-                    nearest,
-                    (others[m, 0] + p_b[0] - corners[k, 0] - p_a[0]) * nx + (others[m, 1] + p_b[1] - corners[k, 1] - p_a[1]) * ny,
-                )
-            least = min(least, -nearest)
+            for m in range(posed[b].footprint_count):
+                nearest = min(nearest, corners[m, 0] * nx + corners[m, 1] * ny)
+            least = min(least, out - nearest - dx * nx - dy * ny)
             if least <= 0 and not how_far:
                 return least
     return least
 
 
 @njit(cache=True)
-def free_top(table, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
+def free_top(posed, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
     """Corners (V, 2) m in T of what an object's top has beside another object that covers some of it, and the margin (m)."""
-    top, count = table.top[shape], table.top_count[shape]
-    outline, outline_count = table.footprint[above], table.footprint_count[above]
+    top, count = posed[shape].top, posed[shape].top_count
+    outline, outline_count = posed[above].footprint, posed[above].footprint_count
     found = np.empty((0, 2))
     for k in range(outline_count):  # the part of the top beyond each side of the outline
         after = (k + 1) % outline_count
@@ -140,15 +132,14 @@ def free_top(table, shape, above, p_T, above_p, margin):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def touching(table, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
+def touching(posed, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
     """(n,) whether each object may touch that of a row, directly or through others: axis-aligned boxes within the margin (m)."""
     n = len(shapes)
     lower, upper = np.empty((n, 3)), np.empty((n, 3))
     for i in range(n):
-        for axis in range(2):
-            outline = table.footprint[shapes[i], : table.footprint_count[shapes[i]], axis]
-            lower[i, axis], upper[i, axis] = p_T[i, axis] + outline.min(), p_T[i, axis] + outline.max()
-        lower[i, 2], upper[i, 2] = p_T[i, 2] + table.low[shapes[i]], p_T[i, 2] + table.high[shapes[i]]
+        for axis in range(3):
+            lower[i, axis] = p_T[i, axis] + posed[shapes[i]].lower[axis]
+            upper[i, axis] = p_T[i, axis] + posed[shapes[i]].upper[axis]
     reached = np.zeros(n, np.bool_)
     reached[row] = True
     waiting = [row]
@@ -165,12 +156,12 @@ def touching(table, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
+def contacts(posed, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
     """Who stands on whom.
 
     Args:
-        table: of the shapes.
-        shapes: (n,) rows of the table.
+        posed: (N,) of `shapes.POSED`.
+        shapes: (n,) the objects' rows.
         p_T: (n, 3) m.
         tray_side: m.
 
@@ -185,15 +176,15 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
     fault, culprit = SOUND, 0
     for j in range(n):
         shape = shapes[j]
-        if table.fault[shape] != 0:
-            return LEANING if table.fault[shape] == 1 else NOT_CONVEX, j, pairs[:0], stack
-        for k in range(table.footprint_count[shape]):
-            for axis in range(2):
-                if abs(table.footprint[shape, k, axis] + p_T[j, axis]) > tray_side / 2 + DEEPEST:
-                    return OUTSIDE, j, pairs[:0], stack
+        if posed[shape].fault != 0:
+            return LEANING if posed[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
+        for axis in range(2):
+            beyond = max(posed[shape].upper[axis] + p_T[j, axis], -posed[shape].lower[axis] - p_T[j, axis]) - tray_side / 2
+            if beyond > DEEPEST:
+                return OUTSIDE, j, pairs[:0], stack
     for j in range(n):
         upper = shapes[j]
-        low = p_T[j, 2] + table.low[upper]
+        low = p_T[j, 2] + posed[upper].low
         supported = False
         if low < -LEVEL_GAP:
             return OVERLAPPING, j, pairs[:0], stack
@@ -206,12 +197,12 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
             if i == j:
                 continue
             lower = shapes[i]
-            high = p_T[i, 2] + table.high[lower]
+            high = p_T[i, 2] + posed[lower].high
             level = abs(low - high) < LEVEL_GAP
-            over = min(p_T[j, 2] + table.high[upper], high) - max(low, p_T[i, 2] + table.low[lower])
+            over = min(p_T[j, 2] + posed[upper].high, high) - max(low, p_T[i, 2] + posed[lower].low)
             if not level and over <= DEEPEST:
                 continue
-            deep = _overlap(table, upper, lower, p_T[j], p_T[i], level)
+            deep = _overlap(posed, upper, lower, p_T[j], p_T[i], level)
             if not level:
                 if deep > DEEPEST and fault == SOUND:
                     fault, culprit = OVERLAPPING, j
@@ -220,8 +211,8 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
             above |= deep > 0
             if deep <= 0:
                 continue
-            whole = table.flat[upper] and table.flat[lower]  # what overlaps seen from above is in contact
-            if whole or len(contact_polygon(table, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
+            whole = posed[upper].flat and posed[lower].flat  # what overlaps seen from above is in contact
+            if whole or len(contact_polygon(posed, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
                 supported = True
@@ -236,12 +227,12 @@ def contacts(table, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # type: ignore[no-untyped-def]
+def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # type: ignore[no-untyped-def]
     """How much of each object's weight and moment no contact forces can hold.
 
     Args:
-        table: of the shapes.
-        shapes: (n,) rows of the table.
+        posed: (N,) of `shapes.POSED`.
+        shapes: (n,) the objects' rows.
         p_T: (n, 3) m.
         pairs: (c, 2) lower (`GROUND`: the tray) and upper object of each contact.
         margins: (n,) m, by which the contacts below each object are shrunk.
@@ -262,26 +253,26 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
     for c in range(len(pairs)):
         lower, upper = pairs[c]
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
-        polygon = contact_polygon(table, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper])
+        polygon = contact_polygon(posed, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper])
         for k in range(len(polygon)):
             at[count, 0], at[count, 1] = polygon[k, 0], polygon[k, 1]
-            at[count, 2] = p_T[upper, 2] + table.low[shapes[upper]]
+            at[count, 2] = p_T[upper, 2] + posed[shapes[upper]].low
             ends[count, 0], ends[count, 1] = upper, lower
             count += 1
     total = 0.0
     for i in range(n):
-        total += table.mass[shapes[i]]
+        total += posed[shapes[i]].mass
     rows, sides = (6, 4) if friction > 0 else (3, 1)
-    A, b = np.zeros((rows * n, sides * count)), np.zeros(rows * n)
+    A, b = np.zeros((sides * count, rows * n)), np.zeros(rows * n)  # a row of A is a column of the problem
     for i in range(n):
-        b[rows * i] = table.mass[shapes[i]] / total
+        b[rows * i] = posed[shapes[i]].mass / total
     for k in range(count):
         for end in range(2):
             i = ends[k, end]
             if i < 0:
                 continue
             sign = 1.0 - 2.0 * end
-            com = table.com[shapes[i]]
+            com = posed[shapes[i]].com
             x = (at[k, 0] - p_T[i, 0] - com[0] - aside[i, 0]) / _LENGTH
             y = (at[k, 1] - p_T[i, 1] - com[1] - aside[i, 1]) / _LENGTH
             z = (at[k, 2] - p_T[i, 2] - com[2]) / _LENGTH
@@ -290,14 +281,14 @@ def residuals(table, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
                 fx = friction * ((side == 0) - (side == 1)) if slants else 0.0
                 fy = friction * ((side == 2) - (side == 3)) if slants else 0.0
                 column = sides * k + side
-                A[rows * i, column] = sign
-                A[rows * i + 1, column] = sign * (y - z * fy)
-                A[rows * i + 2, column] = sign * (z * fx - x)
+                A[column, rows * i] = sign
+                A[column, rows * i + 1] = sign * (y - z * fy)
+                A[column, rows * i + 2] = sign * (z * fx - x)
                 if sides > 1:
-                    A[rows * i + 3, column] = sign * fx
-                    A[rows * i + 4, column] = sign * fy
-                    A[rows * i + 5, column] = sign * (x * fy - y * fx)
-    rest = b - A @ nnls(A, b, 1e-9) if count > 0 else b
+                    A[column, rows * i + 3] = sign * fx
+                    A[column, rows * i + 4] = sign * fy
+                    A[column, rows * i + 5] = sign * (x * fy - y * fx)
+    rest = nnls(A, b, 1e-9)[1]
     found = np.empty(n)
     for i in range(n):
         norm = np.sqrt((rest[rows * i : rows * i + rows] ** 2).sum())
@@ -318,7 +309,7 @@ def _holds(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _stands_one_on_one(table, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
+def _stands_one_on_one(posed, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
     """Whether a stack stands in which no object has more than one contact below: then loads simply add up from the top.
 
     False also if there is such an object, or a cylinder that carries: then it takes a solver to know.
@@ -326,22 +317,22 @@ def _stands_one_on_one(table, shapes, p_T, pairs, margin):  # type: ignore[no-un
     n = len(shapes)
     below = np.full(n, -2)
     for lower, upper in pairs:
-        if below[upper] != -2 or (lower >= 0 and table.rolls[shapes[lower]]):
+        if below[upper] != -2 or (lower >= 0 and posed[shapes[lower]].rolls):
             return False
         below[upper] = lower
     force, moment = np.empty(n), np.empty((n, 2))  # of the object and all that it carries
     for i in range(n):
-        force[i] = table.mass[shapes[i]]
+        force[i] = posed[shapes[i]].mass
         for axis in range(2):
-            moment[i, axis] = force[i] * (p_T[i, axis] + table.com[shapes[i], axis])
+            moment[i, axis] = force[i] * (p_T[i, axis] + posed[shapes[i]].com[axis])
     for i in np.argsort(p_T[:, 2])[::-1]:
         x, y = moment[i, 0] / force[i], moment[i, 1] / force[i]
         shape, lower = shapes[i], below[i]
-        if not _holds(table.bottom[shape], table.bottom_count[shape], p_T[i], x, y, margin):
+        if not _holds(posed[shape].bottom, posed[shape].bottom_count, p_T[i], x, y, margin):
             return False
         if lower >= 0:
             carrier = shapes[lower]
-            if not _holds(table.top[carrier], table.top_count[carrier], p_T[lower], x, y, margin):
+            if not _holds(posed[carrier].top, posed[carrier].top_count, p_T[lower], x, y, margin):
                 return False
             force[lower] += force[i]
             moment[lower, 0] += moment[i, 0]
@@ -350,37 +341,37 @@ def _stands_one_on_one(table, shapes, p_T, pairs, margin):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def weakest(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
+def weakest(posed, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
     """The object of a stack that is furthest from equilibrium, and whether it rolls; -1 if the stack stands.
 
     Vertical forces come first; what they cannot hold, forces with friction may, as in an arch of two boxes that lean on what
     bridges them. All contacts are shrunk by the margin (m). The line along which a cylinder carries has no width to shrink:
     instead, what lies on one must also be held with its centre of mass moved by the margin to either side of the line.
     """
-    if _stands_one_on_one(table, shapes, p_T, pairs, margin):
+    if _stands_one_on_one(posed, shapes, p_T, pairs, margin):
         return -1, False
     n = len(shapes)
     margins, aside = np.full(n, margin), np.zeros((n, 2))
-    rest = residuals(table, shapes, p_T, pairs, margins, aside, 0.0, NO_LOADS)
+    rest = residuals(posed, shapes, p_T, pairs, margins, aside, 0.0, NO_LOADS)
     needed = 0.0
     if rest.max() > 0:
         needed = friction
-        if residuals(table, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
+        if residuals(posed, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
             return np.nonzero(rest > rest.max() - 1e-9)[0][0], False  # of twins the first, whatever rounding says
     for lower, upper in pairs:
-        if lower >= 0 and table.rolls[shapes[lower]]:
-            line = table.top[shapes[lower], 1] - table.top[shapes[lower], 0]
+        if lower >= 0 and posed[shapes[lower]].rolls:
+            line = posed[shapes[lower]].top[1] - posed[shapes[lower]].top[0]
             for sign in (-1.0, 1.0):
                 aside[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
                 aside[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
-                if residuals(table, shapes, p_T, pairs, margins, aside, needed, NO_LOADS).max() > 0:
+                if residuals(posed, shapes, p_T, pairs, margins, aside, needed, NO_LOADS).max() > 0:
                     return upper, True
             aside[upper] = 0.0
     return -1, False
 
 
 @njit(cache=True)
-def weakest_each(table, shapes, p_T, pairs, order, first, margin, friction):  # type: ignore[no-untyped-def]
+def weakest_each(posed, shapes, p_T, pairs, order, first, margin, friction):  # type: ignore[no-untyped-def]
     """See `weakest`, for several stacks: the rows of stack k are order[first[k]] up to order[first[k + 1]].
 
     Returns:
@@ -400,5 +391,5 @@ def weakest_each(table, shapes, p_T, pairs, order, first, margin, friction):  # 
             if position[lower] != -2 and position[upper] != -2:
                 within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
                 contacts += 1
-        found[k], rolls[k] = weakest(table, shapes[rows], p_T[rows], within[:contacts], margin, friction)
+        found[k], rolls[k] = weakest(posed, shapes[rows], p_T[rows], within[:contacts], margin, friction)
     return found, rolls

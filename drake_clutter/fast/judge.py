@@ -75,8 +75,8 @@ class FastJudge:
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
         """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
-        p_T = np.array([o.X_TO.translation for o in scene.objects]).reshape(-1, 3)
-        found = self.stability(scene)
+        shapes, p_T = self._arrays(scene.objects)
+        found = self._stability(scene, shapes, p_T)
         if isinstance(found, CannotJudge):
             return found
         moved = p_T + random_offsets(len(p_T), self._config.settle.jitter, rng)
@@ -89,7 +89,10 @@ class FastJudge:
 
     def stability(self, scene: Scene) -> Instability | CannotJudge | None:
         """What does not stand, or None if everything does."""
-        standing = self._standing(scene)
+        return self._stability(scene, *self._arrays(scene.objects))
+
+    def _stability(self, scene: Scene, shapes: Ints, p_T: Floats) -> Instability | CannotJudge | None:
+        standing = self._standing(scene, shapes, p_T)
         if isinstance(standing, CannotJudge):
             if standing.reason is CannotJudgeReason.UNSUPPORTED:
                 return Instability(InstabilityReason.UNSUPPORTED, standing.object)
@@ -97,8 +100,7 @@ class FastJudge:
         members: dict[int, list[int]] = defaultdict(list)
         for row, number in enumerate(standing.stack.tolist()):
             members[number].append(row)
-        stacks = list(members.values())
-        for weakest, rolls in self._weakest(standing, stacks):
+        for weakest, rolls in self._weakest(standing, list(members.values())):
             if weakest >= 0:
                 reason = InstabilityReason.ROLLS if rolls else InstabilityReason.UNBALANCED
                 return Instability(reason, scene.objects[weakest].name)
@@ -106,7 +108,7 @@ class FastJudge:
 
     def supports(self, scene: Scene) -> dict[str, frozenset[str]] | CannotJudge:
         """What each object stands on, by name; `TRAY` for the tray."""
-        standing = self._standing(scene)
+        standing = self._standing(scene, *self._arrays(scene.objects))
         if isinstance(standing, CannotJudge):
             return standing
         found: dict[str, set[str]] = {name: set() for name in scene.names}
@@ -122,7 +124,7 @@ class FastJudge:
         """
         scene[name]
         shapes, p_T = self._arrays(scene.objects)
-        reached = equilibrium.touching(self._shapes.table, shapes, p_T, scene.names.index(name), _TOUCHING)
+        reached = equilibrium.touching(self._shapes.table.posed, shapes, p_T, scene.names.index(name), _TOUCHING)
         return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
 
     def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
@@ -134,7 +136,7 @@ class FastJudge:
             KeyError: no such object.
         """
         scene = self.group(scene, name)
-        standing = self._standing(scene)
+        standing = self._standing(scene, *self._arrays(scene.objects))
         if isinstance(standing, CannotJudge):
             return standing
         _, _, pairs, stack = standing
@@ -159,7 +161,7 @@ class FastJudge:
         Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm. What rolls
         has none.
         """
-        standing = self._standing(scene)
+        standing = self._standing(scene, *self._arrays(scene.objects))
         if isinstance(standing, CannotJudge):
             return standing
         shapes, p_T, pairs, stack = standing
@@ -173,7 +175,7 @@ class FastJudge:
                 margin[own] = (low + high) / 2
                 aside = np.zeros((len(rows), 2))
                 rest = equilibrium.residuals(
-                    self._shapes.table, shapes[rows], p_T[rows], members, margin, aside, 0.0, equilibrium.NO_LOADS
+                    self._shapes.table.posed, shapes[rows], p_T[rows], members, margin, aside, 0.0, equilibrium.NO_LOADS
                 )
                 low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
             found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
@@ -189,7 +191,7 @@ class FastJudge:
         which may be gone by then, press straight down wherever the tops are free. (A bridge to another stack that pushes sideways
         is not thought of.) What is not in the set may still be impossible to move.
         """
-        standing = self._standing(scene)
+        standing = self._standing(scene, *self._arrays(scene.objects))
         if isinstance(standing, CannotJudge):
             return standing
         shapes, p_T, pairs, _ = standing
@@ -211,16 +213,17 @@ class FastJudge:
         rest = sorted(stack - {taken})
         if not rest:
             return True
+        posed = self._shapes.table.posed
         # What is not fixed holds like the ground does while it is there.
         number = {row: k for k, row in enumerate(rest)}
         contacts = [(number.get(a, equilibrium.GROUND), number[b]) for a, b in pairs.tolist() if b in number and a != taken]
         loads = [
-            (x, y, p_T[row, 2] + self._shapes.table.high[shapes[row]], number[row])
+            (x, y, p_T[row, 2] + posed[shapes[row]]["high"], number[row])
             for row in rest
-            for x, y in equilibrium.free_top(self._shapes.table, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
+            for x, y in equilibrium.free_top(posed, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
         ]
         residuals = equilibrium.residuals(
-            self._shapes.table,
+            posed,
             shapes[rest],
             p_T[rest],
             np.array(contacts, dtype=np.int64).reshape(-1, 2),
@@ -231,10 +234,9 @@ class FastJudge:
         )
         return bool(residuals.max() == 0)
 
-    def _standing(self, scene: Scene) -> "_Standing | CannotJudge":
+    def _standing(self, scene: Scene, shapes: Ints, p_T: Floats) -> "_Standing | CannotJudge":
         """Who stands on whom, if all objects are within the model."""
-        shapes, p_T = self._arrays(scene.objects)
-        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table, shapes, p_T, scene.tray_side)
+        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table.posed, shapes, p_T, scene.tray_side)
         if fault != equilibrium.SOUND:
             return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
         return _Standing(shapes, p_T, pairs, stack)
@@ -262,7 +264,7 @@ class FastJudge:
             rows_of_all = np.array([row for rows in unknown.values() for row in rows])
             first = np.cumsum([0] + [len(rows) for rows in unknown.values()])
             arguments = (
-                self._shapes.table,
+                self._shapes.table.posed,
                 standing.shapes,
                 standing.p_T,
                 standing.pairs,

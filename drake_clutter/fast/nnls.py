@@ -7,74 +7,86 @@ import numpy as np
 from numba import njit
 
 
+@njit(cache=True, fastmath={"reassoc"})
+def _dot(a, b, count):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(cache=True)
+def _factor_row(A, members, m, L):  # type: ignore[no-untyped-def]
+    """Writes row m of the Cholesky factor of the members' normal equations; False if that member depends on those before it."""
+    newest = A[members[m]]
+    for q in range(m):
+        L[m, q] = (_dot(newest, A[members[q]], len(newest)) - _dot(L[m], L[q], q)) / L[q, q]
+    pivot = _dot(newest, newest, len(newest)) - _dot(L[m], L[m], m)
+    L[m, m] = np.sqrt(max(pivot, 1e-11))
+    return pivot > 1e-11
+
+
 @njit(cache=True)
 def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
-    """x >= 0, (columns,), that minimises |A x - b|, by active sets on the normal equations.
+    """The x >= 0 that minimises |A^T x - b|, by active sets on the normal equations.
 
     Args:
-        A: (rows, columns).
+        A: (columns, rows), transposed, so that a column lies in one piece.
         b: (rows,).
         tolerance: slopes of the squared residual below this are taken for zero.
+
+    Returns:
+        x (columns,) and the residual b - A^T x (rows,).
     """
-    rows, columns = A.shape
-    G, c = A.T @ A, A.T @ b
-    x, chosen = np.zeros(columns), np.zeros(columns, np.bool_)
-    blocked = np.zeros(columns, np.bool_)
+    columns, rows = A.shape
+    x, rest = np.zeros(columns), b.copy()
+    chosen, blocked = np.zeros(columns, np.bool_), np.zeros(columns, np.bool_)
+    most_members = min(columns, rows) + 1
+    members, m = np.empty(most_members, np.int64), 0
+    L, c, s = np.empty((most_members, most_members)), np.empty(most_members), np.empty(most_members)
     for _ in range(6 * rows + 30):
-        w = c - G @ x
         entering, most = -1, tolerance
         for k in range(columns):
-            if not chosen[k] and not blocked[k] and w[k] > most:
-                entering, most = k, w[k]
+            if not chosen[k] and not blocked[k]:
+                slope = _dot(A[k], rest, rows)
+                if slope > most:
+                    entering, most = k, slope
         if entering < 0:
             break
+        members[m] = entering
+        if m + 1 == most_members or not _factor_row(A, members, m, L):
+            blocked[entering] = True
+            continue
         chosen[entering] = True
+        c[m] = _dot(A[entering], b, rows)
+        m += 1
         while True:
-            members = np.nonzero(chosen)[0]
-            m = len(members)
-            # Cholesky, in place; a column that depends on the others is left out.
-            L, s = np.empty((m, m)), np.empty(m)
-            dependent = -1
             for r in range(m):
-                for q in range(r + 1):
-                    value = G[members[r], members[q]]
-                    for t in range(q):
-                        value -= L[r, t] * L[q, t]
-                    if r == q:
-                        if value < 1e-11:
-                            dependent = r
-                            break
-                        L[r, r] = np.sqrt(value)
-                    else:
-                        L[r, q] = value / L[q, q]
-                if dependent >= 0:
-                    break
-            if dependent >= 0:
-                chosen[entering] = False
-                x[entering] = 0.0
-                blocked[entering] = True
-                break
-            for r in range(m):
-                value = c[members[r]]
-                for t in range(r):
-                    value -= L[r, t] * s[t]
-                s[r] = value / L[r, r]
+                s[r] = (c[r] - _dot(L[r], s, r)) / L[r, r]
             for r in range(m - 1, -1, -1):
-                value = s[r]
                 for t in range(r + 1, m):
-                    value -= L[t, r] * s[t]
-                s[r] = value / L[r, r]
+                    s[r] -= L[t, r] * s[t]
+                s[r] /= L[r, r]
             step = 1.0
             for r in range(m):
                 if s[r] < 0:
                     step = min(step, x[members[r]] / (x[members[r]] - s[r]))
+            kept = 0
             for r in range(m):
-                x[members[r]] += step * (s[r] - x[members[r]])
+                k = members[r]
+                x[k] += step * (s[r] - x[k])
+                if step < 1.0 and x[k] <= 1e-12:
+                    x[k], chosen[k] = 0.0, False
+                    continue
+                members[kept], c[kept] = k, c[r]
+                if kept < r:
+                    _factor_row(A, members, kept, L)
+                kept += 1
+            m = kept
             if step >= 1.0:
                 blocked[:] = False
                 break
-            for r in range(m):
-                if x[members[r]] <= 1e-12:
-                    x[members[r]] = 0.0
-                    chosen[members[r]] = False
-    return x
+        rest[:] = b
+        for r in range(m):
+            rest -= x[members[r]] * A[members[r]]
+    return x, rest

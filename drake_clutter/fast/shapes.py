@@ -168,66 +168,59 @@ def _area(face: Floats) -> float:
     return float(np.linalg.norm(np.cross(face[1:-1] - face[0], face[2:] - face[0]).sum(axis=0)) / 2)
 
 
+POSED = np.dtype(
+    [
+        ("fault", np.int64),
+        ("rolls", np.bool_),
+        ("flat", np.bool_),
+        ("com", np.float64, 3),
+        ("lower", np.float64, 3),
+        ("upper", np.float64, 3),
+        ("low", np.float64),
+        ("high", np.float64),
+        ("mass", np.float64),
+        ("reach", np.float64),
+        ("bottom", np.float64, (RIM_CORNERS, 2)),
+        ("top", np.float64, (RIM_CORNERS, 2)),
+        ("footprint", np.float64, (_FOOTPRINT_CORNERS, 2)),
+        ("sides", np.float64, (_FOOTPRINT_CORNERS, 3)),
+        ("bottom_count", np.int64),
+        ("top_count", np.int64),
+        ("footprint_count", np.int64),
+        ("first_face", np.int64),
+        ("last_face", np.int64),
+    ]
+)
+"""A posed shape in a record: see `Posed`, and
+
+    flat: whether bottom and top are as large as the footprint.
+    lower, upper: (3,) m, of the box along the axes that holds it.
+    mass: kg.
+    reach: m, radius of the circle about the object's origin that holds its footprint.
+    sides: outward normal of each side of the footprint, and m along it from the origin.
+    bottom_count, top_count, footprint_count: corners in use.
+    first_face, last_face: its faces in the table, the end excluded.
+"""
+
+
 class Table(NamedTuple):
-    """Posed shapes in arrays, for compiled loops: a row per shape, with room for more.
+    """Posed shapes in few arrays (each costs a compiled function a moment), with room for more.
 
     Attributes:
-        fault, rolls, com, low, high: (N, ...) see `Posed`.
-        mass: (N,) kg.
-        flat: (N,) whether bottom and top are as large as the footprint.
-        reach: (N,) m, radius of the circle about the object's origin that holds its footprint.
-        bottom, top, footprint: (N, C, 2) m, corners.
-        bottom_count, top_count, footprint_count: (N,) corners in use.
-        first_face: (N + 1,) a shape's faces are first_face[i] up to first_face[i + 1].
-        first_corner: (F + 1,) a face's corners likewise.
+        posed: (N,) of `POSED`.
+        first_corner: (F + 1,) a face's corners are first_corner[f] up to first_corner[f + 1].
         normal: (F, 3).
         corner: (V, 3) m.
     """
 
-    fault: Ints
-    rolls: NDArray[np.bool_]
-    com: Floats
-    low: Floats
-    high: Floats
-    mass: Floats
-    flat: NDArray[np.bool_]
-    reach: Floats
-    bottom: Floats
-    bottom_count: Ints
-    top: Floats
-    top_count: Ints
-    footprint: Floats
-    footprint_count: Ints
-    first_face: Ints
+    posed: NDArray[np.void]
     first_corner: Ints
     normal: Floats
     corner: Floats
 
 
 def _room(rows: int, faces: int, corners: int) -> Table:
-    def whole(*shape: int) -> Ints:
-        return np.zeros(shape, np.int64)
-
-    return Table(
-        fault=whole(rows),
-        rolls=np.zeros(rows, np.bool_),
-        com=np.zeros((rows, 3)),
-        low=np.zeros(rows),
-        high=np.zeros(rows),
-        mass=np.zeros(rows),
-        flat=np.zeros(rows, np.bool_),
-        reach=np.zeros(rows),
-        bottom=np.zeros((rows, RIM_CORNERS, 2)),
-        bottom_count=whole(rows),
-        top=np.zeros((rows, RIM_CORNERS, 2)),
-        top_count=whole(rows),
-        footprint=np.zeros((rows, _FOOTPRINT_CORNERS, 2)),
-        footprint_count=whole(rows),
-        first_face=whole(rows + 1),
-        first_corner=whole(faces + 1),
-        normal=np.zeros((faces, 3)),
-        corner=np.zeros((corners, 3)),
-    )
+    return Table(np.zeros(rows, POSED), np.zeros(faces + 1, np.int64), np.zeros((faces, 3)), np.zeros((corners, 3)))
 
 
 class Shapes:
@@ -263,26 +256,26 @@ class Shapes:
     def _add(self, scene_object: SceneObject) -> None:
         shape = pose(scene_object.object_class, scene_object.X_TO.quaternion)
         row = len(self._row)
-        face = self.table.first_face[row]
+        face = int(self.table.posed["last_face"].max())
         corner = self.table.first_corner[face]
         last_face, last_corner = face + len(shape.surface.counts), corner + len(shape.surface.corner)
-        if row + 1 >= len(self.table.fault) or last_face >= len(self.table.normal) or last_corner > len(self.table.corner):
+        if row >= len(self.table.posed) or last_face >= len(self.table.normal) or last_corner > len(self.table.corner):
             old = self.table
-            self.table = _room(2 * len(old.fault), 2 * max(last_face + 1, len(old.normal)), 2 * max(last_corner, len(old.corner)))
+            self.table = _room(2 * len(old.posed), 2 * max(last_face + 1, len(old.normal)), 2 * max(last_corner, len(old.corner)))
             for array, earlier in zip(self.table, old, strict=True):
                 array[: len(earlier)] = earlier
-        table = self.table
-        table.fault[row], table.rolls[row], table.com[row] = shape.fault, shape.rolls, shape.com
-        table.low[row], table.high[row], table.mass[row] = shape.low, shape.high, scene_object.object_class.mass
-        table.flat[row] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
-        table.reach[row] = np.linalg.norm(shape.footprint, axis=1).max()
-        for polygon, counts, corners in (
-            (table.bottom, table.bottom_count, shape.bottom),
-            (table.top, table.top_count, shape.top),
-            (table.footprint, table.footprint_count, shape.footprint),
-        ):
-            polygon[row, : len(corners)], counts[row] = corners, len(corners)
-        table.first_face[row + 1] = last_face
+        table, posed = self.table, self.table.posed[row]
+        posed["fault"], posed["rolls"], posed["com"] = shape.fault, shape.rolls, shape.com
+        posed["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
+        posed["lower"], posed["upper"] = shape.surface.corner.min(axis=0), shape.surface.corner.max(axis=0)
+        posed["low"], posed["high"], posed["mass"] = shape.low, shape.high, scene_object.object_class.mass
+        posed["reach"] = np.linalg.norm(shape.footprint, axis=1).max()
+        for name, corners in (("bottom", shape.bottom), ("top", shape.top), ("footprint", shape.footprint)):
+            posed[name][: len(corners)], posed[f"{name}_count"] = corners, len(corners)
+        along = np.roll(shape.footprint, -1, axis=0) - shape.footprint
+        normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+        posed["sides"][: len(normal)] = np.column_stack([normal, (normal * shape.footprint).sum(axis=1)])
+        posed["first_face"], posed["last_face"] = face, last_face
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal
         table.corner[corner:last_corner] = shape.surface.corner

@@ -29,9 +29,9 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
     height, width = hit.shape
     middle_u, middle_v = width / 2 - 1, height / 2 - 1
     u, v = np.empty(64), np.empty(64)
-    begin, end = np.empty(height, np.int64), np.empty(height, np.int64)  # columns of a face, row by row
+    begin, end = np.zeros(height, np.int64), np.zeros(height, np.int64)  # columns of a face, row by row
     rays = 0
-    for face in range(table.first_face[shape], table.first_face[shape + 1]):
+    for face in range(table.posed[shape].first_face, table.posed[shape].last_face):
         first, last = table.first_corner[face], table.first_corner[face + 1]
         nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
         corner = table.corner[first]
@@ -51,17 +51,18 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
         along, down = nx / focal_length / k, -ny / focal_length / k
         start = -nz / k - along * middle_u - down * middle_v
         first_row, last_row = max(0, math.ceil(top)), min(height - 1, math.floor(bottom))
-        begin[first_row : last_row + 1], end[first_row : last_row + 1] = width, 0
         for c in range(count):
             d = c + 1 if c + 1 < count else 0
             # Downwards, and so the same for both faces at an edge: no ray is counted twice or lost.
-            a, b = (c, d) if v[c] < v[d] else (d, c)
-            if v[a] == v[b]:
+            leftmost = v[c] < v[d]
+            a, b = (c, d) if leftmost else (d, c)
+            first_below, last_below = max(first_row, math.ceil(v[a])), min(last_row + 1, math.ceil(v[b]))
+            if first_below >= last_below:
                 continue
             slope = (u[b] - u[a]) / (v[b] - v[a])
-            for row in range(max(first_row, math.ceil(v[a])), min(last_row + 1, math.ceil(v[b]))):
-                column = math.ceil(u[a] + (row - v[a]) * slope)
-                begin[row], end[row] = min(begin[row], max(column, 0)), max(end[row], min(column, width))
+            bound = begin if leftmost else end
+            for row in range(first_below, last_below):
+                bound[row] = min(max(math.ceil(u[a] + (row - v[a]) * slope), 0), width)
         for row in range(first_row, last_row + 1):
             first_column, last_column = begin[row], end[row]
             if last_column <= first_column:
@@ -78,20 +79,17 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
 
 
 @njit(cache=True)
-def _window(table, shapes, p_T, altitude, focal_length, image_shape):  # type: ignore[no-untyped-def]
-    """First row, last row, first column and last column (ends excluded) of a rectangle that holds all objects."""
+def _window(posed, p_TO, altitude, focal_length, image_shape):  # type: ignore[no-untyped-def]
+    """First row, last row, first column and last column (ends excluded) of a rectangle that holds an object's box."""
     height, width = image_shape
     middle_u, middle_v = width / 2 - 1, height / 2 - 1
     top, bottom, left, right = np.inf, -np.inf, np.inf, -np.inf
-    for i in range(len(shapes)):
-        first_face, last_face = table.first_face[shapes[i]], table.first_face[shapes[i] + 1]
-        for c in range(table.first_corner[first_face], table.first_corner[last_face]):
-            scale = focal_length / (altitude - table.corner[c, 2] - p_T[i, 2])
-            u = middle_u + scale * (table.corner[c, 0] + p_T[i, 0])
-            v = middle_v - scale * (table.corner[c, 1] + p_T[i, 1])
-            top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
-    row_begin, row_end = max(0, math.floor(top)), min(height, math.ceil(bottom) + 1)
-    column_begin, column_end = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
+    for z in (posed.lower[2], posed.upper[2]):
+        scale = focal_length / (altitude - z - p_TO[2])
+        left, right = min(left, scale * (posed.lower[0] + p_TO[0])), max(right, scale * (posed.upper[0] + p_TO[0]))
+        top, bottom = min(top, -scale * (posed.upper[1] + p_TO[1])), max(bottom, -scale * (posed.lower[1] + p_TO[1]))
+    row_begin, row_end = max(0, math.floor(middle_v + top)), min(height, math.ceil(middle_v + bottom) + 1)
+    column_begin, column_end = max(0, math.floor(middle_u + left)), min(width, math.ceil(middle_u + right) + 1)
     if row_end <= row_begin or column_end <= column_begin:
         return 0, 0, 0, 0
     return row_begin, row_end, column_begin, column_end
@@ -115,28 +113,34 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
     Returns:
         The rectangle that was written to, see `_window`.
     """
-    window = _window(table, shapes, p_T, altitude, focal_length, hit.shape)
-    row_begin, row_end, column_begin, column_end = window
-    nearest[row_begin:row_end, column_begin:column_end] = 1 / altitude
-    hit[row_begin:row_end, column_begin:column_end] = -1
-
+    windows = np.zeros((len(shapes), 4), np.int64)
+    row_begin, row_end, column_begin, column_end = hit.shape[0], 0, hit.shape[1], 0
+    for i in range(len(shapes)):
+        window = _window(table.posed[shapes[i]], p_T[i], altitude, focal_length, hit.shape)
+        windows[i, 0], windows[i, 1], windows[i, 2], windows[i, 3] = window
+        if window[1] > 0:
+            row_begin, row_end = min(row_begin, window[0]), max(row_end, window[1])
+            column_begin, column_end = min(column_begin, window[2]), max(column_end, window[3])
+    for row in range(row_begin, row_end):
+        nearest[row, column_begin:column_end] = 1 / altitude
+        hit[row, column_begin:column_end] = -1
     for i in range(len(shapes)):
         alone[i] = _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(i), nearest, hit)
-
     for i in range(len(shapes)):
-        window_i = _window(table, shapes[i : i + 1], p_T[i : i + 1], altitude, focal_length, hit.shape)
-        total = 0
-        for row in range(window_i[0], window_i[1]):
-            for column in range(window_i[2], window_i[3]):
-                total += hit[row, column] == i
+        label, total = np.int16(i), 0
+        for row in range(windows[i, 0], windows[i, 1]):
+            in_row = np.int16(0)
+            for column in range(windows[i, 2], windows[i, 3]):
+                in_row = np.int16(in_row + (hit[row, column] == label))  # 16 bits wide: more pixels at a time
+            total += int(in_row)
         seen[i] = total
-    return window
+    return min(row_begin, row_end), row_end, min(column_begin, column_end), column_end
 
 
 @njit(cache=True)
 def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  # type: ignore[no-untyped-def]
     """(rays,) for every ray that would meet the target, the objects before it, as bits."""
-    window = _window(table, shapes[target : target + 1], p_T[target : target + 1], altitude, focal_length, hit.shape)
+    window = _window(table.posed[shapes[target]], p_T[target], altitude, focal_length, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
     _cast_at(table, shapes[target], p_T[target], altitude, focal_length, np.int16(0), nearest, hit)
@@ -146,7 +150,7 @@ def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  #
     for k in range(len(rows)):
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
-        other = _window(table, shapes[i : i + 1], p_T[i : i + 1], altitude, focal_length, hit.shape)
+        other = _window(table.posed[shapes[i]], p_T[i], altitude, focal_length, hit.shape)
         apart = other[0] >= window[1] or window[0] >= other[1] or other[2] >= window[3] or window[2] >= other[3]
         if i == target or apart:
             continue
