@@ -241,7 +241,7 @@ def judge_row(seconds: Sequence[float], found: Sequence[Found], truth: Sequence[
 
 def ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
     """The whole label image, by one cast."""
-    _, rectangle = rays._cast(scene.objects, None)
+    _, rectangle = rays._cast(*rays._shapes.arrays(scene.objects))
     image = np.full(rays._hit.shape, -1, np.int16)
     image[rectangle] = rays._hit[rectangle]
     return image

@@ -13,6 +13,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import CameraConfig, LayoutConfig
+from drake_clutter.fast.shapes import Shapes
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
 from drake_clutter.perception.label_detector import LabelDetector
@@ -197,9 +198,12 @@ def test_other_places_than_those_of_the_poses() -> None:
     scene = tumbled(1)
     offsets = rng(3).uniform(-0.05, 0.05, (len(scene.objects), 3))
     moved = scene.at({o.name: o.X_TO.moved(offset) for o, offset in zip(scene.objects, offsets, strict=True)})
+    shapes = Shapes()
+    caster = RayCaster(CAMERA, shapes)
+    rows = shapes.rows(scene.objects)
     p_T = np.array([o.X_TO.p for o in moved.objects])
-    assert RAYS.visible_shares(scene.objects, p_T) == RAYS.visible_shares(moved.objects)
-    assert RAYS.visible_shares(scene.objects, p_T) != RAYS.visible_shares(scene.objects)
+    assert caster.shares(rows, p_T) == list(RAYS.visible_shares(moved.objects).values())
+    assert caster.shares(rows, p_T) != list(RAYS.visible_shares(scene.objects).values())
 
 
 FAR = scene_of(resting("gelatin_box", name="near"), resting("sugar_box", xy=(5.0, 0.0), name="far"))

@@ -83,7 +83,7 @@ class FastJudge:
         settled = {o.name: Pose((x, y, z), o.X_TO.quaternion) for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)}
         if found is not None:
             return Verdict(found, settled, {}, ())
-        shares = self.rays.visible_shares(scene.objects, moved)
+        shares = dict(zip(settled, self.rays.shares(shapes, moved), strict=True))
         below = self._config.camera.hidden_below
         return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < below))
 
@@ -184,6 +184,28 @@ class FastJudge:
                 found[scene_object.name] = 0.0
         return found
 
+    def comes_apart(self, scene: Scene) -> bool | CannotJudge:
+        """Whether all objects can be taken away one by one, each with nothing on it, while what is left always stands."""
+        standing = self._standing(scene, *self._arrays(scene.objects))
+        if isinstance(standing, CannotJudge):
+            return standing
+        pairs, hopeless = standing.pairs.tolist(), set[frozenset[int]]()
+
+        def taken_apart(rows: frozenset[int]) -> bool:
+            if len(rows) < 2:
+                return True
+            loaded = {lower for lower, upper in pairs if upper in rows}
+            for row in sorted(rows - loaded):
+                rest = rows - {row}
+                if rest not in hopeless and self._weakest(standing, [sorted(rest)])[0][0] < 0 and taken_apart(rest):
+                    return True
+            hopeless.add(rows)
+            return False
+
+        return all(
+            taken_apart(frozenset(np.flatnonzero(standing.stack == stack).tolist())) for stack in set(standing.stack.tolist())
+        )
+
     def never_movable(self, scene: Scene) -> frozenset[str] | CannotJudge:
         """Objects that no sequence of moves can pick without a collapse, whatever is put down on the others before.
 
@@ -242,11 +264,11 @@ class FastJudge:
         return _Standing(shapes, p_T, pairs, stack)
 
     def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
-        shapes = self._shapes.rows(objects)
+        arrays = self._shapes.arrays(objects)
         if self._generation != self._shapes.generation or len(self._known) > _KEPT:
             self._known.clear()
             self._generation = self._shapes.generation
-        return shapes, np.array([o.X_TO.translation for o in objects]).reshape(-1, 3)
+        return arrays
 
     def _weakest(self, standing: "_Standing", stacks: list[list[int]]) -> list[tuple[int, bool]]:
         """For each stack, given by its rows, the row of what is furthest from equilibrium, or -1, and whether it rolls."""

@@ -253,6 +253,10 @@ class Shapes:
                     self._add(o)
             return np.array([known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64)
 
+    def arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
+        """The table's row of each object (n,), and p_TO (n, 3) m."""
+        return self.rows(objects), np.array([o.X_TO.translation for o in objects]).reshape(-1, 3)
+
     def _add(self, scene_object: SceneObject) -> None:
         shape = pose(scene_object.object_class, scene_object.X_TO.quaternion)
         row = len(self._row)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.fast.shapes import Floats, Shapes
+from drake_clutter.fast.shapes import Floats, Ints, Shapes
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 
@@ -69,12 +69,13 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
                 continue
             rays += last_column - first_column
             inverse, step = np.float32(start + down * row + along * first_column), np.float32(along)
-            # Both are always written, so that the compiler can do several pixels at a time.
-            for column in range(first_column, last_column):
-                value = inverse + step * np.float32(column - first_column)
-                nearer = value > nearest[row, column]
-                nearest[row, column] = value if nearer else nearest[row, column]
-                hit[row, column] = label if nearer else hit[row, column]
+            # Both are always written, and counted from 0, so that the compiler can do several pixels at a time.
+            nearest_here, hit_here = nearest[row, first_column:last_column], hit[row, first_column:last_column]
+            for k in range(last_column - first_column):
+                value = inverse + step * np.float32(k)
+                nearer = value > nearest_here[k]
+                nearest_here[k] = value if nearer else nearest_here[k]
+                hit_here[k] = label if nearer else hit_here[k]
     return rays
 
 
@@ -129,9 +130,9 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
     for i in range(len(shapes)):
         label, total = np.int16(i), 0
         for row in range(windows[i, 0], windows[i, 1]):
-            in_row = np.int16(0)
-            for column in range(windows[i, 2], windows[i, 3]):
-                in_row = np.int16(in_row + (hit[row, column] == label))  # 16 bits wide: more pixels at a time
+            in_row, here = np.int16(0), hit[row, windows[i, 2] : windows[i, 3]]
+            for k in range(len(here)):
+                in_row = np.int16(in_row + (here[k] == label))  # 16 bits wide: more pixels at a time
             total += int(in_row)
         seen[i] = total
     return min(row_begin, row_end), row_end, min(column_begin, column_end), column_end
@@ -172,27 +173,27 @@ class RayCaster:
         self._nearest = np.empty((config.height, config.width), np.float32)
         self._hit = np.empty((config.height, config.width), np.int16)
 
-    def _cast(self, objects: Sequence[SceneObject], p_T: Floats | None) -> tuple[list[float], tuple[slice, slice]]:
+    def _cast(self, shapes: Ints, p_T: Floats) -> tuple[list[float], tuple[slice, slice]]:
         """Fills the buffers in a rectangle, which it returns after the visible share of each object."""
-        if not objects:
+        if not len(shapes):
             return [], (slice(0, 0), slice(0, 0))
-        if p_T is None:
-            p_T = np.array([o.X_TO.translation for o in objects])
-        alone, seen = np.zeros(len(objects), np.int64), np.zeros(len(objects), np.int64)
-        shapes = self._shapes.rows(objects)
+        alone, seen = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
         arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length)
         row, row_end, column, column_end = _cast(*arguments, self._nearest, self._hit, alone, seen)
         shares = [s / a if a else 1.0 for s, a in zip(seen.tolist(), alone.tolist(), strict=True)]
         return shares, (slice(row, row_end), slice(column, column_end))
 
-    def visible_shares(self, objects: Sequence[SceneObject], p_T: Floats | None = None) -> dict[str, float]:
+    def shares(self, shapes: Ints, p_T: Floats) -> list[float]:
+        """See `visible_shares`, of the table's shapes at p_T (n, 3) m, in their order."""
+        return self._cast(shapes, p_T)[0]
+
+    def visible_shares(self, objects: Sequence[SceneObject]) -> dict[str, float]:
         """Of the rays that would meet each object alone on the tray, the share that does, by name; out of the frame, 1.
 
         Args:
             objects: convex ones.
-            p_T: (n, 3) m, where they are; None: where their poses say.
         """
-        shares, _ = self._cast(objects, p_T)
+        shares = self.shares(*self._shapes.arrays(objects))
         return {o.name: share for o, share in zip(objects, shares, strict=True)}
 
     def cover(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
@@ -205,8 +206,7 @@ class RayCaster:
         scene[name]
         if len(scene.objects) > _MOST_COVERED:
             raise ValueError(f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most")
-        shapes = self._shapes.rows(scene.objects)
-        p_T = np.array([o.X_TO.translation for o in scene.objects])
+        shapes, p_T = self._shapes.arrays(scene.objects)
         arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length, scene.names.index(name))
         sets, counts = np.unique(_cover(*arguments, self._nearest, self._hit), return_counts=True)
         names = scene.names
@@ -215,7 +215,7 @@ class RayCaster:
 
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
         """What the camera shows of a scene, and the visible shares; as `LabelDetector` has it, but with the floor all around."""
-        shares, rectangle = self._cast(scene.objects, None)
+        shares, rectangle = self._cast(*self._shapes.arrays(scene.objects))
         depth = np.full(self._nearest.shape, self.config.altitude, np.float32)
         depth[rectangle] = 1 / self._nearest[rectangle]
         label = np.full(self._hit.shape, -1, np.int16)

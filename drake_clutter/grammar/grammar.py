@@ -1,6 +1,6 @@
 """Matching and applying production rules under a budget of nodes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,43 +39,62 @@ class Derivation:
     rules: tuple[str, ...]
 
 
+Match = Mapping[str, int]
+"""The graph's node for each node of a G_L, by its name in the rule."""
+
+
 class SceneGrammar:
-    """G = (N_NT, N_T, E, R, S) for a set of object classes (paper, eq. 1)."""
+    """G = (N_NT, N_T, E, R, S) for a set of object classes (paper, eq. 1).
+
+    Attributes:
+        classes: by name.
+        rules: in the order of the sheet.
+        index: of each rule, by name.
+        patterns: the few left-hand sides that the rules share.
+        pattern: (rules,) each rule's left-hand side among them.
+    """
 
     def __init__(self, classes: Sequence[ObjectClass]) -> None:
         self.classes = {object_class.name: object_class for object_class in classes}
         self.rules = rule_sheet(classes)
         self.index = {rule.name: index for index, rule in enumerate(self.rules)}
+        self.patterns = list({id(rule.left): rule.left for rule in self.rules}.values())
+        self.pattern = [next(k for k, left in enumerate(self.patterns) if left is rule.left) for rule in self.rules]
+        self._growth = np.array([rule.growth for rule in self.rules])
+        self._open_slots_added = np.array([rule.open_slots_added for rule in self.rules])
 
-    def find_match(self, graph: ClutterGraph, left: Pattern) -> dict[str, int] | None:
+    def find_match(self, graph: ClutterGraph, left: Pattern) -> Match | None:
         """The first subgraph that G_L matches: the tray leads to its root first, breadth first, siblings in order.
 
         Returns:
             The graph's node for each node of G_L, or None if nothing matches.
         """
-        for root in graph.breadth_first():
-            match = _extend(graph, left, root)
-            if match is not None:
-                return match
-        return None
+        return _first_match(graph, left, graph.breadth_first())
 
-    def feasible(self, graph: ClutterGraph, budget: NodeBudget) -> NDArray[np.bool_]:
+    def matches(self, graph: ClutterGraph) -> list[Match | None]:
+        """The first match of each of `patterns`."""
+        order = graph.breadth_first()
+        return [_first_match(graph, left, order) for left in self.patterns]
+
+    def feasible(
+        self, graph: ClutterGraph, budget: NodeBudget, matches: Sequence[Match | None] | None = None
+    ) -> NDArray[np.bool_]:
         """(rules,) which rules match and neither overrun the budget nor, if it is exact, leave it unfillable.
 
         What is left can be filled unless it is one node with no open slot to stack on: a drop and a pair both add two.
+
+        Args:
+            graph: a derived graph.
+            budget: how large it may become.
+            matches: of the graph, if they are known.
         """
-        open_slots = sum(kind == OPEN_SLOT for _, kind in graph.nx.nodes(data="kind"))
-        matches: dict[int, bool] = {}  # by identity: the thirty rules share four left-hand sides
-        mask = np.zeros(len(self.rules), bool)
-        for index, rule in enumerate(self.rules):
-            remaining = budget.nodes - len(graph) - rule.growth
-            stranded = budget.exact and remaining == 1 and open_slots + rule.open_slots_added == 0
-            if remaining < 0 or stranded:
-                continue
-            if id(rule.left) not in matches:
-                matches[id(rule.left)] = self.find_match(graph, rule.left) is not None
-            mask[index] = matches[id(rule.left)]
-        return mask
+        open_slots = sum(kind == OPEN_SLOT for kind in graph.kinds())
+        remaining = budget.nodes - len(graph) - self._growth
+        allowed = remaining >= 0
+        if budget.exact:
+            allowed &= (remaining != 1) | (open_slots + self._open_slots_added > 0)
+        found = np.array([match is not None for match in matches or self.matches(graph)])
+        return np.asarray(allowed & found[self.pattern])
 
     def apply(self, graph: ClutterGraph, rule: ProductionRule) -> ClutterGraph:
         """A new graph in which the first match of G_L is replaced by G_R.
@@ -87,19 +106,25 @@ class SceneGrammar:
         if match is None:
             raise ValueError(f"rule {rule.name} does not match the graph")
         result = graph.copy()
+        self.rewrite(result, rule, match)
+        return result
+
+    @staticmethod
+    def rewrite(graph: ClutterGraph, rule: ProductionRule, match: Match) -> None:
+        """Replaces a match of G_L by G_R, in place."""
+        nodes = dict(match)
         for parent, child in rule.left.edges:
             if (parent, child) not in rule.right_edges:
-                result.nx.remove_edge(match[parent], match[child])
-        next_node = max(result.nx.nodes) + 1
+                graph.nx.remove_edge(nodes[parent], nodes[child])
+        next_node = max(graph.nx) + 1
         for name, kind in rule.right_nodes.items():
-            if name not in match:
-                match[name] = next_node
+            if name not in nodes:
+                nodes[name] = next_node
                 next_node += 1
             if kind != KEEP:
-                result.nx.add_node(match[name], kind=kind)
+                graph.nx.add_node(nodes[name], kind=kind)
         for (parent, child), edge_kind in rule.right_edges.items():
-            result.nx.add_edge(match[parent], match[child], kind=edge_kind)
-        return result
+            graph.nx.add_edge(nodes[parent], nodes[child], kind=edge_kind)
 
     def replay(self, rules: Sequence[str]) -> ClutterGraph:
         """The graph that a sequence of rules, by name, derives from the start graph.
@@ -122,9 +147,11 @@ class SceneGrammar:
             choose: given the graph and the mask of feasible rules, the index of the rule to apply.
         """
         graph, names = ClutterGraph(), []
-        while (mask := self.feasible(graph, budget)).any():
-            rule = self.rules[choose(graph, mask)]
-            graph = self.apply(graph, rule)
+        while (mask := self.feasible(graph, budget, matches := self.matches(graph))).any():
+            chosen = choose(graph, mask)
+            rule, match = self.rules[chosen], matches[self.pattern[chosen]]
+            assert match is not None, f"rule {rule.name} was chosen, which is not feasible"
+            self.rewrite(graph, rule, match)
             names.append(rule.name)
         return Derivation(graph, tuple(names))
 
@@ -134,22 +161,26 @@ def uniform_choice(rng: np.random.Generator) -> Callable[[ClutterGraph, NDArray[
     return lambda _, mask: int(rng.choice(np.flatnonzero(mask)))
 
 
-def _extend(graph: ClutterGraph, left: Pattern, root: int) -> dict[str, int] | None:
-    """The match of a pattern whose root is the given node, or None. Children are tried in order, with backtracking."""
-    kinds = graph.nx.nodes
-    root_name = next(iter(left.nodes))
-    if kinds[root]["kind"] not in left.nodes[root_name]:
-        return None
+def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Match | None:
+    """The match of a pattern whose root is the first possible of the given nodes. Children are tried in order, with backtracking."""
+    nodes, edges = graph.nx._node, graph.nx._adj  # as networkx's own loops do: its views cost more than the matching
+    root_name, root_kinds = next(iter(left.nodes.items()))
 
-    def extend(match: Mapping[str, int], edges: tuple[tuple[str, str], ...]) -> dict[str, int] | None:
-        if not edges:
-            return dict(match)
-        (parent, child), rest = edges[0], edges[1:]
-        for node, edge in graph.nx.adj[match[parent]].items():
-            if edge["kind"] == PRIMITIVE and kinds[node]["kind"] in left.nodes[child]:
+    def extend(match: Match, pattern_edges: tuple[tuple[str, str], ...]) -> Match | None:
+        if not pattern_edges:
+            return match
+        (parent, child), rest = pattern_edges[0], pattern_edges[1:]
+        kinds = left.nodes[child]
+        for node, edge in edges[match[parent]].items():
+            if edge["kind"] == PRIMITIVE and nodes[node]["kind"] in kinds:
                 found = extend({**match, child: node}, rest)
                 if found is not None:
                     return found
         return None
 
-    return extend({root_name: root}, left.edges)
+    for root in roots:
+        if nodes[root]["kind"] in root_kinds:
+            match = extend({root_name: root}, left.edges)
+            if match is not None:
+                return match
+    return None

@@ -74,6 +74,10 @@ class ClutterGraph:
         """The kind of a node."""
         return str(self.nx.nodes[node]["kind"])
 
+    def kinds(self) -> list[str]:
+        """The kind of every node, in order of creation."""
+        return [node["kind"] for node in self.nx._node.values()]
+
     def edge_kind(self, parent: int, child: int) -> EdgeKind:
         """The kind of an edge."""
         kind: EdgeKind = self.nx.edges[parent, child]["kind"]
@@ -85,7 +89,17 @@ class ClutterGraph:
 
     def breadth_first(self) -> list[int]:
         """All nodes that the tray leads to, breadth first, siblings in order."""
-        return [self.TRAY_NODE] + [child for _, child in nx.bfs_edges(self.nx, self.TRAY_NODE)]
+        edges, order = (
+            self.nx._adj,
+            [self.TRAY_NODE],
+        )  # networkx's own walk costs several times as much, and is taken at every rule
+        reached = {self.TRAY_NODE}
+        for node in order:
+            for child in edges[node]:
+                if child not in reached:
+                    reached.add(child)
+                    order.append(child)
+        return order
 
     def stacks(self) -> list[list[int]]:
         """The nodes that stand on the tray, stack by stack: one, or the two of a pair."""

@@ -24,10 +24,12 @@ class Pattern:
     Attributes:
         nodes: allowed kinds by the node's name in the rule.
         edges: (parent, child) in an order in which the parent of each edge is the root or an earlier child; all primitive.
+        rewritten: the node that the rules are about: they replace it, orient it, or, of the tray, put something on it.
     """
 
     nodes: Mapping[str, frozenset[str]]
     edges: tuple[tuple[str, str], ...]
+    rewritten: str
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,16 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
     """
     names = frozenset(object_class.name for object_class in classes)
     terminal_parents = names | {TRAY, DUMMY}
-    tray = Pattern({"tray": frozenset({TRAY})}, ())
-    slot_below_open = Pattern({"slot": frozenset({OBJECT_SLOT}), "top": frozenset({OPEN_SLOT})}, (("slot", "top"),))
+    tray = Pattern({"tray": frozenset({TRAY})}, (), rewritten="tray")
+    slot_below_open = Pattern(
+        {"slot": frozenset({OBJECT_SLOT}), "top": frozenset({OPEN_SLOT})}, (("slot", "top"),), rewritten="top"
+    )
     slot = Pattern(
         {"parent": terminal_parents, "slot": frozenset({OBJECT_SLOT}), "child": frozenset({OBJECT_SLOT, END})},
         (("parent", "slot"), ("slot", "child")),
+        rewritten="slot",
     )
-    unoriented = Pattern({"parent": terminal_parents, "child": names}, (("parent", "child"),))
+    unoriented = Pattern({"parent": terminal_parents, "child": names}, (("parent", "child"),), rewritten="child")
 
     rules = [
         ProductionRule(

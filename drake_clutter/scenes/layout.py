@@ -1,8 +1,10 @@
 """From a terminal graph to poses: objects in their resting poses, pairs with their gap, stacks side by side on the tray."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,35 +42,73 @@ class LayoutFailure:
         return f"{self.reason.value}: {self.amount:.3g} of {self.limit:.3g} {unit}"
 
 
-def _resting_at(node: int, object_class: ObjectClass, orientation: Orientation, floor: float) -> SceneObject:
-    """The object in its resting pose, centred over the tray's centre, its lowest point at height `floor` (m)."""
-    R_TO = resting_rotation(object_class, orientation)
-    lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
-    return SceneObject(f"{object_class.name}_{node}", object_class, Pose.of(R_TO, (0.0, 0.0, floor - lowest)), node)
+class _Resting(NamedTuple):
+    """An object class at rest; lengths in m, axes those of T, origin the object's.
+
+    Attributes:
+        quaternion: (4,) of R_TO.
+        lower, upper: (3,) of its box along the axes.
+    """
+
+    quaternion: tuple[float, float, float, float]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
 
 
-def _stack(graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: list[int], config: LayoutConfig) -> list[SceneObject]:
-    """The objects of one stack, centred over the tray's centre; `bottom` is the single or the pair that stands on the tray."""
-    placed: list[SceneObject] = []
-    floor, level = 0.0, bottom
-    parent = ClutterGraph.TRAY_NODE
-    while level:
-        orientation = graph.edge_kind(parent, level[0])  # a pair's two are alike
-        assert isinstance(orientation, Orientation), "layout needs a terminal graph"
-        resting = [_resting_at(node, classes[graph.kind(node)], orientation, floor) for node in level]
-        if len(resting) == 2:
-            gap = config.lying_gap if orientation.rest is Rest.FLAT else config.standing_gap
-            aside = np.array([0.0, (resting[0].bounds_T[1][1] - resting[0].bounds_T[0][1] + gap) / 2, 0.0])
-            resting = [replace(o, X_TO=o.X_TO.moved(sign * aside)) for o, sign in zip(resting, (-1, 1), strict=True)]
-        placed += resting
-        floor = max(o.top for o in resting)
-        parent = level[0]
-        above = graph.children(parent)
-        if above and graph.kind(above[0]) == DUMMY:
-            parent = above[0]
+@lru_cache(maxsize=4096)
+def _at_rest(object_class: ObjectClass, orientation: Orientation) -> _Resting:
+    X_TO = Pose.of(resting_rotation(object_class, orientation), (0.0, 0.0, 0.0))
+    corners = X_TO.apply(object_class.corners)
+    return _Resting(X_TO.quaternion, corners.min(axis=0), corners.max(axis=0))
+
+
+class Stack:
+    """What stands on one single or one pair, laid out over the tray's centre.
+
+    Attributes:
+        nodes: of its objects in the graph, each below what it carries.
+        p_T: (n, 3) m, their origins.
+        lower, upper: (3,) m, its box along the axes.
+    """
+
+    def __init__(
+        self, graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: Sequence[int], config: LayoutConfig
+    ) -> None:
+        """Lays out a stack whose attributes are all terminal; `bottom`: the single or the pair that stands on the tray."""
+        self.nodes: list[int] = []
+        self._graph, self._classes, self._resting = graph, classes, list[_Resting]()
+        origins: list[list[float]] = []
+        floor, level, parent = 0.0, list(bottom), ClutterGraph.TRAY_NODE
+        while level:
+            orientation = graph.edge_kind(parent, level[0])  # a pair's two are alike
+            assert isinstance(orientation, Orientation), "layout needs a terminal graph"
+            resting = _at_rest(classes[graph.kind(level[0])], orientation)
+            aside = 0.0
+            if len(level) == 2:
+                gap = config.lying_gap if orientation.rest is Rest.FLAT else config.standing_gap
+                aside = (resting.upper[1] - resting.lower[1] + gap) / 2
+            self.nodes += level
+            self._resting += [resting] * len(level)
+            height = floor - resting.lower[2]
+            origins += [[0.0, 0.0, height]] if len(level) == 1 else [[0.0, -aside, height], [0.0, aside, height]]
+            floor = height + resting.upper[2]
+            parent = level[0]
             above = graph.children(parent)
-        level = [node for node in above if graph.kind(node) != END]
-    return placed
+            if above and graph.kind(above[0]) == DUMMY:
+                parent = above[0]
+                above = graph.children(parent)
+            level = [node for node in above if graph.kind(node) != END]
+        self.p_T = np.array(origins)
+        self.lower = np.min(self.p_T + [resting.lower for resting in self._resting], axis=0)
+        self.upper = np.max(self.p_T + [resting.upper for resting in self._resting], axis=0)
+
+    def objects(self, x: float = 0.0, y: float = 0.0) -> list[SceneObject]:
+        """The stack's objects, the stack moved by x and y (m)."""
+        made = []
+        for node, resting, (px, py, pz) in zip(self.nodes, self._resting, (self.p_T + [x, y, 0.0]).tolist(), strict=True):
+            object_class = self._classes[self._graph.kind(node)]
+            made.append(SceneObject(f"{object_class.name}_{node}", object_class, Pose((px, py, pz), resting.quaternion), node))
+        return made
 
 
 def _place(half_sizes: NDArray[np.float64], config: LayoutConfig, rng: np.random.Generator) -> NDArray[np.float64] | None:
@@ -113,17 +153,15 @@ def lay_out(
         seed: noted in the scene.
     """
     graph = derivation.graph
-    stacks = [_stack(graph, classes, bottom, config) for bottom in graph.stacks()]
-    height = max(o.top for stack in stacks for o in stack)
+    stacks = [Stack(graph, classes, bottom, config) for bottom in graph.stacks()]
+    height = max(float(stack.upper[2]) for stack in stacks)
     if height > config.max_stack_height:
         return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.max_stack_height)
-    lower = np.array([np.min([o.bounds_T[0][:2] for o in stack], axis=0) for stack in stacks])
-    upper = np.array([np.max([o.bounds_T[1][:2] for o in stack], axis=0) for stack in stacks])
+    lower, upper = np.array([stack.lower[:2] for stack in stacks]), np.array([stack.upper[:2] for stack in stacks])
     centres = _place((upper - lower) / 2, config, rng)
     if centres is None:
         return LayoutFailure(LayoutFailureReason.NO_ROOM, float((upper - lower).prod(axis=1).sum()), config.tray_side**2)
-    objects = []
-    for stack, centre, middle in zip(stacks, centres, (lower + upper) / 2, strict=True):
-        x, y = centre - middle
-        objects += [replace(o, X_TO=o.X_TO.moved((x, y, 0.0))) for o in stack]
+    objects = [
+        o for stack, (x, y) in zip(stacks, centres - (lower + upper) / 2, strict=True) for o in stack.objects(float(x), float(y))
+    ]
     return Scene(tuple(objects), config.tray_side, graph, derivation.rules, seed)
