@@ -1,15 +1,14 @@
 """The judge that training needs: verdicts from equilibrium and rays, without simulating."""
 
 import itertools
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast import equilibrium
+from drake_clutter.fast import contacts, equilibrium
 from drake_clutter.fast.shapes import Floats, Ints, Shapes
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, random_offsets
@@ -27,27 +26,26 @@ _GRID = 1e-6
 _MARGIN_RANGE = (-0.030, 0.150)
 _MARGIN_STEP = 1e-4
 _KEPT = 100_000
+_ROW = 32
+"""Bytes of a row of `equilibrium.canonical_order`."""
 _CANNOT = {
-    equilibrium.LEANING: CannotJudgeReason.LEANING,
-    equilibrium.NOT_CONVEX: CannotJudgeReason.NOT_CONVEX,
-    equilibrium.OUTSIDE: CannotJudgeReason.OUTSIDE_TRAY,
-    equilibrium.OVERLAPPING: CannotJudgeReason.INTERPENETRATING,
-    equilibrium.FLOATING: CannotJudgeReason.FLOATING,
-    equilibrium.EDGE: CannotJudgeReason.EDGE_CONTACT,
-    equilibrium.UNSUPPORTED: CannotJudgeReason.UNSUPPORTED,
+    contacts.LEANING: CannotJudgeReason.LEANING,
+    contacts.NOT_CONVEX: CannotJudgeReason.NOT_CONVEX,
+    contacts.OUTSIDE: CannotJudgeReason.OUTSIDE_TRAY,
+    contacts.OVERLAPPING: CannotJudgeReason.INTERPENETRATING,
+    contacts.FLOATING: CannotJudgeReason.FLOATING,
+    contacts.EDGE: CannotJudgeReason.EDGE_CONTACT,
+    contacts.UNSUPPORTED: CannotJudgeReason.UNSUPPORTED,
 }
 
 
 class _Standing(NamedTuple):
-    """See `equilibrium.contacts`."""
+    """See `contacts.find_contacts`."""
 
     shapes: Ints
     p_T: Floats
     pairs: Ints
     stack: Ints
-
-
-_StackKey = tuple[tuple[int, int, int, int], ...]
 
 
 class FastJudge:
@@ -70,7 +68,7 @@ class FastJudge:
         self._margin, self._friction = 2 * config.settle.jitter + _ROUNDING if margin is None else margin, friction
         self._shapes = Shapes()
         self.rays = RayCaster(config.camera, self._shapes)
-        self._known: dict[_StackKey, tuple[int, bool]] = {}
+        self._known: dict[bytes, tuple[int, int]] = {}  # see `_weakest`
         self._generation = 0
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
@@ -97,10 +95,7 @@ class FastJudge:
             if standing.reason is CannotJudgeReason.UNSUPPORTED:
                 return Instability(InstabilityReason.UNSUPPORTED, standing.object)
             return standing
-        members: dict[int, list[int]] = defaultdict(list)
-        for row, number in enumerate(standing.stack.tolist()):
-            members[number].append(row)
-        for weakest, rolls in self._weakest(standing, list(members.values())):
+        for weakest, rolls in self._weakest(standing, standing.stack):
             if weakest >= 0:
                 reason = InstabilityReason.ROLLS if rolls else InstabilityReason.UNBALANCED
                 return Instability(reason, scene.objects[weakest].name)
@@ -124,7 +119,7 @@ class FastJudge:
         """
         scene[name]
         shapes, p_T = self._arrays(scene.objects)
-        reached = equilibrium.touching(self._shapes.table.posed, shapes, p_T, scene.names.index(name), _TOUCHING)
+        reached = contacts.touching(self._shapes.table.posed, shapes, p_T, scene.names.index(name), _TOUCHING)
         return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
 
     def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
@@ -139,7 +134,7 @@ class FastJudge:
         standing = self._standing(scene, *self._arrays(scene.objects))
         if isinstance(standing, CannotJudge):
             return standing
-        _, _, pairs, stack = standing
+        shapes, _, pairs, stack = standing
         taken = scene.names.index(name)
         left = [row for row in np.flatnonzero(stack == stack[taken]).tolist() if row != taken]
         fallen = []
@@ -147,7 +142,7 @@ class FastJudge:
             carried = {upper for lower, upper in pairs.tolist() if upper in left and (lower in left or lower < 0)}
             unsupported = [row for row in left if row not in carried]
             if not unsupported:
-                ((weakest, _),) = self._weakest(standing, [left])
+                ((weakest, _),) = self._weakest(standing, _only(left, len(shapes)))
                 if weakest < 0:
                     break
                 unsupported = [weakest]
@@ -179,7 +174,7 @@ class FastJudge:
                 )
                 low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
             found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
-            ((weakest, rolls),) = self._weakest(standing, [rows.tolist()])
+            ((weakest, rolls),) = self._weakest(standing, _only(rows.tolist(), len(shapes)))
             if rolls and weakest == row:
                 found[scene_object.name] = 0.0
         return found
@@ -197,8 +192,10 @@ class FastJudge:
             loaded = {lower for lower, upper in pairs if upper in rows}
             for row in sorted(rows - loaded):
                 rest = rows - {row}
-                if rest not in hopeless and self._weakest(standing, [sorted(rest)])[0][0] < 0 and taken_apart(rest):
-                    return True
+                if rest not in hopeless:
+                    ((weakest, _),) = self._weakest(standing, _only(rest, len(standing.shapes)))
+                    if weakest < 0 and taken_apart(rest):
+                        return True
             hopeless.add(rows)
             return False
 
@@ -228,7 +225,7 @@ class FastJudge:
         """Whether the rest of the fixed objects could stand without one of them, what is not fixed helping."""
         stack = {taken}
         while True:  # all fixed objects that it is in contact with, directly or not
-            more = {row for pair in pairs.tolist() if stack & set(pair) - {equilibrium.GROUND} for row in pair if row in fixed}
+            more = {row for pair in pairs.tolist() if stack & set(pair) - {contacts.GROUND} for row in pair if row in fixed}
             if more <= stack:
                 break
             stack |= more
@@ -238,17 +235,17 @@ class FastJudge:
         posed = self._shapes.table.posed
         # What is not fixed holds like the ground does while it is there.
         number = {row: k for k, row in enumerate(rest)}
-        contacts = [(number.get(a, equilibrium.GROUND), number[b]) for a, b in pairs.tolist() if b in number and a != taken]
+        held = [(number.get(a, contacts.GROUND), number[b]) for a, b in pairs.tolist() if b in number and a != taken]
         loads = [
             (x, y, p_T[row, 2] + posed[shapes[row]]["high"], number[row])
             for row in rest
-            for x, y in equilibrium.free_top(posed, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
+            for x, y in contacts.free_top(posed, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
         ]
         residuals = equilibrium.residuals(
             posed,
             shapes[rest],
             p_T[rest],
-            np.array(contacts, dtype=np.int64).reshape(-1, 2),
+            np.array(held, dtype=np.int64).reshape(-1, 2),
             np.full(len(rest), self._margin),
             np.zeros((len(rest), 2)),
             self._friction,
@@ -258,8 +255,8 @@ class FastJudge:
 
     def _standing(self, scene: Scene, shapes: Ints, p_T: Floats) -> "_Standing | CannotJudge":
         """Who stands on whom, if all objects are within the model."""
-        fault, culprit, pairs, stack = equilibrium.contacts(self._shapes.table.posed, shapes, p_T, scene.tray_side)
-        if fault != equilibrium.SOUND:
+        fault, culprit, pairs, stack = contacts.find_contacts(self._shapes.table.posed, shapes, p_T, scene.tray_side)
+        if fault != contacts.SOUND:
             return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
         return _Standing(shapes, p_T, pairs, stack)
 
@@ -270,39 +267,32 @@ class FastJudge:
             self._generation = self._shapes.generation
         return arrays
 
-    def _weakest(self, standing: "_Standing", stacks: list[list[int]]) -> list[tuple[int, bool]]:
-        """For each stack, given by its rows, the row of what is furthest from equilibrium, or -1, and whether it rolls."""
-        points, shapes = np.rint(standing.p_T / _GRID).astype(np.int64).tolist(), standing.shapes.tolist()
-        keys, orders, unknown = [], [], {}
-        for rows in stacks:
-            order = sorted(rows, key=lambda row: (points[row][2], shapes[row], points[row]))
-            x0, y0, _ = points[order[0]]
-            key = tuple([(shapes[row], points[row][0] - x0, points[row][1] - y0, points[row][2]) for row in order])
-            keys.append(key)
-            orders.append(order)
-            if key not in self._known:
-                unknown[key] = order
+    def _weakest(self, standing: "_Standing", stack: Ints) -> list[tuple[int, bool]]:
+        """For each stack, the row of what is furthest from equilibrium, or -1, and whether it rolls.
+
+        `stack`: its number for each object; objects of stack -1 are not there.
+        """
+        order, first, described = equilibrium.canonical_order(standing.shapes, standing.p_T, stack, _GRID)
+        rows, starts, content = order.tolist(), first.tolist(), described.tobytes()
+        keys = [content[start * _ROW : end * _ROW] for start, end in itertools.pairwise(starts)]
+        unknown = [k for k, key in enumerate(keys) if key not in self._known]
         if unknown:
-            rows_of_all = np.array([row for rows in unknown.values() for row in rows])
-            first = np.cumsum([0] + [len(rows) for rows in unknown.values()])
-            arguments = (
-                self._shapes.table.posed,
-                standing.shapes,
-                standing.p_T,
-                standing.pairs,
-                rows_of_all,
-                first,
-                self._margin,
-                self._friction,
-            )
-            found, rolls = equilibrium.weakest_each(*arguments)
-            self._known.update(zip(unknown, zip(found.tolist(), rolls.tolist(), strict=True), strict=True))
-        known = [self._known[key] for key in keys]
-        return [(rows[at] if at >= 0 else -1, rolls) for rows, (at, rolls) in zip(orders, known, strict=True)]
+            table, options = self._shapes.table.posed, (self._margin, self._friction)
+            found = equilibrium.weakest_each(table, *standing[:3], order, first, np.array(unknown), *options)
+            self._known.update(zip((keys[k] for k in unknown), map(tuple, found.tolist()), strict=True))
+        answers = [self._known[key] for key in keys]
+        return [(rows[start + at] if at >= 0 else -1, bool(rolls)) for start, (at, rolls) in zip(starts, answers, strict=False)]
+
+
+def _only(rows: Iterable[int], count: int) -> Ints:
+    """(count,) the number of a stack: 0 for these rows, -1, no stack, for the others."""
+    stack = np.full(count, -1)
+    stack[list(rows)] = 0
+    return stack
 
 
 def _within(pairs: Ints, rows: list[int]) -> Ints:
     """The contacts among the rows and with the tray, with the rows numbered as they stand in the list."""
-    number = {row: k for k, row in enumerate(rows)} | {equilibrium.GROUND: equilibrium.GROUND}
+    number = {row: k for k, row in enumerate(rows)} | {contacts.GROUND: contacts.GROUND}
     chosen = [(number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0]
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)
