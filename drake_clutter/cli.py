@@ -33,12 +33,6 @@ _err = Console(stderr=True)
 _out = Console()
 
 
-class GeneratorName(Enum):
-    """Agents that generate scenes."""
-
-    RANDOM = "random"
-
-
 class ExplorerName(Enum):
     """Agents that explore scenes."""
 
@@ -138,7 +132,7 @@ def _report(step: "Step") -> None:
 @app.command()
 def generate(
     out: OutOption,
-    agent: Annotated[GeneratorName, typer.Option(help="Who chooses the rules.")] = GeneratorName.RANDOM,
+    agent: Annotated[str, typer.Option(help="random, hill-climbing, sg, sg-star, sg-14, or a checkpoint's file.")] = "random",
     objects: ObjectsOption = "ycb7",
     nodes: NodesOption = 25,
     count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
@@ -154,7 +148,7 @@ def generate(
     from drake_clutter.commands import generate as command
     from drake_clutter.config import load_config
 
-    job = GenerationJob(agent.value, objects, catalogue, nodes, seed, load_config(config))
+    job = GenerationJob(agent, objects, catalogue, nodes, seed, load_config(config))
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return _tracked("scenes", made, done, total)

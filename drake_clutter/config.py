@@ -3,9 +3,10 @@
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
@@ -143,50 +144,91 @@ _ALLOWED = {
     "camera.hidden_below": (0.0, 1.0),
     "exploration.max_moves": (1, math.inf),
     "exploration.collapse_penalty": (-math.inf, 0.0),
+    "task.nodes": (3, 1000),
+    "task.instability_reward": (-math.inf, 0.0),
+    "learning.steps": (1, math.inf),
+    "learning.environments": (1, math.inf),
+    "learning.batch": (1, math.inf),
+    "learning.steps_per_update": (1, math.inf),
+    "learning.replay": (1, math.inf),
+    "learning.temperature": (1e-6, math.inf),
 }
-"""Least and greatest value of a field; of every other field, `_ANY`."""
+"""Least and greatest value of a field, by its last two names; of every other number, `_ANY`."""
 
 
-def _check(given: Any, schema: Any, path: Path, where: str = "") -> None:
-    """Refuses fields that the schema lacks and values out of range."""
-    names = [item.name for item in dataclasses.fields(schema)]
+def _check(given: Any, defaults: Any, source: str, where: str = "") -> None:
+    """Refuses fields that the defaults lack, values of another kind, and numbers out of range."""
+    names = [item.name for item in dataclasses.fields(defaults)]
     if not isinstance(given, dict):
-        raise InputError(f"{path}: {where or 'the file'}: {given!r}; allowed is a mapping with some of {', '.join(names)}")
+        raise InputError(f"{source}: {where or 'the file'}: {given!r}; allowed is a mapping with some of {', '.join(names)}")
     for name, value in given.items():
         field = f"{where}.{name}" if where else str(name)
         if name not in names:
-            raise InputError(f"{path}: {field}: is unknown; allowed are {', '.join(names)}")
-        default = getattr(schema, name)
+            raise InputError(f"{source}: {field}: is unknown; allowed are {', '.join(names)}")
+        default = getattr(defaults, name)
         if dataclasses.is_dataclass(default):
-            _check(value, default, path, field)
-            continue
-        low, high = _ALLOWED.get(field, _ANY)
-        kind = int if isinstance(default, int) else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
-            whole = "a whole number" if isinstance(default, int) else "a finite number"
-            raise InputError(f"{path}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
+            _check(value, default, source, field)
+        elif isinstance(default, bool | str):
+            if type(value) is not type(default):
+                raise InputError(
+                    f"{source}: {field}: {value!r}; allowed is {'a text' if isinstance(default, str) else 'a truth value'}"
+                )
+        else:
+            low, high = _ALLOWED.get(".".join(field.split(".")[-2:]), _ANY)
+            kind = int if isinstance(default, int) else (int, float)
+            if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
+                whole = "a whole number" if isinstance(default, int) else "a finite number"
+                raise InputError(f"{source}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
 
 
-def load_config(path: Path | None = None) -> ClutterConfig:
-    """The defaults, with the fields that a YAML file names put over them.
+Config = TypeVar("Config")
+
+
+def load_typed(defaults: Config, path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """A config: the defaults, with the fields that a YAML file names put over them, and single fields over those.
+
+    Args:
+        defaults: a dataclass, all fields set.
+        path: the file.
+        settings: such as "camera.altitude=2".
 
     Raises:
-        InputError: the file cannot be read, has an unknown field, or a value that is not allowed.
+        InputError: the file cannot be read, an unknown field, or a value that is not allowed.
     """
-    if path is None:
-        return ClutterConfig()
-    try:
-        text = path.read_text(encoding="utf-8")
-        given = yaml.safe_load(text) or {}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except Exception as error:  # as in scenes/scene_file.py
-        raise InputError(f"{path}: is not YAML ({error}); allowed is a mapping of config fields") from error
-    _check(given, ClutterConfig(), path)
-    config: ClutterConfig = yaml_load_typed(schema=ClutterConfig, data=json.dumps(given), defaults=ClutterConfig())
+    config = defaults
+    if path is not None:
+        try:
+            given = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        except Exception as error:  # as in scenes/scene_file.py
+            raise InputError(f"{path}: is not YAML ({error}); allowed is a mapping of config fields") from error
+        config = _over(config, given, str(path))
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        try:
+            given = yaml.safe_load(text)
+        except yaml.YAMLError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--set {setting}: allowed is FIELD=VALUE, such as camera.altitude=2")
+        for part in reversed(name.split(".")):
+            given = {part: given}
+        config = _over(config, given, f"--set {setting}")
     return config
 
 
-def config_yaml(config: ClutterConfig) -> str:
-    """The config as YAML, every field written out."""
-    return str(yaml_dump_typed(config, schema=ClutterConfig))
+def _over(defaults: Config, given: Any, source: str) -> Config:
+    _check(given, defaults, source)
+    over: Config = yaml_load_typed(schema=type(defaults), data=json.dumps(given), defaults=defaults)
+    return over
+
+
+def load_config(path: Path | None = None) -> ClutterConfig:
+    """The simulated world, see `load_typed`."""
+    return load_typed(ClutterConfig(), path)
+
+
+def config_yaml(config: Any) -> str:
+    """A config as YAML, every field written out."""
+    return str(yaml_dump_typed(config, schema=type(config)))

@@ -3,6 +3,7 @@
 import json
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,19 @@ from typing import Any
 
 class InputError(ValueError):
     """A file, option or value that a user gave and that cannot be used; the message says what is allowed."""
+
+
+@contextmanager
+def told_in_one_line() -> Iterator[None]:
+    """A user's mistake is one line and exit code 2; an interruption, exit code 130."""
+    try:
+        yield
+    except InputError as error:
+        print(f"error {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped; what was finished is kept", file=sys.stderr)
+        sys.exit(130)
 
 
 @contextmanager

@@ -191,3 +191,27 @@ def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
     if FAST.stability(scene) is None:
         assert loose
         assert loose.isdisjoint(fixed)
+
+
+def test_a_tower_comes_apart_from_the_top() -> None:
+    tower = [resting("cracker_box", floor=k * 0.060, name=f"box{k}") for k in range(4)]
+    assert FAST.comes_apart(scene_of(*tower)) is True
+    assert FAST.comes_apart(scene_of()) is True
+
+
+def test_what_holds_each_other_down_does_not_come_apart() -> None:
+    """Two sugar boxes side by side on a can, 12.5 mm too far out to stay by themselves: two cracker boxes keep them down."""
+    can = resting("tomato_soup_can", name="can")
+    leaning = [resting("sugar_box", xy=(0.0, side * 0.0455), floor=0.101, name=f"sugar{side}") for side in (-1, 1)]
+    load = [resting("cracker_box", floor=0.101 + 0.038 + k * 0.060, name=f"load{k}") for k in (0, 1)]
+    held = scene_of(can, *leaning, *load)
+    assert FAST.stability(held) is None
+    assert FAST.comes_apart(held) is False
+    assert FAST.stability(scene_of(can, *leaning)) is not None
+    beside = resting("cracker_box", xy=(0.22, 0.22), name="beside")
+    assert FAST.comes_apart(scene_of(*held.objects, beside)) is False
+    assert FAST.comes_apart(scene_of(beside)) is True
+
+
+def test_beyond_the_model_it_does_not_say_whether_it_comes_apart() -> None:
+    assert isinstance(FAST.comes_apart(scene_of(resting("cracker_box", floor=0.1))), CannotJudge)

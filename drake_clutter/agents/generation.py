@@ -11,12 +11,16 @@ from scipy.stats import norm
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
+from drake_clutter.resources import shipped_path
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
 
 LAYOUT_TRIES = 1000
 """Graphs in a row that may fail to be laid out before the budget is called too large for the tray."""
@@ -29,6 +33,14 @@ class GenerationAgent(Protocol):
         """A terminal graph within the budget."""
 
 
+TRAINED = {
+    "sg": "training/checkpoints/sg.safetensors",
+    "sg-star": "training/checkpoints/sg_star.safetensors",
+    "sg-14": "training/checkpoints/sg_14.safetensors",
+}
+"""The shipped checkpoints, by the agent's name."""
+
+
 class RandomGenerator:
     """RG: uniform over the feasible rules, the first match of the rule that is drawn (SPEC section 3)."""
 
@@ -37,7 +49,53 @@ class RandomGenerator:
         return grammar.derive(budget, uniform_choice(rng))
 
 
-GENERATION_AGENTS: dict[str, type[RandomGenerator]] = {"random": RandomGenerator}
+class HillClimber:
+    """HC: begins with a random graph, and derives it anew from a random rule on, as long as that makes no worse scene.
+
+    Scenes are rated as `ClutterGeneration` does, without learning anything from one to the next.
+    """
+
+    TRIES = 150
+    """Graphs that are derived for each scene."""
+
+    def __init__(self, config: ClutterConfig) -> None:
+        self._config = config
+        self._judge = FastJudge(config, margin=GenerationTask().margin)
+
+    def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
+        """See `GenerationAgent.derive`."""
+        vocabulary = GraphVocabulary.of(list(grammar.classes.values()))
+        task = GenerationTask(nodes=budget.nodes)
+        best, best_worth = None, -np.inf
+        for _ in range(self.TRIES):
+            partial = PartialScene(grammar, vocabulary, task, self._config, self._judge)
+            kept: tuple[str, ...] = best.rules[: rng.integers(len(best.rules))] if best else ()
+            for name in kept:
+                partial.apply(grammar.index[name])
+            while not partial.finished:
+                partial.apply(int(rng.choice(np.flatnonzero(partial.mask))))
+            worth = task.instability_reward if partial.fault else task.hidden_reward * partial.hidden
+            if worth >= best_worth:
+                best, best_worth = Derivation(partial.graph, tuple(partial.rules)), worth
+        assert best is not None
+        return best
+
+
+def make_generation_agent(name: str, config: ClutterConfig) -> GenerationAgent:
+    """A generation agent: `random`, `hill-climbing`, one of `TRAINED`, or the checkpoint in a file.
+
+    Raises:
+        InputError: no such agent, or a file that is no checkpoint of one.
+    """
+    if name == "random":
+        return RandomGenerator()
+    if name == "hill-climbing":
+        return HillClimber(config)
+    if name not in TRAINED and not name.endswith(".safetensors"):
+        raise InputError(f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file")
+    from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
+
+    return LearnedGenerator(shipped_path(TRAINED[name]) if name in TRAINED else Path(name), config)
 
 
 @dataclass(frozen=True)
@@ -45,7 +103,7 @@ class GenerationJob:
     """Everything that decides what a batch of scenes looks like, scene by scene.
 
     Attributes:
-        agent: one of `GENERATION_AGENTS`.
+        agent: see `make_generation_agent`.
         objects: name of an object set.
         catalogue_folder: a user's asset folder, or None.
         nodes: exact size of the graphs.
@@ -83,7 +141,7 @@ class SceneGenerator:
         self._job = job
         self._grammar = SceneGrammar(load_catalogue(job.catalogue_folder).object_set(job.objects))
         self._budget = NodeBudget(job.nodes)
-        self._agent: GenerationAgent = GENERATION_AGENTS[job.agent]()
+        self._agent: GenerationAgent = make_generation_agent(job.agent, job.config)
         self._judge = DrakeJudge(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:

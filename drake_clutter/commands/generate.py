@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator, summarise
+from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator, make_generation_agent, summarise
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.files import InputError, output_directory, write_json
 from drake_clutter.grammar import NodeBudget
@@ -70,6 +70,7 @@ def generate(
     if count < 1:
         raise InputError(f"--count {count}; allowed is 1 or more")
     NodeBudget(job.nodes)
+    make_generation_agent(job.agent, job.config)
     catalogue = load_catalogue(job.catalogue_folder)
     for object_class in catalogue.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written

@@ -162,7 +162,7 @@ def uniform_choice(rng: np.random.Generator) -> Callable[[ClutterGraph, NDArray[
 
 
 def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Match | None:
-    """The match of a pattern whose root is the first possible of the given nodes. Children are tried in order, with backtracking."""
+    """The match whose root is the first possible of the given nodes. Children are tried in order, with backtracking."""
     nodes, edges = graph.nx._node, graph.nx._adj  # as networkx's own loops do: its views cost more than the matching
     root_name, root_kinds = next(iter(left.nodes.items()))
 

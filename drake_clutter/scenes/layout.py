@@ -99,13 +99,15 @@ class Stack:
                 above = graph.children(parent)
             level = [node for node in above if graph.kind(node) != END]
         self.p_T = np.array(origins)
-        self.lower = np.min(self.p_T + [resting.lower for resting in self._resting], axis=0)
-        self.upper = np.max(self.p_T + [resting.upper for resting in self._resting], axis=0)
+        self.lower = np.min(self.p_T + np.array([resting.lower for resting in self._resting]), axis=0)
+        self.upper = np.max(self.p_T + np.array([resting.upper for resting in self._resting]), axis=0)
 
     def objects(self, x: float = 0.0, y: float = 0.0) -> list[SceneObject]:
         """The stack's objects, the stack moved by x and y (m)."""
         made = []
-        for node, resting, (px, py, pz) in zip(self.nodes, self._resting, (self.p_T + [x, y, 0.0]).tolist(), strict=True):
+        for node, resting, (px, py, pz) in zip(
+            self.nodes, self._resting, (self.p_T + np.array([x, y, 0.0])).tolist(), strict=True
+        ):
             object_class = self._classes[self._graph.kind(node)]
             made.append(SceneObject(f"{object_class.name}_{node}", object_class, Pose((px, py, pz), resting.quaternion), node))
         return made

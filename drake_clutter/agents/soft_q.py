@@ -1,0 +1,318 @@
+"""Soft Q-learning of a scene generator (SPEC section 3): the policy is the softmax of Q / temperature over the feasible rules.
+
+Without discount, and with a deterministic grammar, the optimal soft policy draws every derivation with a probability
+proportional to exp(return / temperature): a distribution of scenes, the better the likelier (Haarnoja et al. 2017, eq. 2).
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from drake_clutter.agents.graph_network import RuleValues
+from drake_clutter.files import replacing
+from drake_clutter.runner import item_rng
+from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
+
+KEPT = ("node_kind", "node_flags", "position", "edge", "edge_kind", "remaining")
+"""What of an observation the network looks at; the masks follow from the kinds."""
+
+
+@dataclass
+class SoftQConfig:
+    """How a generator learns.
+
+    Attributes:
+        steps: of the environments, in all.
+        environments: that are stepped side by side.
+        batch: steps per update.
+        segment: steps that follow each other in it; trace: by which the later ones count for the earlier, see `aims`.
+        steps_per_update: steps of the environments between two updates.
+        replay: steps that are remembered.
+        warm_up: steps, at the beginning, by uniform choice.
+        learning_rate: at the beginning; it is halved every `halve_every` steps (SPEC section 3).
+        temperature: of the policy, in units of the reward.
+        target_rate: by which the target network moves towards the other at every update.
+        width: of the network.
+    """
+
+    steps: int = 640_000
+    environments: int = 32
+    batch: int = 128
+    segment: int = 8
+    trace: float = 0.95
+    steps_per_update: int = 4
+    replay: int = 100_000
+    warm_up: int = 4_000
+    learning_rate: float = 1e-3
+    halve_every: int = 128_000
+    temperature: float = 0.1
+    target_rate: float = 0.005
+    width: int = 32
+
+
+class Episode(NamedTuple):
+    """How an episode ended: what its rewards sum up to, and the last `info`."""
+
+    score: float
+    info: dict[str, Any]
+
+
+def stacked(observations: Sequence[GraphObservation]) -> dict[str, NDArray[Any]]:
+    """A batch of observations, those of their arrays that the network looks at."""
+    return {name: np.stack([observation[name] for observation in observations]) for name in KEPT}
+
+
+def softmax_choice(
+    values: NDArray[np.float32], mask: NDArray[np.bool_], temperature: float, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """(B,) a feasible action for each row, drawn with probabilities softmax(values / temperature); values, mask: (B, actions)."""
+    noise = rng.gumbel(size=values.shape)  # the largest of values with Gumbel noise is such a draw
+    return np.asarray(np.where(mask, values / temperature + noise, -np.inf).argmax(axis=1))
+
+
+def soft_value(values: Tensor, mask: Tensor, temperature: float) -> Tensor:
+    """(B,) V = temperature * log sum exp(Q / temperature) over the feasible actions; 0 where there are none."""
+    exponent = (values / temperature).masked_fill(~mask, -torch.inf)
+    return torch.where(mask.any(dim=1), temperature * exponent.logsumexp(dim=1), 0.0)
+
+
+def play(
+    network: RuleValues,
+    make_environment: Callable[[], ClutterGeneration],
+    count: int,
+    temperature: float,
+    seed: int,
+    side_by_side: int = 64,
+) -> list[Episode]:
+    """Samples episodes, the same for the same seed."""
+    environments = [make_environment() for _ in range(min(side_by_side, count))]
+    rng, episodes = item_rng(seed, 2), list[Episode]()
+    while len(episodes) < count:
+        # So many at a time, and none in the place of one that ends: short episodes are not to be more frequent.
+        running = {k: environment.reset(seed=int(rng.integers(2**31))) for k, environment in enumerate(environments)}
+        scores = [0.0] * len(environments)
+        while running:
+            observations = stacked([observation for observation, _ in running.values()])
+            masks = np.array([info["action_mask"] for _, info in running.values()]).astype(bool)
+            with torch.no_grad():
+                actions = softmax_choice(network(observations).cpu().numpy(), masks, temperature, rng)
+            for k, action in zip(list(running), actions.tolist(), strict=True):
+                observation, reward, over, _, info = environments[k].step(action)
+                scores[k] += float(reward)
+                running[k] = observation, info
+                if over:
+                    episodes.append(Episode(scores[k], info))
+                    del running[k]
+    return episodes[:count]
+
+
+class Replay:
+    """The latest steps of some environments that are stepped side by side.
+
+    Attributes:
+        arrays: by name, (times, environments, ...), a ring over the times: the observation before the step, `mask`, what was
+            feasible, `action`, `reward`, and `over`, whether the episode ended with it.
+        times: that were ever added.
+    """
+
+    def __init__(self, capacity: int, environments: int, observation: GraphObservation, actions: int) -> None:
+        """Room for that many steps, of all environments together."""
+
+        def room(like: NDArray[Any]) -> NDArray[Any]:
+            return np.zeros((max(1, capacity // environments), environments, *like.shape), like.dtype)
+
+        self.arrays = {name: room(observation[name]) for name in KEPT}
+        others = {"mask": np.zeros(actions, bool), "action": np.int64(0), "reward": np.float32(0), "over": np.bool_(False)}
+        self.arrays |= {name: room(np.asarray(like)) for name, like in others.items()}
+        self.times = 0
+
+    def add(self, **step: NDArray[Any]) -> None:
+        """Remembers one step of every environment: arrays (environments, ...)."""
+        for name, array in step.items():
+            self.arrays[name][self.times % len(self.arrays[name])] = array
+        self.times += 1
+
+    def draw(self, segments: int, length: int, rng: np.random.Generator) -> dict[str, NDArray[Any]] | None:
+        """Steps of one environment after another, (segments, length + 1, ...), uniformly; None as long as there are too few."""
+        capacity, environments = self.arrays["action"].shape
+        held = min(self.times, capacity)
+        if held <= length:
+            return None
+        start = self.times - held + rng.integers(held - length, size=segments)
+        time = (start[:, None] + np.arange(length + 1)) % capacity
+        number = rng.integers(environments, size=segments)[:, None]
+        return {name: array[time, number] for name, array in self.arrays.items()}
+
+
+def aims(values: Tensor, mask: Tensor, action: Tensor, reward: Tensor, over: Tensor, temperature: float, trace: float) -> Tensor:
+    """(S, L) what Q(s, a) should be, for S segments of L steps.
+
+    Where the policy is optimal, V(s) = r - temperature * log policy(a | s) + V(s') for every action, whoever chose it (path
+    consistency, Nachum et al. 2017, theorem 1). So the errors of the later steps can be added to the one-step aim:
+
+        aim(k) = r(k) + V(k + 1) + trace * (aim(k + 1) - Q(k + 1, a(k + 1))), without what lies beyond an episode's end.
+
+    Args:
+        values: (S, L + 1, actions) the target network's.
+        mask: (S, L + 1, actions) feasible actions.
+        action, reward, over: (S, L + 1).
+        temperature: of the policy.
+        trace: 0 takes one step into account, 1 all that there are.
+    """
+    value = soft_value(values.flatten(0, 1), mask.flatten(0, 1), temperature).view_as(reward)
+    taken = values.gather(2, action[:, :, None]).squeeze(2)
+    length = reward.shape[1] - 1
+    found: list[Tensor] = []
+    later = value[:, length]
+    for k in reversed(range(length)):
+        found.append(reward[:, k] + torch.where(over[:, k], 0.0, later))
+        later = value[:, k] + trace * (found[-1] - taken[:, k])
+    return torch.stack(found[::-1], dim=1)
+
+
+class SoftQLearner:
+    """Environments, networks and replay of one training, step by step.
+
+    Attributes:
+        step: of the environments, so far.
+        network: Q.
+        losses: the latest, one per update.
+    """
+
+    def __init__(
+        self, make_environment: Callable[[], ClutterGeneration], config: SoftQConfig, seed: int, device: torch.device
+    ) -> None:
+        """Begins a training; `make_environment()` makes a `ClutterGeneration`."""
+        self.config, self.seed, self.device = config, seed, device
+        self._environments: list[ClutterGeneration] = [make_environment() for _ in range(config.environments)]
+        vocabulary, rules = self._environments[0].vocabulary, len(self._environments[0].grammar.rules)
+        torch.manual_seed(seed)
+        self.network = RuleValues(len(vocabulary.node_kinds), len(vocabulary.edge_kinds), rules, config.width).to(device)
+        self._target = deepcopy(self.network).requires_grad_(False)
+        self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate, fused=True)
+        self._rng = item_rng(seed, 0)
+        self.step, self.losses = 0, list[float]()
+        self._scores = [0.0] * config.environments
+        self._observations: list[GraphObservation] = []
+        self._masks: list[NDArray[np.bool_]] = []
+        for number, environment in enumerate(self._environments):
+            observation, info = environment.reset(seed=int(item_rng(seed, 1, number).integers(2**31)))
+            self._observations.append(observation)
+            self._masks.append(info["action_mask"].astype(bool))
+        self._replay = Replay(config.replay, config.environments, self._observations[0], rules)
+
+    def begin_with(self, network: RuleValues) -> None:
+        """Takes over what another network has learned."""
+        self.network.load_state_dict(network.state_dict())
+        self._target.load_state_dict(network.state_dict())
+
+    @property
+    def learning_rate(self) -> float:
+        """Of the present step."""
+        return float(self.config.learning_rate * 0.5 ** (self.step // self.config.halve_every))
+
+    def advance(self) -> list[Episode]:
+        """One step of every environment, and the updates that are due; returns the episodes that ended."""
+        ended = []
+        masks = np.array(self._masks)
+        values = np.zeros(masks.shape, np.float32)
+        if self.step >= self.config.warm_up:
+            with torch.no_grad():
+                values = self.network(stacked(self._observations)).cpu().numpy()
+        actions = softmax_choice(values, masks, self.config.temperature, self._rng)
+        step = stacked(self._observations) | {"mask": masks, "action": actions}
+        rewards, overs = np.zeros(len(actions), np.float32), np.zeros(len(actions), bool)
+        for k, environment in enumerate(self._environments):
+            observation, reward, over, _, info = environment.step(int(actions[k]))
+            rewards[k], overs[k] = reward, over
+            self._scores[k] += float(reward)
+            if over:
+                ended.append(Episode(self._scores[k], info))
+                self._scores[k] = 0.0
+                observation, info = environment.reset()
+            self._observations[k], self._masks[k] = observation, info["action_mask"].astype(bool)
+        self._replay.add(**step, reward=rewards, over=overs)
+        updates_before, self.step = self._updates_due(), self.step + len(self._environments)
+        self.losses = [loss for _ in range(self._updates_due() - updates_before) if (loss := self._update()) is not None]
+        return ended
+
+    def _updates_due(self) -> int:
+        return max(0, self.step - self.config.warm_up) // self.config.steps_per_update
+
+    def _update(self) -> float | None:
+        config = self.config
+        drawn = self._replay.draw(max(1, config.batch // config.segment), config.segment, self._rng)
+        if drawn is None:
+            return None
+        names = ("mask", "action", "reward", "over")
+        mask, action, reward, over = (torch.from_numpy(drawn[name]).to(self.device) for name in names)
+        with torch.no_grad():
+            values = self._target({name: drawn[name].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}).view(mask.shape)
+            aim = aims(values, mask, action, reward, over, config.temperature, config.trace).flatten()
+        before = {name: drawn[name][:, :-1].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}
+        chosen = self.network(before).gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
+        loss = torch.nn.functional.smooth_l1_loss(chosen, aim)
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        self._optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
+        self._optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_([*self._target.parameters()], [*self.network.parameters()], self.config.target_rate)
+        return loss.item()
+
+    def save(self, path: Path) -> None:
+        """Writes all that the training needs to go on as if it had never been interrupted."""
+        arrays = {f"network.{name}": value.detach().cpu() for name, value in self.network.state_dict().items()}
+        arrays |= {f"target.{name}": value.detach().cpu() for name, value in self._target.state_dict().items()}
+        for number, moments in self._optimizer.state_dict()["state"].items():
+            arrays |= {f"optimizer.{number}.{name}": value.detach().cpu() for name, value in moments.items()}
+        arrays |= {f"replay.{name}": torch.from_numpy(array[: self._replay.times]) for name, array in self._replay.arrays.items()}
+        state = {
+            "step": self.step,
+            "remembered": self._replay.times,
+            "rng": self._rng.bit_generator.state,
+            "environments": [
+                {"rules": environment.partial.rules, "score": score, "rng": environment.np_random.bit_generator.state}
+                for environment, score in zip(self._environments, self._scores, strict=True)
+            ],
+        }
+        with replacing(path) as temporary:
+            save_file(arrays, temporary, metadata={"state": json.dumps(state)})
+
+    def load(self, path: Path) -> None:
+        """Goes on where `save` was called, in a training of the same config and seed."""
+        with safe_open(path, "pt") as file:
+            state = json.loads(file.metadata()["state"])
+            arrays: dict[str, dict[str, Tensor]] = {"network": {}, "target": {}, "optimizer": {}, "replay": {}}
+            for name in file.keys():  # noqa: SIM118, it is no dict
+                part, _, rest = name.partition(".")
+                arrays[part][rest] = file.get_tensor(name)
+        self.network.load_state_dict(arrays["network"])
+        self._target.load_state_dict(arrays["target"])
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, value in arrays["optimizer"].items():
+            number, _, rest = name.partition(".")
+            moments.setdefault(int(number), {})[rest] = value
+        self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": moments})
+        for name, value in arrays["replay"].items():
+            self._replay.arrays[name][: len(value)] = value.numpy()
+        self._replay.times, self.step = state["remembered"], state["step"]
+        self._rng.bit_generator.state = state["rng"]
+        for k, (environment, saved) in enumerate(zip(self._environments, state["environments"], strict=True)):
+            observation, info = environment.reset()
+            for rule in saved["rules"]:
+                observation, _, _, _, info = environment.step(environment.grammar.index[rule])
+            environment.np_random.bit_generator.state = saved["rng"]
+            self._scores[k], self._observations[k], self._masks[k] = saved["score"], observation, info["action_mask"].astype(bool)

@@ -1,0 +1,193 @@
+"""The generation environment: what it shows, what it pays, when it ends."""
+
+import gymnasium
+import networkx as nx
+import numpy as np
+import pytest
+from conftest import CLASSES, GRAMMARS, rng
+from gymnasium.utils.env_checker import check_env
+
+from drake_clutter.grammar import ClutterGraph, NodeBudget, canonical_form
+from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, PRIMITIVE
+from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphObservation, StackFault, most_edges
+
+
+def random_action(mask: np.ndarray, draw: np.random.Generator) -> int:
+    return int(draw.choice(np.flatnonzero(mask)))
+
+
+def graph_of(observation: GraphObservation, environment: ClutterGeneration) -> ClutterGraph:
+    """The graph that an observation describes."""
+    kinds, edge_kinds = environment.vocabulary.node_kinds, environment.vocabulary.edge_kinds
+    nodes = {k: kinds[kind - 1] for k, kind in enumerate(observation["node_kind"].tolist()) if kind}
+    edges = {
+        (parent, child): edge_kinds[kind - 1]
+        for (parent, child), kind in zip(observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True)
+        if kind
+    }
+    return ClutterGraph.from_parts(nodes, edges)
+
+
+def finished_stacks(graph: ClutterGraph) -> set[int]:
+    """The objects of the stacks of which every attribute is terminal."""
+    found = set()
+    for bottom in graph.stacks():
+        members = set(bottom).union(*(nx.descendants(graph.nx, node) for node in bottom))
+        edges = [e for e in graph.nx.edges(data="kind") if e[1] in members and graph.kind(e[1]) != END]
+        if all(graph.kind(node) not in NON_TERMINAL_KINDS for node in members) and all(kind != PRIMITIVE for *_, kind in edges):
+            found |= {node for node in members if graph.kind(node) not in (END, DUMMY)}
+    return found
+
+
+def test_gymnasium_approves() -> None:
+    environment = gymnasium.make("drake_clutter.tasks:ClutterGeneration-v0")
+    assert isinstance(environment.unwrapped, ClutterGeneration)
+    check_env(environment.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("objects", ["ycb7", "pantry14"])
+def test_what_is_observed_is_the_graph(objects: str) -> None:
+    """With its finished stacks and where their objects stand."""
+    grammar = GRAMMARS[objects]
+    environment, draw = ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=14)), rng(1)
+    stacks_seen = 0
+    for episode in range(25):
+        observation, info = environment.reset(seed=episode)
+        over = False
+        while not over:
+            graph = environment.partial.graph
+            shown = graph_of(observation, environment)
+            assert [shown.kind(k) for k in shown.nx] == graph.kinds()
+            assert dict(shown.nx.edges) == dict(graph.nx.edges)
+            assert (info["action_mask"] == grammar.feasible(graph, NodeBudget(14))).all()
+            assert (observation["node_mask"] == (observation["node_kind"] > 0)).all()
+            assert (observation["edge_mask"] == (observation["edge_kind"] > 0)).all()
+            assert observation["remaining"] == pytest.approx((14 - len(graph)) / 25)
+            simulated = set(np.flatnonzero(observation["node_flags"][:, 0]).tolist())
+            assert simulated == finished_stacks(graph)
+            stacks_seen += bool(simulated)
+            for node in range(14):
+                if node in simulated:
+                    assert observation["position"][node, 2] > 0
+                else:
+                    assert (observation["position"][node] == 0).all()
+            observation, _, over, truncated, info = environment.step(random_action(info["action_mask"], draw))
+            assert not truncated
+    assert stacks_seen > 50
+
+
+def test_the_marks_show_what_a_rule_rewrites() -> None:
+    environment, draw = ClutterGeneration(task=GenerationTask(nodes=14)), rng(2)
+    grammar, changed_kinds = environment.grammar, 0
+    for episode in range(15):
+        observation, info = environment.reset(seed=episode)
+        over = False
+        while not over:
+            action = random_action(info["action_mask"], draw)
+            rule, before = grammar.rules[action], environment.partial.graph.copy()
+            marked = (
+                np.flatnonzero(observation["node_flags"][:, 1 + ["top", "slot", "child"].index(rule.left.rewritten)])
+                if (rule.left.rewritten != "tray")
+                else np.array([0])
+            )
+            observation, _, over, _, info = environment.step(action)
+            after = environment.partial.graph
+            changed = {n for n in before.nx if before.kind(n) != after.kind(n)}
+            changed |= {
+                child
+                for _, child in set(before.nx.edges) & set(after.nx.edges)
+                if any(before.edge_kind(p, child) != after.edge_kind(p, child) for p in before.nx.predecessors(child))
+                and rule.left.rewritten == "child"
+            }
+            if changed:
+                changed_kinds += 1
+                assert changed == set(marked.tolist()), rule.name
+    assert changed_kinds > 200
+
+
+def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
+    task = GenerationTask(nodes=14, hidden_reward=0.5, instability_reward=-1.0)
+    environment, draw = ClutterGeneration(task=task), rng(3)
+    stable = unstable = 0
+    for episode in range(120):
+        _, info = environment.reset(seed=episode)
+        total, over = 0.0, False
+        while not over:
+            _, reward, over, _, info = environment.step(random_action(info["action_mask"], draw))
+            total += float(reward)
+        if "scene" in info:
+            stable += 1
+            assert info["verdict"].stable
+            assert total == pytest.approx(0.5 * len(info["verdict"].hidden))
+            assert info["scene"].graph.is_terminal
+            assert len(info["scene"].graph) == 14
+            derived = environment.grammar.replay(info["scene"].derivation)
+            assert canonical_form(derived, CLASSES) == canonical_form(info["scene"].graph, CLASSES)
+        else:
+            unstable += 1
+            assert total == pytest.approx(-1.0)
+    assert stable > 20
+    assert unstable > 20
+
+
+def test_an_infeasible_rule_changes_nothing() -> None:
+    environment = ClutterGeneration(task=GenerationTask(nodes=8))
+    before, info = environment.reset(seed=0)
+    infeasible = int(np.flatnonzero(info["action_mask"] == 0)[0])
+    after, reward, over, _, later = environment.step(infeasible)
+    assert reward == 0
+    assert not over
+    assert all((before[name] == after[name]).all() for name in before)
+    assert (later["action_mask"] == info["action_mask"]).all()
+
+
+def derived(environment: ClutterGeneration, rules: list[str]) -> tuple[float, bool, dict[str, object]]:
+    """Return, whether it is over, and the last info, of a derivation given by names."""
+    environment.reset(seed=0)
+    total, over = 0.0, False
+    info: dict[str, object] = {}
+    for name in rules:
+        assert not over, f"over before {name}"
+        _, reward, over, _, info = environment.step(environment.grammar.index[name])
+        total += float(reward)
+    return total, over, info
+
+
+def test_a_tower_that_falls_ends_the_episode() -> None:
+    """A cracker box flat on a marker that lies."""
+    environment = ClutterGeneration(task=GenerationTask(nodes=10))
+    rules = ["drop_object", "stack_object", "end", "insert_large_marker", "insert_cracker_box", "orient_flat_0", "orient_flat_0"]
+    total, over, info = derived(environment, rules)
+    assert over
+    assert total == -1.0
+    assert info["fault"] is StackFault.UNSTABLE
+
+
+def test_a_tower_that_is_too_high_ends_the_episode() -> None:
+    """Three cracker boxes on end are 0.69 m."""
+    environment = ClutterGeneration(task=GenerationTask(nodes=10))
+    rules = ["drop_object", "stack_object", "stack_object", "end", *["insert_cracker_box"] * 3, *["orient_upright_0"] * 3]
+    total, over, info = derived(environment, rules)
+    assert (total, over, info["fault"]) == (-1.0, True, StackFault.TOO_HIGH)
+
+
+def test_a_hidden_object_pays_at_once() -> None:
+    """A gelatin box under a cracker box, both flat; then another stack."""
+    environment = ClutterGeneration(task=GenerationTask(nodes=7))
+    rules = ["drop_object", "stack_object", "end", "insert_gelatin_box", "insert_cracker_box", "orient_flat_0", "orient_flat_0"]
+    total, over, _ = derived(environment, rules)
+    assert (total, over) == (0.5, False)
+
+
+def test_edges_fit() -> None:
+    """The most edges: as many pairs as possible."""
+    for nodes in range(3, 30):
+        grammar, draw, most = GRAMMARS["ycb7"], rng(nodes), 0
+        pairs = [k for k, rule in enumerate(grammar.rules) if rule.name.startswith("insert_meta")]
+        for _ in range(10):
+            graph = grammar.derive(
+                NodeBudget(nodes),
+                lambda _, mask: int(draw.choice(np.flatnonzero(mask) if not mask[pairs].any() else np.array(pairs)[mask[pairs]])),  # noqa: B023
+            ).graph
+            most = max(most, graph.nx.number_of_edges())
+        assert most <= most_edges(nodes)

@@ -1,0 +1,162 @@
+"""Soft Q-learning: the policy and the value as defined, learning where the answer is known, going on after a kill."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import rng
+
+from drake_clutter.agents.checkpoint import load_checkpoint
+from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, play, soft_value, softmax_choice
+from drake_clutter.files import InputError
+from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+
+CPU = torch.device("cpu")
+SMALL = SoftQConfig(steps=400, environments=4, batch=16, replay=200, warm_up=60, width=8)
+SCRIPT = Path(__file__).parents[1] / "training" / "train_generator.py"
+
+
+def small_environment() -> ClutterGeneration:
+    return ClutterGeneration(task=GenerationTask(nodes=6))
+
+
+def test_actions_follow_the_softmax() -> None:
+    values = np.array([0.3, 0.1, 0.7, 9.0], np.float32)
+    mask = np.array([True, True, True, False])
+    drawn = softmax_choice(np.tile(values, (40_000, 1)), np.tile(mask, (40_000, 1)), 0.2, rng(0))
+    expected = np.exp(values[:3] / 0.2) / np.exp(values[:3] / 0.2).sum()
+    assert np.bincount(drawn, minlength=4)[:3] / 40_000 == pytest.approx(expected, abs=0.01)
+    assert (drawn != 3).all()
+
+
+def test_the_soft_value() -> None:
+    values = torch.tensor([[1.0, 2.0, 5.0], [1.0, 1.0, 1.0]])
+    mask = torch.tensor([[True, True, False], [False, False, False]])
+    expected = 0.5 * np.log(np.exp(2.0) + np.exp(4.0))
+    torch.testing.assert_close(soft_value(values, mask, 0.5), torch.tensor([expected, 0.0], dtype=torch.float32))
+
+
+def test_aims_by_hand() -> None:
+    """Two segments of two steps, three actions, temperature 0.5; in the second one the episode ends with its first step."""
+    values = torch.tensor([[[1.0, 2.0, 9.0], [0.5, 1.0, 0.0], [3.0, 1.0, 2.0]]] * 2)
+    mask = torch.tensor([[[True, True, False], [True, True, True], [False, True, False]]] * 2)
+    action = torch.tensor([[0, 2, 1]] * 2)
+    reward = torch.tensor([[0.1, 0.2, 7.0]] * 2)
+    over = torch.tensor([[False, False, False], [True, False, False]])
+    v1 = 0.5 * np.log(np.exp(1.0) + np.exp(2.0) + np.exp(0.0))
+    second = 0.2 + 1.0  # the third state has one feasible action
+    for trace in (0.0, 0.5, 1.0):
+        found = aims(values, mask, action, reward, over, 0.5, trace)
+        expected = [[0.1 + v1 + trace * (second - 0.0), second], [0.1, second]]
+        torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
+
+
+def test_what_is_drawn_was_added_and_follows_each_other() -> None:
+    example, _ = small_environment().reset(seed=0)
+    replay = Replay(capacity=60, environments=4, observation=example, actions=5)
+    draw, seen = rng(0), set[int]()
+    assert replay.draw(3, 4, draw) is None
+    for moment in range(40):  # the ring of 15 is filled more than twice
+        step = {name: np.repeat(array[None], 4, axis=0) for name, array in example.items() if name in replay.arrays}
+        numbers = 10 * moment + np.arange(4)
+        replay.add(**step, mask=np.ones((4, 5), bool), action=numbers, reward=numbers.astype(np.float32), over=numbers % 3 == 0)
+        if moment >= 5:
+            drawn = replay.draw(50, 4, draw)
+            assert drawn is not None
+            assert drawn["mask"].shape == (50, 5, 5)
+            assert (np.diff(drawn["action"], axis=1) == 10).all()
+            assert (drawn["action"] == drawn["reward"]).all()
+            assert drawn["action"].max() <= 10 * moment + 3
+            assert drawn["action"].min() >= 10 * max(0, moment - 14)
+            seen |= set(drawn["action"].ravel().tolist())
+    assert seen == {10 * moment + k for moment in range(40) for k in range(4)}
+
+
+def test_a_small_grammar_is_learned() -> None:
+    """Graphs of five nodes hold at most three objects in a tower, of which two are hidden."""
+    config = SoftQConfig(steps=8_000, environments=16, batch=64, steps_per_update=8, replay=8_000, warm_up=500, temperature=0.02)
+
+    def environment() -> ClutterGeneration:
+        return ClutterGeneration(task=GenerationTask(nodes=5))
+
+    learner = SoftQLearner(environment, config, 0, CPU)
+
+    def mean_score(temperature: float) -> float:
+        return float(np.mean([episode.score for episode in play(learner.network, environment, 100, temperature, 7)]))
+
+    by_chance = mean_score(1e6)
+    while learner.step < config.steps:
+        learner.advance()
+    assert by_chance < 0.4
+    assert mean_score(config.temperature) > 0.8
+
+
+def state_of(learner: SoftQLearner) -> list[torch.Tensor]:
+    return [value.clone() for value in learner.network.state_dict().values()]
+
+
+@pytest.mark.parametrize("at", [32, 200, 396])
+def test_a_saved_training_goes_on_as_if_nothing_had_been(at: int, tmp_path: Path) -> None:
+    """Before the first update, in the middle, and after the replay has been filled twice."""
+    through = SoftQLearner(small_environment, SMALL, 3, CPU)
+    while through.step < at:
+        through.advance()
+    through.save(tmp_path / "state.safetensors")
+    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU)
+    taken_up.load(tmp_path / "state.safetensors")
+    assert taken_up.step == at
+    for _ in range(15):
+        ended, ended_too = through.advance(), taken_up.advance()
+        assert [episode.score for episode in ended] == [episode.score for episode in ended_too]
+    assert through.losses == taken_up.losses
+    for mine, other in zip(state_of(through), state_of(taken_up), strict=True):
+        assert torch.equal(mine, other)
+
+
+def test_the_seed_decides() -> None:
+    def trained(seed: int) -> torch.Tensor:
+        learner = SoftQLearner(small_environment, SMALL, seed, CPU)
+        while learner.step < 160:
+            learner.advance()
+        return torch.cat([value.flatten() for value in state_of(learner)])
+
+    assert torch.equal(trained(1), trained(1))
+    assert not torch.equal(trained(1), trained(2))
+
+
+def script(out: Path, *more: str) -> list[str]:
+    settings = ["task.nodes=6", "learning.steps=480", "learning.environments=4", "learning.batch=16", "learning.warm_up=60"]
+    settings += ["learning.replay=300", "learning.width=8", "evaluate_every=160", "evaluation_scenes=8", "save_every=80"]
+    return [sys.executable, str(SCRIPT), "--out", str(out), "--threads", "1", *(a for s in settings for a in ("--set", s)), *more]
+
+
+def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> None:
+    subprocess.run(script(tmp_path / "whole"), check=True, capture_output=True)
+    killed = subprocess.Popen(script(tmp_path / "killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (tmp_path / "killed" / "state.safetensors").exists():
+        assert killed.poll() is None
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    assert not (tmp_path / "killed" / "generator.safetensors").exists()
+    subprocess.run(script(tmp_path / "killed"), check=True, capture_output=True)
+    whole, again = (load_checkpoint(tmp_path / name / "generator.safetensors") for name in ("whole", "killed"))
+    assert whole.weights.keys() == again.weights.keys()
+    assert all(torch.equal(whole.weights[name], again.weights[name]) for name in whole.weights)
+    histories = [json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")]
+    assert [row["step"] for row in histories[0]] == [row["step"] for row in histories[1]]
+    assert [row["score"] for row in histories[0]] == [row["score"] for row in histories[1]]
+    assert whole.about["metrics"]["step"] == 480
+    refused = subprocess.run(script(tmp_path / "whole", "--set", "seed=1"), capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert "config.yaml" in refused.stderr
+
+
+def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.safetensors"):
+        load_checkpoint(tmp_path / "none.safetensors")
