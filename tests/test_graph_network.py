@@ -92,7 +92,11 @@ def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
         weight = torch.cat([layer.attention(own) for own in node]).softmax(dim=0)
         pooled = sum((w * own for w, own in zip(weight, node, strict=True)), torch.zeros_like(glob))
         glob = glob + fc((layer.global_pooled, pooled), (layer.global_global, glob))
-    return torch.as_tensor(values.value(glob))
+    marked = []
+    for mark in range(3):
+        (at,) = np.flatnonzero(observation["node_flags"][:, 1 + mark]).tolist() or (None,)
+        marked.append(torch.zeros_like(glob) if at is None else node[at])
+    return torch.as_tensor(values.value(leaky(values.joined(torch.cat([glob, *marked])))))
 
 
 def test_the_same_as_with_loops() -> None:

@@ -20,8 +20,13 @@ from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
 from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
 
+SEARCH_BUDGET = 400
+"""Moves that are tried to find out whether a scene is solvable."""
+MOST_IN_A_STACK = 0.6
+"""Of a balanced scene's objects."""
 LAYOUT_TRIES = 1000
 """Graphs in a row that may fail to be laid out before the budget is called too large for the tray."""
 
@@ -127,11 +132,13 @@ class GeneratedScene:
         scene: as laid out.
         verdict: the judge's.
         layout_failures: graphs that were drawn before it and could not be laid out, by reason.
+        solvable: what the full-knowledge search says of a stable scene, once settled; None for an unstable one.
     """
 
     scene: Scene
     verdict: Verdict
     layout_failures: Counter[str]
+    solvable: Answer | None
 
 
 class SceneGenerator:
@@ -143,12 +150,17 @@ class SceneGenerator:
         self._budget = NodeBudget(job.nodes)
         self._agent: GenerationAgent = make_generation_agent(job.agent, job.config)
         self._judge = DrakeJudge(job.config)
+        self._search = FullKnowledgeSearch(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:
         """The scene of an index, judged; it depends on nothing but the job and the index."""
         rng = item_rng(self._job.seed, index)
         scene, failures = self.lay_out(rng)
-        return GeneratedScene(scene, self._judge.judge(scene, rng), failures)
+        verdict = self._judge.judge(scene, rng)
+        solvable = None
+        if verdict.stable:
+            solvable = self._search.solve(scene.at(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False).answer
+        return GeneratedScene(scene, verdict, failures, solvable)
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
         """A scene as laid out, and why the graphs drawn before it could not be."""
@@ -181,15 +193,26 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
     return float(np.mean(values)) - half, float(np.mean(values)) + half
 
 
-def summarise(job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]]) -> dict[str, Any]:
-    """The figures of a batch: stability over all scenes, hidden objects over the stable ones (SPEC section 6)."""
+def summarise(
+    job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]], solvable: Sequence[Answer | None] | None = None
+) -> dict[str, Any]:
+    """The figures of a batch: stability over all scenes, hidden and solvable over the stable ones (SPEC section 6).
+
+    `largest_stack_share` is of a scene's objects, on average; `balanced_share` is of the scenes in which no stack holds more than
+    60 % of them; `class_entropy` is in bits, over all objects.
+    """
     classes = load_catalogue(job.catalogue_folder).classes
     stable, hidden, stacks, forms, objects = 0, [], [], set(), []
     reasons: Counter[str] = Counter()
+    kinds: Counter[str] = Counter()
+    largest = []
     for scene, verdict in scenes:
         assert scene.graph is not None
-        stacks.append(len(scene.graph.stacks()))
+        heights = [len(stack) for stack in scene.graph.stack_objects()]
+        stacks.append(len(heights))
         objects.append(len(scene.objects))
+        largest.append(max(heights) / sum(heights))
+        kinds.update(o.object_class.name for o in scene.objects)
         forms.add(canonical_form(scene.graph, classes))
         if verdict.instability is None:
             stable += 1
@@ -197,6 +220,8 @@ def summarise(job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]]) -> di
         else:
             reasons[verdict.instability.reason.value] += 1
     count = len(stacks)
+    shares = np.array([*kinds.values()]) / kinds.total()
+    solved = sum(answer is Answer.SOLVABLE for answer in solvable or ())
     return {
         "nodes": job.nodes,
         "count": count,
@@ -204,9 +229,15 @@ def summarise(job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]]) -> di
         "stability_ci95": wilson_interval(stable, count),
         "hidden_mean": float(np.mean(hidden)) if hidden else None,
         "hidden_ci95": mean_interval(hidden),
+        "solvable_share": solved / stable if solvable and stable else None,
+        "solvable_ci95": wilson_interval(solved, stable) if solvable and stable else None,
         "distinct_share": len(forms) / count,
         "mean_stacks": float(np.mean(stacks)),
         "mean_objects": float(np.mean(objects)),
+        "largest_stack_share": float(np.mean(largest)),
+        "balanced_share": float(np.mean(np.array(largest) <= MOST_IN_A_STACK)),
+        "class_entropy": float(-(shares * np.log2(shares)).sum()),
+        "classes": dict(sorted(kinds.items())),
         "instability_reasons": dict(reasons.most_common()),
         "agent": job.agent,
         "objects": job.objects,

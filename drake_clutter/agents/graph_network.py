@@ -92,17 +92,23 @@ class GraphNetwork(nn.Module):
         return node, glob
 
 
+MARKS = 3
+"""Kinds of rules that mark the node they would rewrite: of structure, insertion, orientation."""
+
+
 class RuleValues(nn.Module):
     """Q: a value for every rule of a grammar, from the observation of `ClutterGeneration`.
 
-    Edges carry messages both ways; the ways are different kinds.
+    Edges carry messages both ways; the ways are different kinds. The values are read from the global node, as in the paper, and
+    from the nodes that are marked as what the next rules would rewrite: 0 where there is none.
     """
 
     def __init__(self, node_kinds: int, edge_kinds: int, rules: int, width: int = 32) -> None:
         super().__init__()
         self._edge_kinds = edge_kinds
         self.network = GraphNetwork(node_kinds, 4 + 3, 2 * edge_kinds, 1, width)
-        self.value = nn.Linear(width, rules)
+        self.joined = nn.Linear((1 + MARKS) * width, 2 * width)
+        self.value = nn.Linear(2 * width, rules)
 
     def batch(self, observation: Mapping[str, NDArray[Any]]) -> GraphBatch:
         """The network's input: arrays as in `ClutterGeneration`, with a first axis of graphs."""
@@ -117,5 +123,10 @@ class RuleValues(nn.Module):
 
     def forward(self, observation: Mapping[str, NDArray[Any]]) -> Tensor:
         """(B, rules)."""
-        values: Tensor = self.value(self.network(self.batch(observation))[1])
+        batch = self.batch(observation)
+        node, glob = self.network(batch)
+        row, mark = batch.feature[:, 1 : 1 + MARKS].nonzero(as_tuple=True)
+        marked = node.new_zeros(len(glob) * MARKS, node.shape[1])
+        marked = marked.index_copy(0, batch.graph[row] * MARKS + mark, node[row]).view(len(glob), -1)
+        values: Tensor = self.value(leaky_relu(self.joined(torch.cat([glob, marked], dim=1))))
         return values

@@ -21,6 +21,7 @@ from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.scenes.seams import Verdict
+from drake_clutter.tasks.full_knowledge import Answer
 
 JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
 SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"
@@ -90,18 +91,23 @@ def generate(
     done = next((index for index, path in enumerate(paths) if not path.exists()), count)
     earlier_run = json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
     seconds, failures = float(earlier_run.get("seconds", 0.0)), Counter(earlier_run.get("layout_failures", {}))
+    solvable: list[str | None] = earlier_run.get("solvable", [])[:done]
+    done = len(solvable)  # one less than the scenes, if the run was stopped between the two files
 
     start = time.monotonic()
     made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers, ray_address=ray_address)
     for index, result in enumerate(progress(made, done, count), start=done):
         failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, result.verdict)
-        write_json(out / PROGRESS_FILE, {"seconds": seconds + time.monotonic() - start, "layout_failures": dict(failures)})
+        solvable.append(result.solvable.value if result.solvable else None)
+        spent = seconds + time.monotonic() - start
+        write_json(out / PROGRESS_FILE, {"seconds": spent, "layout_failures": dict(failures), "solvable": solvable})
     seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
 
     files = [load_scene(path, catalogue) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
-    summary = summarise(job, judged)
+    answers = [None if answer is None else Answer(answer) for answer in solvable[:count]]
+    summary = summarise(job, judged, answers)
     summary |= {"layout_failures": dict(failures), "seconds": round(seconds, 2), "workers": workers, "config": asdict(job.config)}
     write_json(out / SUMMARY_FILE, summary)
     write_contact_sheet(out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])])

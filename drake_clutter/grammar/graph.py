@@ -109,6 +109,14 @@ class ClutterGraph:
             bases.setdefault(base, []).append(node)
         return list(bases.values())
 
+    def stack_objects(self) -> list[list[int]]:
+        """The object nodes of every stack, in the stacks' order."""
+        found = []
+        for bottom in self.stacks():
+            members = set(bottom).union(*(nx.descendants(self.nx, node) for node in bottom))
+            found.append([node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS])
+        return found
+
     def objects(self) -> Iterator[tuple[int, str]]:
         """(node, class) of every object node, in order of creation."""
         return ((node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS)

@@ -102,13 +102,14 @@ class FullKnowledgeSearch:
         self._executor = FastExecutor(config, self._judge)
         self._hidden_below = config.camera.hidden_below
 
-    def solve(self, scene: Scene, seed: int = 0, budget: int = 5000) -> Solution:
+    def solve(self, scene: Scene, seed: int = 0, budget: int = 5000, *, fewest: bool = True) -> Solution:
         """The fewest moves for a scene at rest.
 
         Args:
             scene: as it settled.
             seed: of the places that are equally good; an episode of the same seed puts the objects where the plan does.
             budget: moves to try at most.
+            fewest: whether to look for a shorter plan when there is one.
         """
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(), item_rng(seed).bit_generator.state)
@@ -122,6 +123,8 @@ class FullKnowledgeSearch:
         except _OutOfBudgetError:
             pass
         self._left += budget - budget // 2
+        if plan is not None and not fewest:
+            return Solution(Answer.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
         try:
             while not exhausted and at_least < (len(plan) if plan is not None else LONGEST + 1):
                 self._doubts = 0
