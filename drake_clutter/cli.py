@@ -133,6 +133,9 @@ def _report(step: "Step") -> None:
 def generate(
     out: OutOption,
     agent: Annotated[str, typer.Option(help="random, hill-climbing, sg, sg-star, sg-14, or a checkpoint's file.")] = "random",
+    temperature: Annotated[
+        float | None, typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds.")
+    ] = None,
     objects: ObjectsOption = "ycb7",
     nodes: NodesOption = 25,
     count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
@@ -148,7 +151,7 @@ def generate(
     from drake_clutter.commands import generate as command
     from drake_clutter.config import load_config
 
-    job = GenerationJob(agent, objects, catalogue, nodes, seed, load_config(config))
+    job = GenerationJob(agent, objects, catalogue, nodes, seed, load_config(config), temperature)
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return _tracked("scenes", made, done, total)

@@ -3,25 +3,32 @@
 from collections import Counter
 from functools import partial
 
+import numpy as np
 import pytest
 import yaml
 from conftest import CLASSES, GRAMMARS, rng
 
 from drake_clutter.agents.generation import (
+    GenerationAgent,
     GenerationJob,
+    HillClimber,
     RandomGenerator,
     SceneGenerator,
+    make_generation_agent,
     mean_interval,
     summarise,
     wilson_interval,
 )
 from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import scene_fields
 from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
+from drake_clutter.tasks.full_knowledge import Answer
+from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
 
 def job(nodes: int = 10, seed: int = 5) -> GenerationJob:
@@ -77,6 +84,46 @@ def test_the_random_generator_is_uniform_over_feasible_rules() -> None:
     assert min(second.values()) > 200 - 4 * 11.5  # four standard deviations
 
 
+def test_a_generated_scene_says_whether_it_is_solvable() -> None:
+    made = [SceneGenerator(job(12))(index) for index in range(6)]
+    assert {m.verdict.stable for m in made} == {True, False}
+    for m in made:
+        assert (m.solvable is None) == (not m.verdict.stable)
+        if m.verdict.stable and not m.verdict.hidden:
+            assert m.solvable is Answer.SOLVABLE
+
+
+def test_the_hill_climber_hides_more_than_chance() -> None:
+    grammar, config = GRAMMARS["ycb7"], ClutterConfig()
+    environment = ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=12), config)
+
+    def worth(agent: GenerationAgent, seed: int) -> float:
+        environment.reset(seed=0)
+        total, over = 0.0, False
+        for name in agent.derive(grammar, NodeBudget(12), rng(seed)).rules:
+            if not over:
+                _, reward, over, _, _ = environment.step(environment.grammar.index[name])
+                total += float(reward)
+        assert over
+        return total
+
+    climbed = [worth(HillClimber(config), seed) for seed in range(5)]
+    chance = [worth(RandomGenerator(), seed) for seed in range(20)]
+    assert np.mean(climbed) > np.mean(chance) + 1.0
+    assert min(climbed) > 0
+
+
+def test_an_unknown_agent_is_refused() -> None:
+    for name, temperature, named in (
+        ("clever", None, "clever"),
+        ("none.safetensors", None, "none.safetensors"),
+        ("random", 0.5, "temperature"),
+        ("sg-star", -1.0, "temperature"),
+    ):
+        with pytest.raises(InputError, match=named):
+            make_generation_agent(name, ClutterConfig(), temperature)
+
+
 # --- Figures ---
 
 
@@ -124,7 +171,11 @@ def test_summary_of_a_batch_by_hand() -> None:
         Verdict(slid, {}, {}, ()),
         Verdict(None, {}, {}, ("c",)),
     ]
-    summary = summarise(job(), list(zip(scenes, verdicts, strict=True)))
+    answers = [Answer.SOLVABLE, Answer.UNDECIDED, None, Answer.SOLVABLE]
+    summary = summarise(job(), list(zip(scenes, verdicts, strict=True)), answers)
+    assert summary.pop("solvable_ci95") == pytest.approx(wilson_interval(2, 3))
+    assert summary.pop("largest_stack_share") == pytest.approx((0.5 + 0.5 + 1 + 1) / 4)
+    assert summary.pop("class_entropy") == pytest.approx(-sum(n / 9 * np.log2(n / 9) for n in (6, 2, 1)))
     low, high = summary.pop("stability_ci95")
     assert (low, high) == pytest.approx((0.3006, 0.9544), abs=5e-5)
     assert summary.pop("hidden_ci95") == pytest.approx((1 - 1.959964 / 3**0.5, 1 + 1.959964 / 3**0.5))
@@ -133,11 +184,15 @@ def test_summary_of_a_batch_by_hand() -> None:
         "count": 4,
         "stability_rate": 0.75,
         "hidden_mean": 1.0,  # over the three that are stable
+        "solvable_share": 2 / 3,
+        "balanced_share": 0.5,
+        "classes": {"cracker_box": 1, "sugar_box": 6, "tomato_soup_can": 2},
         "distinct_share": 0.75,
         "mean_stacks": (2 + 2 + 1 + 1) / 4,
         "mean_objects": (2 + 2 + 2 + 3) / 4,
         "instability_reasons": {"slid": 1},
         "agent": "random",
+        "temperature": None,
         "objects": "ycb7",
         "seed": 5,
     }
@@ -148,3 +203,4 @@ def test_a_batch_without_a_stable_scene_has_no_mean() -> None:
     toppled = Verdict(Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.0, 1.0), {}, {}, ())
     summary = summarise(job(), [(scene, toppled)])
     assert (summary["stability_rate"], summary["hidden_mean"], summary["hidden_ci95"]) == (0.0, None, None)
+    assert (summary["solvable_share"], summary["solvable_ci95"]) == (None, None)

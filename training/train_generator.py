@@ -74,7 +74,7 @@ def main(
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainGenerator.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    threads: Annotated[int, typer.Option(help="Of torch on the CPU.")] = 2,
+    threads: Annotated[int, typer.Option(help="Of torch on the CPU; more than one helps little with networks this small.")] = 1,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
     run = load_typed(TrainGenerator(), config, settings or [])

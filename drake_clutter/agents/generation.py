@@ -86,21 +86,29 @@ class HillClimber:
         return best
 
 
-def make_generation_agent(name: str, config: ClutterConfig) -> GenerationAgent:
+def make_generation_agent(name: str, config: ClutterConfig, temperature: float | None = None) -> GenerationAgent:
     """A generation agent: `random`, `hill-climbing`, one of `TRAINED`, or the checkpoint in a file.
 
+    Args:
+        name: which.
+        config: the world.
+        temperature: of a trained agent's policy; None: the one it was trained with.
+
     Raises:
-        InputError: no such agent, or a file that is no checkpoint of one.
+        InputError: no such agent, a file that is no checkpoint of one, or a temperature for an agent that has none.
     """
+    learned = name in TRAINED or name.endswith(".safetensors")
+    if temperature is not None and not (learned and temperature > 0):
+        raise InputError(f"--temperature {temperature:g} for {name}; allowed is a positive one, for a trained agent")
     if name == "random":
         return RandomGenerator()
     if name == "hill-climbing":
         return HillClimber(config)
-    if name not in TRAINED and not name.endswith(".safetensors"):
+    if not learned:
         raise InputError(f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file")
     from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
 
-    return LearnedGenerator(shipped_path(TRAINED[name]) if name in TRAINED else Path(name), config)
+    return LearnedGenerator(shipped_path(TRAINED[name]) if name in TRAINED else Path(name), config, temperature)
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,7 @@ class GenerationJob:
         nodes: exact size of the graphs.
         seed: of the batch.
         config: the world.
+        temperature: see `make_generation_agent`.
     """
 
     agent: str
@@ -122,6 +131,7 @@ class GenerationJob:
     nodes: int
     seed: int
     config: ClutterConfig
+    temperature: float | None = None
 
 
 @dataclass(frozen=True)
@@ -148,7 +158,7 @@ class SceneGenerator:
         self._job = job
         self._grammar = SceneGrammar(load_catalogue(job.catalogue_folder).object_set(job.objects))
         self._budget = NodeBudget(job.nodes)
-        self._agent: GenerationAgent = make_generation_agent(job.agent, job.config)
+        self._agent: GenerationAgent = make_generation_agent(job.agent, job.config, job.temperature)
         self._judge = DrakeJudge(job.config)
         self._search = FullKnowledgeSearch(job.config)
 
@@ -240,6 +250,7 @@ def summarise(
         "classes": dict(sorted(kinds.items())),
         "instability_reasons": dict(reasons.most_common()),
         "agent": job.agent,
+        "temperature": job.temperature,
         "objects": job.objects,
         "seed": job.seed,
     }

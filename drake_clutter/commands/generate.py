@@ -71,7 +71,7 @@ def generate(
     if count < 1:
         raise InputError(f"--count {count}; allowed is 1 or more")
     NodeBudget(job.nodes)
-    make_generation_agent(job.agent, job.config)
+    make_generation_agent(job.agent, job.config, job.temperature)
     catalogue = load_catalogue(job.catalogue_folder)
     for object_class in catalogue.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written

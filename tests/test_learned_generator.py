@@ -1,0 +1,94 @@
+"""A trained generator at work: from a checkpoint, with other objects, in the command's scenes."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import GRAMMARS, rng
+
+from drake_clutter.agents.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.graph_network import RuleValues
+from drake_clutter.agents.learned_generator import LearnedGenerator, about_values, load_values
+from drake_clutter.agents.soft_q import SoftQConfig, stacked
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.grammar import NodeBudget, SceneGrammar
+from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphVocabulary
+
+WIDTH = 8
+
+
+def vocabulary(grammar: SceneGrammar) -> GraphVocabulary:
+    return GraphVocabulary.of(list(grammar.classes.values()))
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """An untrained network for the seven objects."""
+    grammar = GRAMMARS["ycb7"]
+    torch.manual_seed(0)
+    words = vocabulary(grammar)
+    network = RuleValues(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
+    config = {"task": asdict(GenerationTask()), "learning": asdict(SoftQConfig(temperature=0.3))}
+    path = tmp_path / "untrained.safetensors"
+    save_checkpoint(path, network, {"kind": "generator", "network": about_values(words, grammar, WIDTH), "config": config})
+    return path
+
+
+@pytest.mark.parametrize("nodes", [7, 12, 30])
+def test_it_derives_terminal_graphs_of_any_size(checkpoint: Path, nodes: int) -> None:
+    agent, grammar = LearnedGenerator(checkpoint, ClutterConfig()), GRAMMARS["ycb7"]
+    derived = [agent.derive(grammar, NodeBudget(nodes), rng(seed)) for seed in (0, 0, 1)]
+    assert all(derivation.graph.is_terminal and len(derivation.graph) == nodes for derivation in derived)
+    assert derived[0].rules == derived[1].rules != derived[2].rules
+
+
+def test_a_low_temperature_leaves_nothing_to_chance(checkpoint: Path) -> None:
+    grammar = GRAMMARS["ycb7"]
+    cold, hot = (LearnedGenerator(checkpoint, ClutterConfig(), temperature) for temperature in (1e-6, 10.0))
+    assert len({cold.derive(grammar, NodeBudget(8), rng(seed)).rules for seed in range(5)}) == 1
+    assert len({hot.derive(grammar, NodeBudget(8), rng(seed)).rules for seed in range(5)}) == 5
+
+
+def test_the_generate_command_takes_a_checkpoint(checkpoint: Path) -> None:
+    job = GenerationJob(str(checkpoint), "ycb7", None, nodes=6, seed=1, config=ClutterConfig())
+    first, again = SceneGenerator(job)(0), SceneGenerator(job)(0)
+    assert first.scene.objects == again.scene.objects
+    assert first.scene.graph is not None
+    assert len(first.scene.graph) == 6
+
+
+def test_what_it_was_not_trained_with_is_named(checkpoint: Path) -> None:
+    with pytest.raises(InputError, match="was not trained with"):
+        LearnedGenerator(checkpoint, ClutterConfig()).derive(GRAMMARS["pantry14"], NodeBudget(6), rng())
+
+
+def test_what_is_no_generator_is_refused(checkpoint: Path) -> None:
+    about = load_checkpoint(checkpoint).about
+    save_checkpoint(checkpoint, torch.nn.Linear(1, 1), about | {"kind": "explorer"})
+    with pytest.raises(InputError, match="another kind"):
+        LearnedGenerator(checkpoint, ClutterConfig())
+    checkpoint.write_bytes(b"broken")
+    with pytest.raises(InputError, match="cannot be read"):
+        LearnedGenerator(checkpoint, ClutterConfig())
+
+
+def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path) -> None:
+    """For graphs of the old objects, the values of the old rules are the same in the larger grammar."""
+    small, large = GRAMMARS["ycb7"], GRAMMARS["pantry14"]
+    loaded = load_checkpoint(checkpoint)
+    old, new = (load_values(loaded, vocabulary(grammar), grammar) for grammar in (small, large))
+    environments = [ClutterGeneration(list(g.classes.values()), GenerationTask(nodes=12)) for g in (small, large)]
+    both = [large.index[rule.name] for rule in small.rules]
+    draw = rng(3)
+    for episode in range(5):
+        (one, info), (other, _) = (environment.reset(seed=episode) for environment in environments)
+        over = False
+        while not over:
+            torch.testing.assert_close(new(stacked([other]))[:, both], old(stacked([one])))
+            action = int(draw.choice(np.flatnonzero(info["action_mask"])))
+            one, _, over, _, info = environments[0].step(action)
+            other, *_ = environments[1].step(both[action])
