@@ -12,7 +12,7 @@ import torch
 from conftest import rng
 
 from drake_clutter.agents.checkpoint import load_checkpoint
-from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, play, soft_value, softmax_choice
+from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, chances, play, soft_value, softmax_choice
 from drake_clutter.files import InputError
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
@@ -50,10 +50,18 @@ def test_aims_by_hand() -> None:
     over = torch.tensor([[False, False, False], [True, False, False]])
     v1 = 0.5 * np.log(np.exp(1.0) + np.exp(2.0) + np.exp(0.0))
     second = 0.2 + 1.0  # the third state has one feasible action
-    for trace in (0.0, 0.5, 1.0):
-        found = aims(values, mask, action, reward, over, 0.5, trace)
-        expected = [[0.1 + v1 + trace * (second - 0.0), second], [0.1, second]]
+    policy = float(np.exp((0.0 - v1) / 0.5))
+    for trace, chance, passed_on in ((0.0, 0.3, 0.0), (0.5, policy / 2, 0.5), (1.0, policy, 1.0), (1.0, 4 * policy, 0.25)):
+        found = aims(values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace)
+        expected = [[0.1 + v1 + passed_on * (second - 0.0), second], [0.1, second]]
         torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
+
+
+def test_chances_are_those_of_the_choice() -> None:
+    values, mask = np.array([[0.3, 0.1, 0.7, 9.0]], np.float32), np.array([[True, True, True, False]])
+    given = [chances(values, mask, np.array([action]), 0.2)[0] for action in range(3)]
+    expected = np.exp(values[0, :3] / 0.2) / np.exp(values[0, :3] / 0.2).sum()
+    assert given == pytest.approx(expected.tolist())
 
 
 def test_what_is_drawn_was_added_and_follows_each_other() -> None:
@@ -64,7 +72,14 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
     for moment in range(40):  # the ring of 15 is filled more than twice
         step = {name: np.repeat(array[None], 4, axis=0) for name, array in example.items() if name in replay.arrays}
         numbers = 10 * moment + np.arange(4)
-        replay.add(**step, mask=np.ones((4, 5), bool), action=numbers, reward=numbers.astype(np.float32), over=numbers % 3 == 0)
+        replay.add(
+            **step,
+            mask=np.ones((4, 5), bool),
+            action=numbers,
+            chance=np.ones(4, np.float32),
+            reward=numbers.astype(np.float32),
+            over=numbers % 3 == 0,
+        )
         if moment >= 5:
             drawn = replay.draw(50, 4, draw)
             assert drawn is not None

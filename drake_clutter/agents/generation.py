@@ -106,9 +106,13 @@ def make_generation_agent(name: str, config: ClutterConfig, temperature: float |
         return HillClimber(config)
     if not learned:
         raise InputError(f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file")
+    try:
+        path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
+    except FileNotFoundError as error:
+        raise InputError(f"--agent {name}: {error}; train it with training/train_generator.py") from error
     from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
 
-    return LearnedGenerator(shipped_path(TRAINED[name]) if name in TRAINED else Path(name), config, temperature)
+    return LearnedGenerator(path, config, temperature)
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,15 @@ def softmax_choice(
     return np.asarray(np.where(mask, values / temperature + noise, -np.inf).argmax(axis=1))
 
 
+def chances(
+    values: NDArray[np.float32], mask: NDArray[np.bool_], actions: NDArray[np.int64], temperature: float
+) -> NDArray[np.float32]:
+    """(B,) the probability with which `softmax_choice` takes each action."""
+    exponent = np.where(mask, values / temperature, -np.inf)
+    weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+    return np.asarray(weight[np.arange(len(actions)), actions] / weight.sum(axis=1), np.float32)
+
+
 def soft_value(values: Tensor, mask: Tensor, temperature: float) -> Tensor:
     """(B,) V = temperature * log sum exp(Q / temperature) over the feasible actions; 0 where there are none."""
     exponent = (values / temperature).masked_fill(~mask, -torch.inf)
@@ -121,7 +130,7 @@ class Replay:
 
     Attributes:
         arrays: by name, (times, environments, ...), a ring over the times: the observation before the step, `mask`, what was
-            feasible, `action`, `reward`, and `over`, whether the episode ended with it.
+            feasible, `action`, the `chance` that it had, `reward`, and `over`, whether the episode ended with it.
         times: that were ever added.
     """
 
@@ -132,7 +141,13 @@ class Replay:
             return np.zeros((max(1, capacity // environments), environments, *like.shape), like.dtype)
 
         self.arrays = {name: room(observation[name]) for name in KEPT}
-        others = {"mask": np.zeros(actions, bool), "action": np.int64(0), "reward": np.float32(0), "over": np.bool_(False)}
+        others = {
+            "mask": np.zeros(actions, bool),
+            "action": np.int64(0),
+            "chance": np.float32(0),
+            "reward": np.float32(0),
+            "over": np.bool_(False),
+        }
         self.arrays |= {name: room(np.asarray(like)) for name, like in others.items()}
         self.times = 0
 
@@ -154,29 +169,39 @@ class Replay:
         return {name: array[time, number] for name, array in self.arrays.items()}
 
 
-def aims(values: Tensor, mask: Tensor, action: Tensor, reward: Tensor, over: Tensor, temperature: float, trace: float) -> Tensor:
-    """(S, L) what Q(s, a) should be, for S segments of L steps.
+def aims(
+    values: Tensor,
+    mask: Tensor,
+    action: Tensor,
+    chance: Tensor,
+    reward: Tensor,
+    over: Tensor,
+    temperature: float,
+    trace: float,
+) -> Tensor:
+    """(S, L) what Q(s, a) should be, for S segments of L steps: Retrace (Munos et al. 2016, eq. 3 and 4) with soft values.
 
-    Where the policy is optimal, V(s) = r - temperature * log policy(a | s) + V(s') for every action, whoever chose it (path
-    consistency, Nachum et al. 2017, theorem 1). So the errors of the later steps can be added to the one-step aim:
+    The errors of the later steps are added to the one-step aim, as far as the policy would take these steps today:
 
-        aim(k) = r(k) + V(k + 1) + trace * (aim(k + 1) - Q(k + 1, a(k + 1))), without what lies beyond an episode's end.
+        aim(k) = r(k) + V(k + 1) + c(k + 1) * (aim(k + 1) - Q(k + 1, a(k + 1))), without what lies beyond an episode's end,
+        c = trace * min(1, policy(a) / chance).
 
     Args:
         values: (S, L + 1, actions) the target network's.
         mask: (S, L + 1, actions) feasible actions.
-        action, reward, over: (S, L + 1).
+        action, reward, over: (S, L + 1). chance: (S, L + 1), that the action had when it was taken.
         temperature: of the policy.
         trace: 0 takes one step into account, 1 all that there are.
     """
     value = soft_value(values.flatten(0, 1), mask.flatten(0, 1), temperature).view_as(reward)
     taken = values.gather(2, action[:, :, None]).squeeze(2)
+    passed_on = trace * (((taken - value) / temperature).exp() / chance).clamp(max=1.0)
     length = reward.shape[1] - 1
     found: list[Tensor] = []
     later = value[:, length]
     for k in reversed(range(length)):
         found.append(reward[:, k] + torch.where(over[:, k], 0.0, later))
-        later = value[:, k] + trace * (found[-1] - taken[:, k])
+        later = value[:, k] + passed_on[:, k] * (found[-1] - taken[:, k])
     return torch.stack(found[::-1], dim=1)
 
 
@@ -231,6 +256,7 @@ class SoftQLearner:
                 values = self.network(stacked(self._observations)).cpu().numpy()
         actions = softmax_choice(values, masks, self.config.temperature, self._rng)
         step = stacked(self._observations) | {"mask": masks, "action": actions}
+        step["chance"] = chances(values, masks, actions, self.config.temperature)
         rewards, overs = np.zeros(len(actions), np.float32), np.zeros(len(actions), bool)
         for k, environment in enumerate(self._environments):
             observation, reward, over, _, info = environment.step(int(actions[k]))
@@ -254,11 +280,11 @@ class SoftQLearner:
         drawn = self._replay.draw(max(1, config.batch // config.segment), config.segment, self._rng)
         if drawn is None:
             return None
-        names = ("mask", "action", "reward", "over")
-        mask, action, reward, over = (torch.from_numpy(drawn[name]).to(self.device) for name in names)
+        names = ("mask", "action", "chance", "reward", "over")
+        mask, action, chance, reward, over = (torch.from_numpy(drawn[name]).to(self.device) for name in names)
         with torch.no_grad():
             values = self._target({name: drawn[name].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}).view(mask.shape)
-            aim = aims(values, mask, action, reward, over, config.temperature, config.trace).flatten()
+            aim = aims(values, mask, action, chance, reward, over, config.temperature, config.trace).flatten()
         before = {name: drawn[name][:, :-1].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}
         chosen = self.network(before).gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
         loss = torch.nn.functional.smooth_l1_loss(chosen, aim)
