@@ -132,7 +132,7 @@ def _report(step: "Step") -> None:
 @app.command()
 def generate(
     out: OutOption,
-    agent: Annotated[str, typer.Option(help="random, hill-climbing, sg, sg-star, sg-14, or a checkpoint's file.")] = "random",
+    agent: Annotated[str, typer.Option(help="random, hill-climbing, or the file of a checkpoint that you trained.")] = "random",
     temperature: Annotated[
         float | None, typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds.")
     ] = None,
