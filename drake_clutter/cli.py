@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from drake_clutter.files import InputError, output_directory
+from drake_clutter.files import InputError, output_directory, told_in_one_line
 
 if TYPE_CHECKING:
     from drake_clutter.scenes.scene_file import SceneFile
@@ -84,14 +84,8 @@ NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, al
 
 def main() -> None:
     """The console script: a user's mistake is one line and exit code 2."""
-    try:
+    with told_in_one_line():
         app()
-    except InputError as error:
-        _err.print(f"[red]error[/red] {_plain(str(error))}", highlight=False, soft_wrap=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        _err.print("stopped; what was finished is kept")
-        sys.exit(130)
 
 
 def _plain(text: str) -> str:

@@ -150,8 +150,16 @@ _ALLOWED = {
     "learning.environments": (1, math.inf),
     "learning.batch": (1, math.inf),
     "learning.steps_per_update": (1, math.inf),
+    "learning.segment": (1, math.inf),
+    "learning.trace": (0.0, 1.0),
     "learning.replay": (1, math.inf),
+    "learning.halve_every": (1, math.inf),
     "learning.temperature": (1e-6, math.inf),
+    "learning.target_rate": (0.0, 1.0),
+    "learning.width": (1, math.inf),
+    "evaluate_every": (1, math.inf),
+    "evaluation_scenes": (1, math.inf),
+    "save_every": (1, math.inf),
 }
 """Least and greatest value of a field, by its last two names; of every other number, `_ANY`."""
 

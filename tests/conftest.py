@@ -8,10 +8,11 @@ import pytest
 from hypothesis import settings
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig
+from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.fast.judge import FastJudge
-from drake_clutter.grammar import Orientation, SceneGrammar, resting_rotation
+from drake_clutter.grammar import NodeBudget, Orientation, SceneGrammar, resting_rotation, uniform_choice
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
@@ -41,6 +42,17 @@ def resting(
 def scene_of(*objects: SceneObject, tray_side: float = 0.70) -> Scene:
     """A scene without a graph."""
     return Scene(objects, tray_side)
+
+
+def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "ycb7") -> Scene:
+    """What RG derives, laid out: a graph of `fewest` to `most` nodes, the seed's first for which there is room."""
+    generator = rng(seed)
+    while True:
+        budget = NodeBudget(int(generator.integers(fewest, most + 1)))
+        derivation = GRAMMARS[objects].derive(budget, uniform_choice(generator))
+        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator, seed)
+        if isinstance(scene, Scene):
+            return scene
 
 
 def rng(seed: int = 0) -> np.random.Generator:

@@ -6,7 +6,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
+from conftest import random_scene, resting, rng, scene_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -14,10 +14,9 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 
-from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
-from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
-from drake_clutter.scenes.layout import lay_out
+from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
@@ -361,19 +360,10 @@ def test_a_stack_far_away_is_no_matter(layers: Layers) -> None:
         assert FAST.stability(replace(scene, objects=objects)) == FAST.stability(scene)
 
 
-def random_scene(seed: int) -> Scene:
-    generator = rng(seed)
-    while True:
-        derivation = GRAMMARS["ycb7"].derive(NodeBudget(int(generator.integers(4, 18))), uniform_choice(generator))
-        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator)
-        if isinstance(scene, Scene):
-            return scene
-
-
 def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
     """The same verdicts, bit for bit, as those of a judge that has seen nothing, over scenes that come back, changed a little."""
     used = FastJudge(config)
-    scenes = [random_scene(seed) for seed in range(12)]
+    scenes = [random_scene(seed, 4, 17) for seed in range(12)]
     generator = rng(7)
     kinds = set()
     for step in range(24):

@@ -179,6 +179,17 @@ def test_a_hidden_object_pays_at_once() -> None:
     assert (total, over) == (0.5, False)
 
 
+def test_a_graph_of_hundreds_of_nodes_is_observed() -> None:
+    environment, draw = ClutterGeneration(task=GenerationTask(nodes=300)), rng(0)
+    observation, info = environment.reset(seed=0)
+    structure = np.array([rule.left.rewritten in ("tray", "top") and rule.name != "end" for rule in environment.grammar.rules])
+    while (mask := info["action_mask"].astype(bool) & structure).any():
+        observation, *_, info = environment.step(random_action(mask, draw))
+    graph = graph_of(observation, environment)
+    assert len(graph) > 290
+    assert dict(graph.nx.edges) == dict(environment.partial.graph.nx.edges)
+
+
 def test_edges_fit() -> None:
     """The most edges: as many pairs as possible."""
     for nodes in range(3, 30):

@@ -15,14 +15,10 @@ from drake_clutter.agents.learned_generator import LearnedGenerator, about_value
 from drake_clutter.agents.soft_q import SoftQConfig, stacked
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.grammar import NodeBudget, SceneGrammar
+from drake_clutter.grammar import NodeBudget
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphVocabulary
 
 WIDTH = 8
-
-
-def vocabulary(grammar: SceneGrammar) -> GraphVocabulary:
-    return GraphVocabulary.of(list(grammar.classes.values()))
 
 
 @pytest.fixture
@@ -30,11 +26,11 @@ def checkpoint(tmp_path: Path) -> Path:
     """An untrained network for the seven objects."""
     grammar = GRAMMARS["ycb7"]
     torch.manual_seed(0)
-    words = vocabulary(grammar)
+    words = GraphVocabulary.of(grammar)
     network = RuleValues(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
     config = {"task": asdict(GenerationTask()), "learning": asdict(SoftQConfig(temperature=0.3))}
     path = tmp_path / "untrained.safetensors"
-    save_checkpoint(path, network, {"kind": "generator", "network": about_values(words, grammar, WIDTH), "config": config})
+    save_checkpoint(path, network, {"kind": "generator", "network": about_values(grammar, WIDTH), "config": config})
     return path
 
 
@@ -80,7 +76,7 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
     """For graphs of the old objects, the values of the old rules are the same in the larger grammar."""
     small, large = GRAMMARS["ycb7"], GRAMMARS["pantry14"]
     loaded = load_checkpoint(checkpoint)
-    old, new = (load_values(loaded, vocabulary(grammar), grammar) for grammar in (small, large))
+    old, new = (load_values(loaded, grammar) for grammar in (small, large))
     environments = [ClutterGeneration(list(g.classes.values()), GenerationTask(nodes=12)) for g in (small, large)]
     both = [large.index[rule.name] for rule in small.rules]
     draw = rng(3)

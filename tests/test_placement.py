@@ -4,15 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import CLASSES, GRAMMARS, resting, rng, scene_of
+from conftest import CLASSES, random_scene, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.config import ExplorationConfig, LayoutConfig
-from drake_clutter.grammar import NodeBudget, Orientation, uniform_choice
+from drake_clutter.config import ExplorationConfig
+from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import penetration
-from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.placement import CELL, choose_placement, has_clear_top, top_height
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
@@ -65,15 +64,6 @@ def test_the_same_seed_gives_the_same_place_and_chance_breaks_ties(detector: Lab
     assert places[0] == places[1]
     assert len({pose.translation for pose in places if pose}) > 2
     assert len({round(abs(pose.p[:2]).max(), 9) for pose in places if pose}) == 1
-
-
-def random_scene(seed: int) -> Scene:
-    generator = rng(seed)
-    while True:
-        derivation = GRAMMARS["ycb7"].derive(NodeBudget(16), uniform_choice(generator))
-        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator)
-        if isinstance(scene, Scene):
-            return scene
 
 
 @pytest.mark.parametrize("seed", range(3))

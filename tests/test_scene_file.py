@@ -9,31 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import CATALOGUE, CLASSES, GRAMMARS, resting, rng, scene_of
+from conftest import CATALOGUE, CLASSES, random_scene, resting, rng, scene_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_clutter.config import LayoutConfig
 from drake_clutter.files import InputError
-from drake_clutter.grammar import NodeBudget, uniform_choice
 from drake_clutter.grammar.graph import OBJECT_SLOT
-from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import SceneFile, load_scene, save_scene, scene_fields
 from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 
 Path_ = tuple[str | int, ...]
 GONE = object()
-
-
-def random_scene(seed: int, nodes: int = 12) -> Scene:
-    """The first of a seed's random graphs that can be laid out."""
-    generator = rng(seed)
-    while True:
-        derivation = GRAMMARS["pantry14"].derive(NodeBudget(nodes), uniform_choice(generator))
-        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator, seed)
-        if isinstance(scene, Scene):
-            return scene
 
 
 def stable_verdict(scene: Scene) -> Verdict:
@@ -78,7 +65,7 @@ def assert_same(one: Scene, other: Scene) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_round_trip_is_exact(seed: int, tmp_path: Path) -> None:
-    scene = random_scene(seed)
+    scene = random_scene(seed, 12, 12, "pantry14")
     for verdict in (None, stable_verdict(scene), unstable_verdict(scene)):
         read = reloaded(tmp_path, scene, verdict)
         assert_same(read.scene, scene)
@@ -127,7 +114,7 @@ objects:
 
 
 def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
-    scene = random_scene(2)
+    scene = random_scene(2, 12, 12, "pantry14")
     save_scene(tmp_path / "one.yaml", scene, stable_verdict(scene))
     read = load_scene(tmp_path / "one.yaml", CATALOGUE)
     save_scene(tmp_path / "two.yaml", read.scene, read.verdict)
@@ -136,7 +123,7 @@ def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
 
 # --- What is refused ---
 
-SCENE = random_scene(1)
+SCENE = random_scene(1, 12, 12, "pantry14")
 DOCUMENT = scene_fields(SCENE, stable_verdict(SCENE))
 UNSTABLE = scene_fields(SCENE, unstable_verdict(SCENE))
 

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -183,6 +184,28 @@ def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> 
     assert whole.about["metrics"]["step"] == 480
     with pytest.raises(InputError, match=r"config\.yaml"):
         train.main(tmp_path / "whole", settings=[*SETTINGS, "seed=1"])
+
+
+REFUSED = ["evaluate_every=0", "evaluation_scenes=0", "save_every=0", "task.nodes=2", "warm_start=1", "learning.steps=many"]
+REFUSED += ["learning.halve_every=0", "learning.segment=0", "learning.width=0", "learning.trace=1.5", "learning.target_rate=2"]
+REFUSED += ["learning.replay=35"]
+
+
+@pytest.mark.parametrize("setting", REFUSED)
+def test_what_no_training_can_do_is_refused(setting: str, tmp_path: Path) -> None:
+    """Before anything is written."""
+    with pytest.raises(InputError, match=setting.partition("=")[0]):
+        train_generator().main(tmp_path / "out", settings=[*SETTINGS, setting])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_warm_start_of_another_width_is_refused() -> None:
+    narrow, wide = (SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12))
+    with pytest.raises(InputError, match=r"learning\.width: 12"):
+        wide.begin_with(narrow.network)
+    other = SoftQLearner(small_environment, SMALL, 1, CPU)
+    other.begin_with(narrow.network)
+    assert all(torch.equal(mine, theirs) for mine, theirs in zip(state_of(other), state_of(narrow), strict=True))
 
 
 def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.seams import CannotJudge
 
@@ -139,7 +139,9 @@ def main(
     found: dict[str, dict[str, Any]] = {}
     if out.exists():
         earlier = json.loads(out.read_text())
-        found = {Row(**row["row"]).folder: row for row in earlier["rows"] if row["seed"] == seed}
+        if earlier["seed"] != seed:
+            raise InputError(f"--out {out}: holds results of seed {earlier['seed']}; give the same seed or another file")
+        found = {Row(**row["row"]).folder: row for row in earlier["rows"]}
     for row in TABLE + TRADE:
         if row.folder not in found and (only is None or only in row.folder):
             found[row.folder] = measured(row, folder / row.folder, workers, seed)

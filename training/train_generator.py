@@ -82,12 +82,6 @@ def main(
         raise InputError(f"--device {device}; allowed are auto, cpu, cuda")
     chosen = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     torch.set_num_threads(threads)
-    if not (out / CONFIG).exists():
-        output_directory(out)
-        write_text(out / CONFIG, config_yaml(run))
-    elif (out / CONFIG).read_text() != config_yaml(run):
-        raise InputError(f"--out {out}: holds a run of another config, see {CONFIG}; give the same one or another folder")
-
     classes = load_catalogue(Path(run.catalogue) if run.catalogue else None).object_set(run.objects)
 
     def make_environment() -> ClutterGeneration:
@@ -96,8 +90,13 @@ def main(
     example = make_environment()
     learner = SoftQLearner(make_environment, run.learning, run.seed, chosen)
     if run.warm_start:
-        learner.begin_with(load_values(load_checkpoint(Path(run.warm_start)), example.vocabulary, example.grammar))
-    history: list[dict[str, float]] = []
+        learner.begin_with(load_values(load_checkpoint(Path(run.warm_start)), example.grammar))
+    if not (out / CONFIG).exists():
+        output_directory(out)
+        write_text(out / CONFIG, config_yaml(run))
+    elif (out / CONFIG).read_text() != config_yaml(run):
+        raise InputError(f"--out {out}: holds a run of another config, see {CONFIG}; give the same one or another folder")
+    history: list[dict[str, Any]] = []
     if (out / STATE).exists():
         learner.load(out / STATE)
         rows = json.loads((out / HISTORY).read_text()) if (out / HISTORY).exists() else []
@@ -111,7 +110,8 @@ def main(
         episodes = play(learner.network, make_environment, run.evaluation_scenes, run.learning.temperature, run.seed)
         spent = time.monotonic() - begun
         rate = (learner.step - begun_at) / spent if learner.step > begun_at else 0.0
-        row = {"step": learner.step, "seconds": seconds + spent, "loss": float(np.mean(losses or [0.0]))}
+        row: dict[str, Any] = {"step": learner.step, "seconds": seconds + spent, "commit": git_commit()}
+        row["loss"] = float(np.mean(losses or [0.0]))
         row |= figures(episodes, example.grammar.classes)
         history.append(row)
         losses.clear()
@@ -138,10 +138,10 @@ def main(
         evaluate()
     about = {
         "kind": "generator",
-        "network": about_values(example.vocabulary, example.grammar, run.learning.width),
+        "network": about_values(example.grammar, run.learning.width),
         "config": asdict(run),
         "metrics": history[-1],
-        "commit": git_commit(),
+        "commits": list(dict.fromkeys(row["commit"] for row in history)),
     }
     save_checkpoint(out / CHECKPOINT, learner.network, about)
     learner.save(out / STATE)

@@ -21,7 +21,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
-from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
+from drake_clutter.tasks.generation import GenerationTask, PartialScene
 
 SEARCH_BUDGET = 400
 """Moves that are tried to find out whether a scene is solvable."""
@@ -69,11 +69,10 @@ class HillClimber:
 
     def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
         """See `GenerationAgent.derive`."""
-        vocabulary = GraphVocabulary.of(list(grammar.classes.values()))
         task = GenerationTask(nodes=budget.nodes)
         best, best_worth = None, -np.inf
         for _ in range(self.TRIES):
-            partial = PartialScene(grammar, vocabulary, task, self._config, self._judge)
+            partial = PartialScene(grammar, task, self._config, self._judge)
             kept: tuple[str, ...] = best.rules[: rng.integers(len(best.rules))] if best else ()
             for name in kept:
                 partial.apply(grammar.index[name])

@@ -16,8 +16,9 @@ from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
 from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
 
 
-def about_values(vocabulary: GraphVocabulary, grammar: SceneGrammar, width: int) -> dict[str, Any]:
+def about_values(grammar: SceneGrammar, width: int) -> dict[str, Any]:
     """What the inputs and outputs of a `RuleValues` stand for, for its checkpoint."""
+    vocabulary = GraphVocabulary.of(grammar)
     return {
         "node_kinds": list(vocabulary.node_kinds),
         "edge_kinds": [kind if isinstance(kind, str) else kind.name.lower() for kind in vocabulary.edge_kinds],
@@ -26,14 +27,14 @@ def about_values(vocabulary: GraphVocabulary, grammar: SceneGrammar, width: int)
     }
 
 
-def load_values(checkpoint: Checkpoint, vocabulary: GraphVocabulary, grammar: SceneGrammar) -> RuleValues:
+def load_values(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleValues:
     """The network of a checkpoint, for a grammar.
 
     What the checkpoint knows by name is taken over: node kinds, edge kinds and rules of another set of objects keep the
     values of a new network. So a training on one set can begin with what was learned on another.
     """
     about = checkpoint.about["network"]
-    mine = about_values(vocabulary, grammar, about["width"])
+    mine = about_values(grammar, about["width"])
     network = RuleValues(len(mine["node_kinds"]), len(mine["edge_kinds"]), len(mine["rules"]), about["width"])
     state, theirs, ours = network.state_dict(), _named_axes(about), _named_axes(mine)
     for name, weights in checkpoint.weights.items():
@@ -87,14 +88,13 @@ class LearnedGenerator:
         Raises:
             InputError: the grammar has object classes that the agent has not learned.
         """
-        vocabulary = GraphVocabulary.of(list(grammar.classes.values()))
         if self._network is None:
-            unknown = sorted(set(vocabulary.node_kinds) - set(self._checkpoint.about["network"]["node_kinds"]))
+            unknown = sorted(set(grammar.classes) - set(self._checkpoint.about["network"]["node_kinds"]))
             if unknown:
                 raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
-            self._network = load_values(self._checkpoint, vocabulary, grammar).eval()
+            self._network = load_values(self._checkpoint, grammar).eval()
         task = GenerationTask(nodes=budget.nodes, must_come_apart=False)
-        partial = PartialScene(grammar, vocabulary, task, self._config, self._judge)
+        partial = PartialScene(grammar, task, self._config, self._judge)
         while not partial.finished:
             with torch.no_grad():
                 values = self._network(stacked([partial.observe()])).numpy()

@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from drake_clutter.agents.graph_network import RuleValues
-from drake_clutter.files import replacing
+from drake_clutter.files import InputError, replacing
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 
@@ -138,7 +138,7 @@ class Replay:
         """Room for that many steps, of all environments together."""
 
         def room(like: NDArray[Any]) -> NDArray[Any]:
-            return np.zeros((max(1, capacity // environments), environments, *like.shape), like.dtype)
+            return np.zeros((capacity // environments, environments, *like.shape), like.dtype)
 
         self.arrays = {name: room(observation[name]) for name in KEPT}
         others = {
@@ -217,7 +217,14 @@ class SoftQLearner:
     def __init__(
         self, make_environment: Callable[[], ClutterGeneration], config: SoftQConfig, seed: int, device: torch.device
     ) -> None:
-        """Begins a training; `make_environment()` makes a `ClutterGeneration`."""
+        """Begins a training; `make_environment()` makes a `ClutterGeneration`.
+
+        Raises:
+            InputError: a replay too small for a segment of every environment.
+        """
+        least = config.environments * (config.segment + 1)
+        if config.replay < least:
+            raise InputError(f"learning.replay: {config.replay}; allowed is {least} (environments * (segment + 1)) or more")
         self.config, self.seed, self.device = config, seed, device
         self._environments: list[ClutterGeneration] = [make_environment() for _ in range(config.environments)]
         vocabulary, rules = self._environments[0].vocabulary, len(self._environments[0].grammar.rules)
@@ -237,7 +244,13 @@ class SoftQLearner:
         self._replay = Replay(config.replay, config.environments, self._observations[0], rules)
 
     def begin_with(self, network: RuleValues) -> None:
-        """Takes over what another network has learned."""
+        """Takes over what another network has learned.
+
+        Raises:
+            InputError: it is of another width.
+        """
+        if network.value.in_features != self.network.value.in_features:
+            raise InputError(f"learning.width: {self.config.width}; allowed is that of the warm start")
         self.network.load_state_dict(network.state_dict())
         self._target.load_state_dict(network.state_dict())
 

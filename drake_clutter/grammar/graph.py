@@ -89,10 +89,8 @@ class ClutterGraph:
 
     def breadth_first(self) -> list[int]:
         """All nodes that the tray leads to, breadth first, siblings in order."""
-        edges, order = (
-            self.nx._adj,
-            [self.TRAY_NODE],
-        )  # networkx's own walk costs several times as much, and is taken at every rule
+        # networkx's own walk costs several times as much, and is taken at every rule.
+        edges, order = self.nx._adj, [self.TRAY_NODE]
         reached = {self.TRAY_NODE}
         for node in order:
             for child in edges[node]:

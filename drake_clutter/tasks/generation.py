@@ -61,9 +61,9 @@ class GraphVocabulary:
     edge_kinds: tuple[Orientation | str, ...]
 
     @staticmethod
-    def of(classes: Sequence[ObjectClass]) -> "GraphVocabulary":
-        structure = (TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY)
-        return GraphVocabulary(structure + tuple(c.name for c in classes), (PRIMITIVE, *Orientation))
+    def of(grammar: SceneGrammar) -> "GraphVocabulary":
+        """That of a grammar."""
+        return GraphVocabulary((TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY, *grammar.classes), (PRIMITIVE, *Orientation))
 
 
 def most_edges(nodes: int) -> int:
@@ -74,10 +74,9 @@ def most_edges(nodes: int) -> int:
 class PartialScene:
     """A derivation under way, and what is known of its finished stacks."""
 
-    def __init__(
-        self, grammar: SceneGrammar, vocabulary: GraphVocabulary, task: GenerationTask, config: ClutterConfig, judge: FastJudge
-    ) -> None:
+    def __init__(self, grammar: SceneGrammar, task: GenerationTask, config: ClutterConfig, judge: FastJudge) -> None:
         """Starts from the tray; `judge` is asked about every stack."""
+        vocabulary = GraphVocabulary.of(grammar)
         self._grammar, self._task, self._config, self._judge = grammar, task, config, judge
         self._budget = NodeBudget(task.nodes)
         self._node_number = {kind: k for k, kind in enumerate(vocabulary.node_kinds, start=1)}
@@ -165,7 +164,7 @@ class PartialScene:
         for column, (pattern, match) in enumerate(zip(self._grammar.patterns, self._matches, strict=True)):
             if match is not None and column > 0:  # the tray is the tray
                 flags[match[pattern.rewritten], column] = 1
-        ends, edge_kind = np.zeros((edges, 2), np.int8), np.zeros(edges, np.int8)
+        ends, edge_kind = np.zeros((edges, 2), np.int16), np.zeros(edges, np.int8)
         e = 0
         for parent, children in self.graph.nx._adj.items():
             for child, data in children.items():
@@ -220,7 +219,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
         """
         self.task, self._config = task or GenerationTask(), config or ClutterConfig()
         self.grammar = SceneGrammar(classes or load_catalogue().object_set("ycb7"))
-        self.vocabulary = GraphVocabulary.of(list(self.grammar.classes.values()))
+        self.vocabulary = GraphVocabulary.of(self.grammar)
         self._judge = FastJudge(self._config, margin=self.task.margin)
         n, e = self.task.nodes, most_edges(self.task.nodes)
         far = max(self._config.layout.tray_side, self._config.layout.max_stack_height)
@@ -230,7 +229,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
             "node_mask": box(0, 1, (n,), np.int8),
             "node_flags": box(0, 1, (n, 4), np.int8),
             "position": box(-far, far, (n, 3), np.float32),
-            "edge": box(0, n - 1, (e, 2), np.int8),
+            "edge": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(self.vocabulary.edge_kinds), (e,), np.int8),
             "edge_mask": box(0, 1, (e,), np.int8),
             "remaining": box(0, np.inf, (1,), np.float32),
@@ -241,7 +240,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[GraphObservation, dict[str, Any]]:
         """The start graph: the tray."""
         super().reset(seed=seed)
-        self.partial = PartialScene(self.grammar, self.vocabulary, self.task, self._config, self._judge)
+        self.partial = PartialScene(self.grammar, self.task, self._config, self._judge)
         return self.partial.observe(), {"action_mask": self.partial.mask.astype(np.int8)}
 
     def step(self, action: int) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:

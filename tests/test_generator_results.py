@@ -1,0 +1,48 @@
+"""Table I's script, on a few small scenes."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from drake_clutter.files import InputError
+
+SCRIPT = Path(__file__).parents[1] / "training" / "generator_results.py"
+
+
+@pytest.fixture(scope="module")
+def results() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generator_results", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules["generator_results"] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_table_of_one_row(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results, "TABLE", [results.Row("random", 9, 5)])
+    monkeypatch.setattr(results, "TRADE", [])
+    out = tmp_path / "table.json"
+    results.main(tmp_path / "scenes", seed=3, out=out)
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["row"] == {"agent": "random", "nodes": 9, "count": 5, "objects": "ycb7", "temperature": None}
+    assert sum(row["fast_judge"].values()) == 5
+    drake_stable = sum(number for verdicts, number in row["fast_judge"].items() if verdicts.endswith("drake stable"))
+    assert drake_stable == round(5 * row["stability_rate"])
+    assert sum(row["stack_heights_5cm"]) == round(5 * row["mean_stacks"])
+    assert row["seed"] == 3
+    before = out.stat().st_mtime_ns
+    results.main(tmp_path / "scenes", seed=3, out=out)
+    assert out.stat().st_mtime_ns == before, "what is there is not measured again"
+    with pytest.raises(InputError, match="seed 3"):
+        results.main(tmp_path / "scenes", seed=4, out=out)
+
+
+def test_the_picture_of_the_temperature(results: ModuleType, tmp_path: Path) -> None:
+    figures = {"hidden_mean": 5.0, "hidden_ci95": (4.0, 6.0), "stability_rate": 0.9, "solvable_share": 0.8, "distinct_share": 1.0}
+    results.draw_trade([{"temperature": 0.1} | figures, {"temperature": 0.4} | figures], tmp_path / "trade.png")
+    assert (tmp_path / "trade.png").stat().st_size > 10_000
