@@ -40,7 +40,7 @@ def test_actions_follow_the_softmax() -> None:
 def test_the_soft_value() -> None:
     values = torch.tensor([[1.0, 2.0, 5.0], [1.0, 1.0, 1.0]])
     mask = torch.tensor([[True, True, False], [False, False, False]])
-    expected = 0.5 * np.log(np.exp(2.0) + np.exp(4.0))
+    expected = 0.5 * np.log((np.exp(2.0) + np.exp(4.0)) / 2)
     torch.testing.assert_close(soft_value(values, mask, 0.5), torch.tensor([expected, 0.0], dtype=torch.float32))
 
 
@@ -51,9 +51,9 @@ def test_aims_by_hand() -> None:
     action = torch.tensor([[0, 2, 1]] * 2)
     reward = torch.tensor([[0.1, 0.2, 7.0]] * 2)
     over = torch.tensor([[False, False, False], [True, False, False]])
-    v1 = 0.5 * np.log(np.exp(1.0) + np.exp(2.0) + np.exp(0.0))
+    v1 = 0.5 * np.log((np.exp(1.0) + np.exp(2.0) + np.exp(0.0)) / 3)
     second = 0.2 + 1.0  # the third state has one feasible action
-    policy = float(np.exp((0.0 - v1) / 0.5))
+    policy = float(np.exp((0.0 - v1) / 0.5)) / 3
     for trace, chance, passed_on in ((0.0, 0.3, 0.0), (0.5, policy / 2, 0.5), (1.0, policy, 1.0), (1.0, 4 * policy, 0.25)):
         found = aims(values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace)
         expected = [[0.1 + v1 + passed_on * (second - 0.0), second], [0.1, second]]

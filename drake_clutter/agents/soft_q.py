@@ -1,7 +1,8 @@
 """Soft Q-learning of a scene generator (SPEC section 3): the policy is the softmax of Q / temperature over the feasible rules.
 
-Without discount, and with a deterministic grammar, the optimal soft policy draws every derivation with a probability
-proportional to exp(return / temperature): a distribution of scenes, the better the likelier (Haarnoja et al. 2017, eq. 2).
+Its entropy is taken relative to the uniform choice among the feasible rules. Without discount, and with a deterministic
+grammar, the optimal soft policy then draws every derivation as the random generator RG does, times exp(return / temperature):
+a distribution of scenes, the better the likelier, and no state is worth more because more rules are feasible there.
 """
 
 import json
@@ -90,9 +91,9 @@ def chances(
 
 
 def soft_value(values: Tensor, mask: Tensor, temperature: float) -> Tensor:
-    """(B,) V = temperature * log sum exp(Q / temperature) over the feasible actions; 0 where there are none."""
+    """(B,) V = temperature * log mean exp(Q / temperature) over the feasible actions; 0 where there are none."""
     exponent = (values / temperature).masked_fill(~mask, -torch.inf)
-    return torch.where(mask.any(dim=1), temperature * exponent.logsumexp(dim=1), 0.0)
+    return torch.where(mask.any(dim=1), temperature * (exponent.logsumexp(dim=1) - mask.sum(dim=1).log()), 0.0)
 
 
 def play(
@@ -184,7 +185,7 @@ def aims(
     The errors of the later steps are added to the one-step aim, as far as the policy would take these steps today:
 
         aim(k) = r(k) + V(k + 1) + c(k + 1) * (aim(k + 1) - Q(k + 1, a(k + 1))), without what lies beyond an episode's end,
-        c = trace * min(1, policy(a) / chance).
+        c = trace * min(1, policy(a) / chance), where policy(a) = exp((Q(a) - V) / temperature) / number of feasible actions.
 
     Args:
         values: (S, L + 1, actions) the target network's.
@@ -195,7 +196,8 @@ def aims(
     """
     value = soft_value(values.flatten(0, 1), mask.flatten(0, 1), temperature).view_as(reward)
     taken = values.gather(2, action[:, :, None]).squeeze(2)
-    passed_on = trace * (((taken - value) / temperature).exp() / chance).clamp(max=1.0)
+    policy = ((taken - value) / temperature).exp() / mask.sum(dim=2)
+    passed_on = trace * (policy / chance).clamp(max=1.0)
     length = reward.shape[1] - 1
     found: list[Tensor] = []
     later = value[:, length]
