@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 import torch
 from conftest import rng
-from torch import Tensor, nn
+from torch import Tensor
 
-from drake_clutter.agents.graph_kernels import (
-    attention_pooled,
-    composed_maximum,
-    composed_pool,
-    composed_update,
-    message_maximum,
-    updated,
-)
-from drake_clutter.agents.graph_network import GraphBatch, MessagePassing, RuleValues
+from drake_clutter.agents.graph_network import MessagePassing, RuleValues
+from drake_clutter.agents.message_passing import LayerWeights, Links, composed, message_passing
 from drake_clutter.agents.soft_q import stacked
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 
@@ -43,11 +36,10 @@ def network(seed: int = 0) -> RuleValues:
     return RuleValues(len(vocabulary.node_kinds), len(vocabulary.edge_kinds), len(ENVIRONMENT.grammar.rules)).double()
 
 
-def fc(*layers_and_inputs: tuple[nn.Linear, Tensor]) -> Tensor:
+def fc(*weights_and_inputs: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
     """One linear layer of all inputs side by side, then LeakyReLU."""
-    weight = torch.cat([layer.weight for layer, _ in layers_and_inputs], dim=1)
-    bias = sum(layer.bias for layer, _ in layers_and_inputs if layer.bias is not None)
-    value = weight @ torch.cat([entry for _, entry in layers_and_inputs]) + bias
+    weight = torch.cat([weight for weight, _ in weights_and_inputs], dim=1)
+    value = weight @ torch.cat([entry for _, entry in weights_and_inputs]) + bias
     return torch.where(value > 0, value, 0.01 * value)
 
 
@@ -73,25 +65,21 @@ def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
         features = torch.tensor([*observation["node_flags"][k], *observation["position"][k]], dtype=torch.float64)
         node.append(leaky(net.kind.weight[int(observation["node_kind"][k]) - 1] + net.feature(features)))
     glob = leaky(net.glob(torch.tensor(observation["remaining"], dtype=torch.float64)))
-    for layer in net.layers:
-        assert isinstance(layer, MessagePassing)
+    for layer in map(LayerWeights._make, zip(*net.layers.weights, strict=True)):
         most: list[Tensor | None] = [None] * count
         for sender, receiver, kind in edges(observation):
-            message = fc((layer.message_sender, node[sender]), (layer.message_edge, leaky(net.edge.weight[kind])))
+            sent, edge = (layer.sender, node[sender]), (layer.edge, leaky(net.edge.weight[kind]))
+            message = fc(sent, edge, bias=layer.sender_bias)
             so_far = most[receiver]
             most[receiver] = message if so_far is None else torch.maximum(so_far, message)
+        heard = [torch.zeros_like(node[0]) if m is None else m for m in most]
         node = [
-            own
-            + fc(
-                (layer.update_node, own),
-                (layer.update_maximum, torch.zeros_like(own) if m is None else m),
-                (layer.update_global, glob),
-            )
-            for own, m in zip(node, most, strict=True)
+            own + fc((layer.node, own), (layer.maximum, m), (layer.glob, glob), bias=layer.node_bias)
+            for own, m in zip(node, heard, strict=True)
         ]
-        weight = torch.cat([layer.attention(own) for own in node]).softmax(dim=0)
+        weight = torch.cat([layer.attention @ own + layer.attention_bias for own in node]).softmax(dim=0)
         pooled = sum((w * own for w, own in zip(weight, node, strict=True)), torch.zeros_like(glob))
-        glob = glob + fc((layer.global_pooled, pooled), (layer.global_global, glob))
+        glob = glob + fc((layer.pooled, pooled), (layer.old, glob), bias=layer.pooled_bias)
     marked = []
     for mark in range(3):
         (at,) = np.flatnonzero(observation["node_flags"][:, 1 + mark]).tolist() or (None,)
@@ -136,47 +124,31 @@ def test_what_is_known_of_a_graph_matters() -> None:
         assert not torch.allclose(values(stacked([other])), before), name
 
 
-def scattered(count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Graph of each of 12 nodes, and sender, receiver and kind of edges; nobody speaks to the seventh."""
-    draw = torch.Generator().manual_seed(count)
-    graph = torch.tensor([0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 3, 3])
-    sender, receiver, kind = (torch.randint(0, most, (count,), generator=draw) for most in (12, 12, 4))
-    receiver[receiver == 7] = 6
-    return graph, sender, receiver, kind
-
-
 @pytest.mark.parametrize("width", [1, 5])
-@pytest.mark.parametrize("step", ["maximum", "update", "pool"])
-def test_what_is_compiled_is_what_is_composed(step: str, width: int) -> None:
-    """With the gradients of all inputs."""
+def test_what_is_compiled_is_what_is_composed(width: int) -> None:
+    """With the gradients of all inputs and weights; nobody speaks to the seventh node."""
     draw = torch.Generator().manual_seed(width)
-    graph, sender, receiver, kind = scattered(40)
+    sender, receiver, kind = (torch.randint(0, most, (40,), generator=draw) for most in (12, 12, 4))
+    receiver[receiver == 7] = 6
+    links = Links(torch.tensor([0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 3, 3]), sender, receiver, kind)
+    weights = MessagePassing(width, 3, layers=2).double().weights
 
     def drawn(*shape: int) -> Tensor:
         return torch.randn(*shape, dtype=torch.float64, generator=draw).requires_grad_()
 
-    inputs: tuple[Tensor, ...]
-    if step == "maximum":
-        inputs = drawn(12, width), drawn(4, width)
-        ours, theirs = (f(*inputs, sender, receiver, kind) for f in (message_maximum, composed_maximum))
-        assert (ours[7] == 0).all()
-    elif step == "update":
-        inputs = drawn(12, width), drawn(4, width), drawn(12, width)
-        ours, theirs = (f(*inputs[:2], graph, inputs[2]) for f in (updated, composed_update))
-    else:
-        inputs = drawn(12, width), drawn(12)
-        ours, theirs = (f(*inputs, graph, 4) for f in (attention_pooled, composed_pool))
-    torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
-    weight = torch.randn(ours.shape, dtype=torch.float64, generator=draw)
-    for mine, expected in zip(*(torch.autograd.grad((weight * out).sum(), inputs) for out in (ours, theirs)), strict=True):
+    inputs = drawn(12, width), drawn(4, width), drawn(4, 3)
+    node, glob = torch.randn(12, width, generator=draw).double(), torch.randn(4, width, generator=draw).double()
+    found = []
+    for layer_of in (message_passing, composed):
+        out, out_glob = layer_of(*inputs, links, weights)
+        found.append((out, out_glob, *torch.autograd.grad((node * out).sum() + (glob * out_glob).sum(), (*inputs, *weights))))
+    for mine, expected in zip(*found, strict=True):
         torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_lone_node_has_no_messages() -> None:
-    layer = MessagePassing(4, 3)
-    none = torch.zeros(0, dtype=torch.long)
-    zero = torch.zeros(1, dtype=torch.long)
-    alone = GraphBatch(zero, torch.zeros(1, 1), zero, none, none, none, torch.zeros(1, 1))
-    node, glob = layer(torch.ones(1, 4), torch.ones(1, 4), torch.ones(2, 3), alone)
+    layers = MessagePassing(4, 3, layers=1)
+    none, zero = torch.zeros(0, dtype=torch.long), torch.zeros(1, dtype=torch.long)
+    node, glob = layers(torch.ones(1, 4), torch.ones(1, 4), torch.ones(2, 3), Links(zero, none, none, none))
     assert torch.isfinite(node).all()
     assert torch.isfinite(glob).all()

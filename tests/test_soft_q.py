@@ -121,12 +121,12 @@ def state_of(learner: SoftQLearner) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("at", [32, 200, 396])
 def test_a_saved_training_goes_on_as_if_nothing_had_been(at: int, tmp_path: Path) -> None:
-    """Before the first update, in the middle, and after the replay has been filled twice."""
+    """Before the first update, in the middle, and after the replay has been filled twice; with any number of threads."""
     through = SoftQLearner(small_environment, SMALL, 3, CPU)
     while through.step < at:
         through.advance()
     through.save(tmp_path / "state.safetensors")
-    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU)
+    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU, threads=1)
     taken_up.load(tmp_path / "state.safetensors")
     assert taken_up.step == at
     for _ in range(15):

@@ -7,6 +7,7 @@ A run that was stopped, at any moment, goes on with the same command, and ends w
 
 import json
 import time
+from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +20,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from drake_clutter.agents.checkpoint import git_commit, load_checkpoint, save_checkpoint
 from drake_clutter.agents.learned_generator import about_values, load_values
-from drake_clutter.agents.soft_q import Episode, SoftQConfig, SoftQLearner, play
+from drake_clutter.agents.message_passing import one_thread_per_operation
+from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, config_yaml, load_typed
 from drake_clutter.files import InputError, output_directory, told_in_one_line, write_json, write_text
@@ -28,6 +30,7 @@ from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
 CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
 CHECKPOINT = "generator.safetensors"
+FIGURES = ("score", "stable", "hidden", "distinct", "stacks", "rarest_class")
 
 
 @dataclass
@@ -59,6 +62,7 @@ def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float
     """What the fast judge says of sampled scenes."""
     made = [episode.info for episode in episodes if "scene" in episode.info]
     hidden = [len(info["verdict"].hidden) for info in made]
+    used = Counter(object_.object_class.name for info in made for object_ in info["scene"].objects)
     forms = {canonical_form(info["scene"].graph, classes) for info in made}
     return {
         "score": float(np.mean([episode.score for episode in episodes])),
@@ -66,6 +70,7 @@ def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float
         "hidden": float(np.mean(hidden)) if hidden else 0.0,
         "distinct": len(forms) / max(1, len(made)),
         "stacks": float(np.mean([len(info["scene"].graph.stacks()) for info in made])) if made else 0.0,
+        "rarest_class": min(used[name] for name in classes) / max(1, used.total()),
     }
 
 
@@ -74,21 +79,21 @@ def main(
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainGenerator.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    threads: Annotated[int, typer.Option(help="Of torch on the CPU; more than one helps little with networks this small.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=PARTS, help="That work on an update; changes no result.")] = PARTS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
     run = load_typed(TrainGenerator(), config, settings or [])
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}; allowed are auto, cpu, cuda")
     chosen = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    torch.set_num_threads(threads)
+    one_thread_per_operation()
     classes = load_catalogue(Path(run.catalogue) if run.catalogue else None).object_set(run.objects)
 
     def make_environment() -> ClutterGeneration:
         return ClutterGeneration(classes, run.task, run.world)
 
     example = make_environment()
-    learner = SoftQLearner(make_environment, run.learning, run.seed, chosen)
+    learner = SoftQLearner(make_environment, run.learning, run.seed, chosen, threads)
     if run.warm_start:
         learner.begin_with(load_values(load_checkpoint(Path(run.warm_start)), example.grammar))
     if not (out / CONFIG).exists():
@@ -116,12 +121,12 @@ def main(
         history.append(row)
         losses.clear()
         write_json(out / HISTORY, history)
-        for name in ("score", "stable", "hidden", "distinct", "stacks"):
+        for name in FIGURES:
             writer.add_scalar(f"charts/{name}", row[name], learner.step)
         writer.add_scalar("charts/steps_per_second", rate, learner.step)
         writer.add_scalar("losses/q", row["loss"], learner.step)
         left = (run.learning.steps - learner.step) / rate / 60 if rate else float("nan")
-        told = ", ".join(f"{name} {row[name]:.3g}" for name in ("score", "stable", "hidden", "distinct", "stacks", "loss"))
+        told = ", ".join(f"{name} {row[name]:.3g}" for name in (*FIGURES, "loss"))
         console.print(
             f"{learner.step:>7} of {run.learning.steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left", highlight=False
         )

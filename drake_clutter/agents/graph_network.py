@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-from drake_clutter.agents.graph_kernels import attention_pooled, message_maximum, pack, updated
+from drake_clutter.agents.message_passing import LayerWeights, Links, message_passing, pack
 
 
 class GraphBatch(NamedTuple):
@@ -21,45 +21,46 @@ class GraphBatch(NamedTuple):
 
     Attributes:
         kind: (M,) number of a node's kind. feature: (M, F) what else is known of it.
-        graph: (M,) the graph that it belongs to.
-        sender, receiver: (Z,) the nodes that an edge joins. edge_kind: (Z,) number of its kind.
+        links: how the nodes hang together.
         glob: (B, G) features of the whole graph.
     """
 
     kind: Tensor
     feature: Tensor
-    graph: Tensor
-    sender: Tensor
-    receiver: Tensor
-    edge_kind: Tensor
+    links: Links
     glob: Tensor
 
 
 class MessagePassing(nn.Module):
-    """One layer: messages FC(sender, edge), their maximum by receiver, update FC(node, global, maximum) + skip; then the global
-    node, FC(nodes pooled by attention, global) + skip. FC: a linear layer and LeakyReLU.
+    """The layers, see `message_passing`.
 
     A linear layer of several inputs is the sum of one of each: what many nodes share is multiplied once.
     """
 
-    def __init__(self, width: int, edge_width: int) -> None:
+    def __init__(self, width: int, edge_width: int, layers: int) -> None:
         super().__init__()
-        self.message_sender = nn.Linear(width, width)
-        self.message_edge = nn.Linear(edge_width, width, bias=False)
-        self.update_node = nn.Linear(width, width)
-        self.update_maximum = nn.Linear(width, width, bias=False)
-        self.update_global = nn.Linear(width, width, bias=False)
-        self.attention = nn.Linear(width, 1)
-        self.global_pooled = nn.Linear(width, width)
-        self.global_global = nn.Linear(width, width, bias=False)
 
-    def forward(self, node: Tensor, glob: Tensor, edge: Tensor, batch: GraphBatch) -> tuple[Tensor, Tensor]:
-        """Embeddings of nodes (M, H) and of graphs (B, H) after the layer; edge: (kinds of edges, H_edge)."""
-        most = message_maximum(self.message_sender(node), self.message_edge(edge), batch.sender, batch.receiver, batch.edge_kind)
-        update = torch.addmm(self.update_node(node), most, self.update_maximum.weight.t())
-        node = updated(update, self.update_global(glob), batch.graph, node)
-        pooled = attention_pooled(node, self.attention(node).squeeze(1), batch.graph, len(glob))
-        return node, leaky_relu(self.global_pooled(pooled) + self.global_global(glob)) + glob
+        def linear(outputs: int, inputs: int, bias: bool = True) -> list[nn.Parameter]:
+            each = [[*nn.Linear(inputs, outputs, bias).parameters()] for _ in range(layers)]  # as PyTorch begins
+            return [nn.Parameter(torch.stack(weights).detach()) for weights in zip(*each, strict=True)]
+
+        self.sender, self.sender_bias = linear(width, width)
+        (self.edge,) = linear(width, edge_width, bias=False)
+        self.node, self.node_bias = linear(width, width)
+        (self.maximum,) = linear(width, width, bias=False)
+        (self.glob,) = linear(width, width, bias=False)
+        self.attention, self.attention_bias = linear(1, width)
+        self.pooled, self.pooled_bias = linear(width, width)
+        (self.old,) = linear(width, width, bias=False)
+
+    @property
+    def weights(self) -> LayerWeights:
+        """Its parameters."""
+        return LayerWeights(*(getattr(self, name) for name in LayerWeights._fields))
+
+    def forward(self, node: Tensor, glob: Tensor, edge: Tensor, links: Links) -> tuple[Tensor, Tensor]:
+        """Embeddings of nodes (M, H) and of graphs (B, H) after the last layer; edge: (kinds of edges, H_edge)."""
+        return message_passing(node, glob, edge, links, self.weights)
 
 
 class GraphNetwork(nn.Module):
@@ -80,16 +81,15 @@ class GraphNetwork(nn.Module):
         self.feature = nn.Linear(features, width)
         self.edge = nn.Embedding(edge_kinds, edge_width)
         self.glob = nn.Linear(globals_, width)
-        self.layers = nn.ModuleList(MessagePassing(width, edge_width) for _ in range(layers))
+        self.layers = MessagePassing(width, edge_width, layers)
 
     def forward(self, batch: GraphBatch) -> tuple[Tensor, Tensor]:
         """Embeddings of nodes (M, H) and of graphs (B, H)."""
         node = leaky_relu(self.kind(batch.kind) + self.feature(batch.feature))
         edge = leaky_relu(self.edge.weight)
         glob = leaky_relu(self.glob(batch.glob))
-        for layer in self.layers:
-            node, glob = layer(node, glob, edge, batch)
-        return node, glob
+        found: tuple[Tensor, Tensor] = self.layers(node, glob, edge, batch.links)
+        return found
 
 
 MARKS = 3
@@ -114,12 +114,11 @@ class RuleValues(nn.Module):
         """The network's input: arrays as in `ClutterGeneration`, with a first axis of graphs."""
         weight = self.value.weight
         kinds, edges = observation["node_kind"], (observation["edge"], observation["edge_kind"])
-        graph, number, kind, sender, receiver, edge_kind = map(torch.from_numpy, pack(kinds, *edges, self._edge_kinds))
-        at = (graph.numpy(), number.numpy())
-        feature = np.concatenate([observation["node_flags"][at], observation["position"][at]], axis=1)
-        features = (torch.from_numpy(array).to(weight.dtype) for array in (feature, observation["remaining"]))
-        arrays = (kind, next(features), graph, sender, receiver, edge_kind, next(features))
-        return GraphBatch(*(array.to(weight.device) for array in arrays))
+        graph, number, kind, *joined = pack(kinds, *edges, self._edge_kinds)
+        feature = np.concatenate([observation["node_flags"][graph, number], observation["position"][graph, number]], axis=1)
+        features = (torch.from_numpy(array).to(weight) for array in (feature, observation["remaining"]))
+        links = Links(*(torch.from_numpy(array).to(weight.device) for array in (graph, *joined)))
+        return GraphBatch(torch.from_numpy(kind).to(weight.device), next(features), links, next(features))
 
     def forward(self, observation: Mapping[str, NDArray[Any]]) -> Tensor:
         """(B, rules)."""
@@ -127,6 +126,6 @@ class RuleValues(nn.Module):
         node, glob = self.network(batch)
         row, mark = batch.feature[:, 1 : 1 + MARKS].nonzero(as_tuple=True)
         marked = node.new_zeros(len(glob) * MARKS, node.shape[1])
-        marked = marked.index_copy(0, batch.graph[row] * MARKS + mark, node[row]).view(len(glob), -1)
+        marked = marked.index_copy(0, batch.links.graph[row] * MARKS + mark, node[row]).view(len(glob), -1)
         values: Tensor = self.value(leaky_relu(self.joined(torch.cat([glob, marked], dim=1))))
         return values

@@ -7,8 +7,10 @@ a distribution of scenes, the better the likelier, and no state is worth more be
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +25,9 @@ from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.files import InputError, replacing
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
+
+PARTS = 2
+"""Of an update, that are worked on side by side; always so many, so that the number of threads changes no result."""
 
 KEPT = ("node_kind", "node_flags", "position", "edge", "edge_kind", "remaining")
 """What of an observation the network looks at; the masks follow from the kinds."""
@@ -56,7 +61,7 @@ class SoftQConfig:
     warm_up: int = 4_000
     learning_rate: float = 1e-3
     halve_every: int = 128_000
-    temperature: float = 0.1
+    temperature: float = 0.25
     target_rate: float = 0.005
     width: int = 32
 
@@ -217,9 +222,14 @@ class SoftQLearner:
     """
 
     def __init__(
-        self, make_environment: Callable[[], ClutterGeneration], config: SoftQConfig, seed: int, device: torch.device
+        self,
+        make_environment: Callable[[], ClutterGeneration],
+        config: SoftQConfig,
+        seed: int,
+        device: torch.device,
+        threads: int = PARTS,
     ) -> None:
-        """Begins a training; `make_environment()` makes a `ClutterGeneration`.
+        """Begins a training; `make_environment()` makes a `ClutterGeneration`; `threads` work on the parts of an update.
 
         Raises:
             InputError: a replay too small for a segment of every environment.
@@ -234,6 +244,7 @@ class SoftQLearner:
         self.network = RuleValues(len(vocabulary.node_kinds), len(vocabulary.edge_kinds), rules, config.width).to(device)
         self._target = deepcopy(self.network).requires_grad_(False)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate, fused=True)
+        self._workers = ThreadPoolExecutor(threads)
         self._rng = item_rng(seed, 0)
         self.step, self.losses = 0, list[float]()
         self._scores = [0.0] * config.environments
@@ -292,26 +303,34 @@ class SoftQLearner:
 
     def _update(self) -> float | None:
         config = self.config
-        drawn = self._replay.draw(max(1, config.batch // config.segment), config.segment, self._rng)
+        segments = max(PARTS, config.batch // config.segment)
+        drawn = self._replay.draw(segments, config.segment, self._rng)
         if drawn is None:
             return None
+        bounds = [segments * part // PARTS for part in range(PARTS + 1)]
+        parts = [{name: array[a:b] for name, array in drawn.items()} for a, b in pairwise(bounds)]
+        losses, gradients = zip(*self._workers.map(self._loss, parts), strict=True)
+        for parameter, *of_parts in zip(self.network.parameters(), *gradients, strict=True):
+            parameter.grad = sum(of_parts[1:], of_parts[0]) / (segments * config.segment)
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
+        self._optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_([*self._target.parameters()], [*self.network.parameters()], config.target_rate)
+        return float(sum(losses)) / (segments * config.segment)
+
+    def _loss(self, drawn: dict[str, NDArray[Any]]) -> tuple[float, tuple[Tensor, ...]]:
+        """Summed over some segments, and its gradients."""
         names = ("mask", "action", "chance", "reward", "over")
         mask, action, chance, reward, over = (torch.from_numpy(drawn[name]).to(self.device) for name in names)
         with torch.no_grad():
             values = self._target({name: drawn[name].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}).view(mask.shape)
-            aim = aims(values, mask, action, chance, reward, over, config.temperature, config.trace).flatten()
+            aim = aims(values, mask, action, chance, reward, over, self.config.temperature, self.config.trace).flatten()
         before = {name: drawn[name][:, :-1].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}
         chosen = self.network(before).gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
-        loss = torch.nn.functional.smooth_l1_loss(chosen, aim)
-        for group in self._optimizer.param_groups:
-            group["lr"] = self.learning_rate
-        self._optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
-        self._optimizer.step()
-        with torch.no_grad():
-            torch._foreach_lerp_([*self._target.parameters()], [*self.network.parameters()], self.config.target_rate)
-        return loss.item()
+        loss = torch.nn.functional.smooth_l1_loss(chosen, aim, reduction="sum")
+        return loss.item(), torch.autograd.grad(loss, [*self.network.parameters()])
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
