@@ -5,9 +5,9 @@ frames of the Denavit-Hartenberg convention, frame 6 being the tool flange, z ou
 """
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -80,7 +80,7 @@ def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> float:
 
 
 def inverse_kinematics(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:
-    """All joint angles that reach a pose (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms").
+    """All joint angles that reach a pose, see `branches`.
 
     Args:
         X_B6: (4, 4), of the flange.
@@ -90,39 +90,65 @@ def inverse_kinematics(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHa
     Returns:
         (n, 6) rad, within -pi to pi, n up to 8; none if it is out of reach. Branches that coincide are repeated.
     """
-    X = np.asarray(X_B6, float)
-    _, a2, a3, *_ = parameters.a
-    _, _, _, d4, _, d6 = parameters.d
-    p_B5 = X[:3, 3] - d6 * X[:3, 2]
-    found = []
-    reach = np.hypot(p_B5[0], p_B5[1])
-    if reach < abs(d4):
-        return np.empty((0, 6))
-    for shoulder, wrist, elbow in product((1.0, -1.0), repeat=3):
-        # The arm moves in a vertical plane at the distance d4 from the base's axis.
-        q1 = np.arctan2(p_B5[1], p_B5[0]) + shoulder * np.arccos(d4 / reach) + np.pi / 2
-        s1, c1 = np.sin(q1), np.cos(q1)
-        cosine = (X[0, 3] * s1 - X[1, 3] * c1 - d4) / d6
-        if abs(cosine) > 1 + 1e-12:
+    found = branches(X_B6, wrist_3, parameters)
+    return found[np.isfinite(found[:, 0])]
+
+
+def branches(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:
+    """The joint angles that reach poses, branch by branch (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots
+    UR-5/UR-10 arms").
+
+    Args:
+        X_B6: (..., 4, 4), of the flange.
+        wrist_3: rad, taken where wrist 2 is straight, so that the last joint is free.
+        parameters: of an arm of the UR family.
+
+    Returns:
+        (..., 8, 6) rad, within -pi to pi; NaN where a branch does not reach. A branch keeps its number from pose to pose.
+    """
+    X = np.ascontiguousarray(X_B6, float)
+    lengths = parameters.d[0], parameters.a[1], parameters.a[2], parameters.d[3], parameters.d[4], parameters.d[5]
+    return np.asarray(_branches(X.reshape(-1, 4, 4), wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6))
+
+
+@njit(cache=True)
+def _branches(X_B6, wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped-def]
+    found = np.full((len(X_B6), 8, 6), np.nan)
+    for k in range(len(X_B6)):
+        X = X_B6[k]
+        x, y, z = X[0, 3] - d6 * X[0, 2], X[1, 3] - d6 * X[1, 2], X[2, 3] - d6 * X[2, 2]  # origin of frame 5
+        reach = np.hypot(x, y)
+        if reach < abs(d4):
             continue
-        q5 = wrist * np.arccos(np.clip(cosine, -1.0, 1.0))
-        s5 = np.sin(q5)
-        across = X[0, :2] * s1 - X[1, :2] * c1  # of the axis of joint 2 (and 3, and 4), along x and y of the flange
-        q6 = np.arctan2(-across[1] / s5, across[0] / s5) if abs(s5) > _SINGULAR else wrist_3
-        X_46 = _turned(np.array(q5)) @ after_joint(parameters, 4) @ _turned(np.array(q6)) @ after_joint(parameters, 5)
-        X_B1 = _turned(np.array(q1)) @ after_joint(parameters, 0)
-        X_14 = np.linalg.solve(X_B1, X) @ np.linalg.inv(X_46)
-        p_13 = X_14[:3, 3] - d4 * X_14[:3, 1]
-        distance = np.hypot(p_13[0], p_13[1])
-        cosine = (distance**2 - a2**2 - a3**2) / (2 * a2 * a3)
-        if abs(cosine) > 1 + 1e-12:
-            continue
-        q3 = elbow * np.arccos(np.clip(cosine, -1.0, 1.0))
-        # Two bars of lengths a2 and a3, both negative: they lie along -x of their frames.
-        q2 = np.arctan2(p_13[1], p_13[0]) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
-        X_13 = _turned(np.array(q2)) @ after_joint(parameters, 1) @ _turned(np.array(q3)) @ after_joint(parameters, 2)
-        X_34 = np.linalg.solve(X_13, X_14)
-        q4 = np.arctan2(X_34[1, 0], X_34[0, 0])
-        found.append([q1, q2, q3, q4, q5, q6])
-    angles = np.array(found).reshape(-1, 6)
-    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
+        for branch in range(8):
+            shoulder, wrist, elbow = 1 - 2 * (branch // 4), 1 - 2 * (branch // 2 % 2), 1 - 2 * (branch % 2)
+            # The arm moves in a vertical plane at the distance d4 from the base's axis.
+            q1 = np.arctan2(y, x) + shoulder * np.arccos(d4 / reach) + np.pi / 2
+            s1, c1 = np.sin(q1), np.cos(q1)
+            cosine = (X[0, 3] * s1 - X[1, 3] * c1 - d4) / d6
+            if abs(cosine) > 1 + 1e-12:
+                continue
+            q5 = wrist * np.arccos(min(max(cosine, -1.0), 1.0))
+            s5 = np.sin(q5)
+            # The axis of joint 2 (and 3, and 4), along x and y of the flange.
+            along_x, along_y = X[0, 0] * s1 - X[1, 0] * c1, X[0, 1] * s1 - X[1, 1] * c1
+            q6 = np.arctan2(-along_y / s5, along_x / s5) if abs(s5) > _SINGULAR else wrist_3
+            # In the plane, whose x is c1, s1 and whose y is up: frame 4 is d5 behind frame 5 along its y.
+            s6, c6 = np.sin(q6), np.cos(q6)
+            u, v, w = X[0, 0] * s6 + X[0, 1] * c6, X[1, 0] * s6 + X[1, 1] * c6, X[2, 0] * s6 + X[2, 1] * c6
+            px = (x + d5 * u) * c1 + (y + d5 * v) * s1
+            py = z + d5 * w - d1
+            distance = np.hypot(px, py)
+            cosine = (distance**2 - a2**2 - a3**2) / (2 * a2 * a3)
+            if abs(cosine) > 1 + 1e-12:
+                continue
+            q3 = elbow * np.arccos(min(max(cosine, -1.0), 1.0))
+            # Two bars of lengths a2 and a3, both negative: they lie along -x of their frames.
+            q2 = np.arctan2(py, px) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
+            # In the plane z of frame 4, which is minus (u, v, w), is sin(q2 + q3 + q4), -cos(q2 + q3 + q4).
+            total = np.arctan2(-(u * c1 + v * s1), w)
+            q = found[k, branch]
+            q[0], q[1], q[2], q[3], q[4], q[5] = q1, q2, q3, total - q2 - q3, q5, q6
+            for joint in range(6):
+                q[joint] = (q[joint] + np.pi) % (2 * np.pi) - np.pi
+    return found
