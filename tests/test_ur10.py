@@ -11,7 +11,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_clutter.arm.kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
-from drake_clutter.arm.ur10 import BASE_OUTLINE, LINKS, Rod, ur10_sdf
+from drake_clutter.arm.rods import Rod
+from drake_clutter.arm.ur10 import BASE_OUTLINE, LINKS, ur10_sdf
 from drake_clutter.resources import shipped_path
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"

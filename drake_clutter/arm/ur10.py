@@ -15,25 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.arm.kinematics import JOINTS, UR10, Floats, after_joint
-
-Point = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Rod:
-    """A cylinder, or with round ends a capsule.
-
-    Attributes:
-        start, end: (3,) m, ends of its axis, in the link's frame.
-        radius: m.
-        colour: of a visual one.
-    """
-
-    start: Point
-    end: Point
-    radius: float
-    colour: str = ""
+from drake_clutter.arm.kinematics import JOINTS, UR10, after_joint
+from drake_clutter.arm.rods import Point, Rod, sdf_link, sdf_pose
 
 
 @dataclass(frozen=True)
@@ -155,60 +138,15 @@ JOINT_RANGE = 2 * math.pi
 """rad, either way."""
 
 
-def _pose(p: Floats, rotation: Rotation, relative_to: str = "") -> str:
-    """SDF pose of a position (3,) m and a rotation."""
-    numbers = " ".join(f"{value:.12g}" for value in (*p, *rotation.as_quat(canonical=True)))
-    frame = f' relative_to="{relative_to}"' if relative_to else ""
-    return f'<pose rotation_format="quat_xyzw"{frame}>{numbers}</pose>'
-
-
-def _geometry(kind: str, name: str, rod: Rod, shape: str) -> str:
-    start, end = np.array(rod.start), np.array(rod.end)
-    length = math.dist(start, end)
-    turn, _ = Rotation.align_vectors((end - start)[None], np.array([[0.0, 0.0, 1.0]]))
-    material = f"\n        <material><diffuse>{rod.colour}</diffuse></material>" if rod.colour else ""
-    return f"""
-      <{kind} name="{name}">
-        {_pose((start + end) / 2, turn)}
-        <geometry><{shape}><radius>{rod.radius:.6g}</radius><length>{length:.6g}</length></{shape}></geometry>{material}
-      </{kind}>"""
-
-
-def _inertial(mass: float, p_LCm: Floats, spine: Rod) -> str:
-    """Of a solid cylinder of the mass that is as long and as thick as the link's longest part, about the centre of mass."""
-    start, end = np.array(spine.start), np.array(spine.end)
-    length = max(float(np.linalg.norm(end - start)), 1e-3)
-    axis = (end - start) / length
-    along, across = mass * spine.radius**2 / 2, mass * (3 * spine.radius**2 + length**2) / 12
-    tensor = across * np.eye(3) + (along - across) * np.outer(axis, axis)
-    parts = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    entries = "".join(f"<i{'xyz'[i]}{'xyz'[j]}>{tensor[i, j]:.6g}</i{'xyz'[i]}{'xyz'[j]}>" for i, j in parts)
-    return f"""
-      <inertial>
-        <pose>{" ".join(f"{value:.6g}" for value in p_LCm)} 0 0 0</pose>
-        <mass>{mass:.6g}</mass>
-        <inertia>{entries}</inertia>
-      </inertial>"""
-
-
-def _link(name: str, pose: str, mass: float, p_LCm: Floats, outline: tuple[Rod, ...], looks: tuple[Rod, ...]) -> str:
-    spine = max(looks, key=lambda rod: math.dist(rod.start, rod.end))
-    shapes = [_geometry("collision", f"outline_{k}", rod, "capsule") for k, rod in enumerate(outline)]
-    shapes += [_geometry("visual", f"part_{k}", rod, "cylinder") for k, rod in enumerate(looks)]
-    return f"""
-    <link name="{name}">{pose}{_inertial(mass, p_LCm, spine)}{"".join(shapes)}
-    </link>"""
-
-
 def ur10_sdf() -> str:
     """The SDF model, as text. Link `base` is B; frame `flange` is frame 6 of the convention."""
-    parts = [_link("base", "", BASE_MASS, np.array([0.0, 0.0, 0.019]), BASE_OUTLINE, BASE_LOOKS)]
+    parts = [sdf_link("base", "", BASE_MASS, np.array([0.0, 0.0, 0.019]), BASE_OUTLINE, BASE_LOOKS)]
     parent, X_PL = "base", np.eye(4)
     for number, (joint, link) in enumerate(zip(JOINTS, LINKS, strict=True)):
         X_LDh = after_joint(UR10, number)
         p_LCm = X_LDh[:3, :3] @ np.array(link.p_DhCm) + X_LDh[:3, 3]
-        pose = "\n      " + _pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]), parent)
-        parts.append(_link(link.name, pose, link.mass, p_LCm, link.outline, link.looks))
+        pose = "\n      " + sdf_pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]), parent)
+        parts.append(sdf_link(link.name, pose, link.mass, p_LCm, link.outline, link.looks))
         parts.append(f"""
     <joint name="{joint}" type="revolute">
       <parent>{parent}</parent>
@@ -227,7 +165,7 @@ def ur10_sdf() -> str:
 <sdf version="1.10">
   <model name="ur10">{"".join(parts)}
     <frame name="flange" attached_to="{parent}">
-      {_pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]))}
+      {sdf_pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]))}
     </frame>
   </model>
 </sdf>

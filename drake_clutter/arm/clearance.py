@@ -1,0 +1,134 @@
+"""How far the arm, and what it holds, is from everything else."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
+from drake_clutter.catalogue import ObjectClass
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """A signed distance.
+
+    Attributes:
+        distance: m, negative where there is penetration.
+        pair: the names of what is so close, the arm's side first.
+    """
+
+    distance: float
+    pair: tuple[str, str] = ("", "")
+
+
+class ClearanceScene:
+    """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put."""
+
+    def __init__(
+        self, config: ArmConfig, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
+    ) -> None:
+        """Makes a plant of the arm and named objects."""
+        builder = DiagramBuilder()
+        made = add_scene_plant(builder, objects, tray_side, 0.0, visuals=False)
+        self.plant, self._bodies = made.plant, made.bodies
+        self._arm: Arm = add_arm(made.plant, config, camera_altitude, compliant=False)
+        made.plant.Finalize()
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self._context = made.plant.GetMyMutableContextFromRoot(self._root)
+        self._scene_graph, self._geometry_context = made.scene_graph, made.scene_graph.GetMyMutableContextFromRoot(self._root)
+        self._query_port = made.scene_graph.get_query_output_port()
+        self._q = self.plant.GetPositions(self._context)
+        self._at, _ = joint_numbers(self.plant, self._arm)
+        self._names = self._name_geometries()
+        self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
+        self._fixed = (self.plant.world_body(), self.plant.GetBodyByName("tray"))
+        fixed = self._geometries(*self._fixed)
+        standing = self._geometries(*self._fixed, *self._bodies.values())
+        self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
+        # Links that cannot meet, though their capsules do.
+        for first, second in (("base", "upper_arm"), ("wrist_1", "wrist_3")):
+            self._filters.Apply(CollisionFilterDeclaration().ExcludeBetween(self._of_arm(first), self._of_arm(second)))
+        self._filters.Apply(CollisionFilterDeclaration().ExcludeBetween(self._of_arm("base"), fixed))
+        self._arm_names = frozenset(body.name() for body in self._arm.bodies)
+        self._held: tuple[str, Floats] | None = None
+        self._transient: list[object] = []
+
+    def _geometries(self, *bodies: RigidBody) -> GeometrySet:
+        found = GeometrySet()
+        for body in bodies:
+            found.Add(self.plant.GetCollisionGeometriesForBody(body))
+        return found
+
+    def _of_arm(self, *names: str) -> GeometrySet:
+        return self._geometries(*(body for body in self._arm.bodies if body.name() in names))
+
+    def _name_geometries(self) -> dict[object, str]:
+        names = {}
+        owners = {body.index(): name for name, body in self._bodies.items()}
+        inspector = self._scene_graph.model_inspector()
+        for index in range(self.plant.num_bodies()):
+            body = self.plant.get_body(BodyIndex(index))
+            for geometry in self.plant.GetCollisionGeometriesForBody(body):
+                fixed = body in (self.plant.world_body(), self.plant.GetBodyByName("tray"))
+                of_its_own = inspector.GetName(geometry).split("::")[-1]
+                names[geometry] = of_its_own if fixed else owners.get(body.index(), body.name())
+        return names
+
+    def put(self, objects: Sequence[SceneObject]) -> None:
+        """Puts objects at their poses; the arm holds nothing any more."""
+        self.release()
+        for o in objects:
+            self.plant.SetFreeBodyPose(self._context, self._bodies[o.name], rigid_transform(o.X_TO))
+        self._q = self.plant.GetPositions(self._context)
+
+    def put_one(self, name: str, X_TO: Pose) -> None:
+        """Puts one object elsewhere."""
+        self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
+        self._q = self.plant.GetPositions(self._context)
+
+    def hold(self, name: str, X_GO: Floats) -> None:
+        """From now on the object moves with the cup, X_GO (4, 4)."""
+        self.release()
+        held = self._geometries(self._bodies[name])
+        others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
+        tool = self._geometries(*(body for body in self._arm.bodies if body.model_instance() == self._arm.tool))
+        declaration = CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
+        self._transient.append(self._filters.ApplyTransient(declaration))
+        self._held = name, X_GO
+
+    def release(self) -> None:
+        """Holds nothing any more."""
+        while self._transient:
+            self._filters.RemoveDeclaration(self._transient.pop())
+        self._held = None
+
+    def touch(self, name: str) -> None:
+        """From now on, until `release`, the cup may come into contact with the object."""
+        allowed = CollisionFilterDeclaration().ExcludeBetween(self._geometries(self._bodies[name]), self._of_arm("cup"))
+        self._transient.append(self._filters.ApplyTransient(allowed))
+
+    def close(self, q: Floats, within: float) -> list[Clearance]:
+        """At joint angles (6,) rad: all that is closer than `within`, m."""
+        self._q[self._at] = q
+        self.plant.SetPositions(self._context, self._q)
+        if self._held is not None:
+            name, X_GO = self._held
+            X_TG = self._arm.cup.CalcPoseInWorld(self._context).GetAsMatrix4()
+            self.plant.SetFreeBodyPose(self._context, self._bodies[name], RigidTransform(X_TG @ X_GO))
+        found = []
+        moves = {self._held[0] if self._held else "", *self._arm_names}
+        for pair in self._query_port.Eval(self._geometry_context).ComputeSignedDistancePairwiseClosestPoints(within):
+            first, second = self._names[pair.id_A], self._names[pair.id_B]
+            found.append(Clearance(float(pair.distance), (first, second) if first in moves else (second, first)))
+        return found

@@ -1,0 +1,119 @@
+"""From joint angles along a way to a trajectory that respects the arm's limits."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import BsplineBasis, KnotVectorType, RigidTransform
+from pydrake.multibody.optimization import Toppra
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, Trajectory
+
+from drake_clutter.arm.epick import epick_sdf
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
+from drake_clutter.resources import shipped_path
+
+Floats = NDArray[np.float64]
+
+VELOCITY_LIMIT = np.array([link.speed for link in LINKS])
+TORQUE_LIMIT = np.array([link.torque for link in LINKS])
+ACCELERATION_LIMIT = np.array([4.0, 4.0, 6.0, 10.0, 10.0, 10.0])
+"""rad/s, N m, and rad/s^2; the last is ours, the data sheet has none."""
+MARGIN = 0.97
+"""Share of the limits that is used: between the points at which they are imposed a trajectory may exceed them a little."""
+SPACING = 0.08
+"""rad, that a joint turns at most from one point of a way to the next."""
+_ORDER = 4
+_GRID = 70
+"""Points of a path at which the limits are imposed."""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What hangs on the cup.
+
+    Attributes:
+        mass: kg.
+        p_GCm: (3,) m, rounded, so that plants can be kept.
+        acceleration: m/s^2, of the cup along each axis, at most; infinite without a load.
+    """
+
+    mass: float = 0.0
+    p_GCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    acceleration: float = math.inf
+
+
+@lru_cache(maxsize=64)
+def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], base: tuple[float, ...]) -> MultibodyPlant:
+    """The arm alone, the cup rigid, with a load; for dynamics."""
+    config = ArmConfig(base=list(base))
+    config.suction.extension = extension
+    plant = MultibodyPlant(0.0)
+    (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
+    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=False), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), RigidTransform(config.X_TB))
+    plant.WeldFrames(plant.GetFrameByName("flange", robot), plant.GetFrameByName("body", tool))
+    if mass:
+        inertia = SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(0.05))
+        load = plant.AddRigidBody("load", robot, inertia)
+        plant.WeldFrames(plant.GetFrameByName("cup", tool), load.body_frame(), RigidTransform(list(p_GCm)))
+    plant.Finalize()
+    return plant
+
+
+def dynamics_plant(config: ArmConfig, payload: Payload) -> MultibodyPlant:
+    """The arm with a rigid cup and the load, no geometry."""
+    return _plant(config.suction.extension, payload.mass, payload.p_GCm, tuple(config.base))
+
+
+def nearest_turns(q: Floats, reference: Floats) -> Floats:
+    """Joint angles (..., 6) rad turned by whole turns so that they lie nearest to others, within the joints' range."""
+    turned = q + 2 * np.pi * np.round((reference - q) / (2 * np.pi))
+    over = np.abs(turned) > JOINT_RANGE
+    return np.asarray(np.where(over, turned - 2 * np.pi * np.sign(turned), turned))
+
+
+def straight(start: Floats, end: Floats) -> Floats:
+    """(n, 6) rad, from one configuration to another, `SPACING` apart at most."""
+    steps = max(2, math.ceil(np.abs(end - start).max() / SPACING) + 1)
+    return np.linspace(start, end, steps)
+
+
+def smooth(way: Floats) -> BsplineTrajectory:
+    """A twice differentiable path of which the points (n, 6) of a way are the control points: it cuts the corners."""
+    distinct = np.concatenate([[True], np.abs(np.diff(way, axis=0)).max(axis=1) > 1e-9])
+    points = way[distinct]
+    while len(points) < _ORDER - 2:
+        points = np.insert(points, 1, (points[0] + points[1]) / 2, axis=0)
+    # A third of the first and last step away, else the path parameter would run three times as fast at the ends.
+    points = np.insert(points, [1, len(points) - 1], [(2 * points[0] + points[1]) / 3, (2 * points[-1] + points[-2]) / 3], axis=0)
+    basis = BsplineBasis(_ORDER, len(points), KnotVectorType.kClampedUniform, 0.0, 1.0)
+    return BsplineTrajectory(basis, points.T)
+
+
+def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
+    """(n, 6) rad along a trajectory, about `spacing` apart."""
+    coarse = path.vector_values(np.linspace(path.start_time(), path.end_time(), 60)).T
+    count = max(20, math.ceil(np.abs(np.diff(coarse, axis=0)).max(axis=1).sum() / spacing))
+    return np.asarray(path.vector_values(np.linspace(path.start_time(), path.end_time(), count)).T)
+
+
+def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
+    """The path as fast as velocity, acceleration, torque and the cup's hold allow (Pham and Pham 2018, "TOPP-RA"); None if it cannot be."""
+    plant = dynamics_plant(config, payload)
+    grid = np.linspace(path.start_time(), path.end_time(), _GRID)
+    toppra = Toppra(path, plant, grid)
+    toppra.AddJointVelocityLimit(-MARGIN * VELOCITY_LIMIT, MARGIN * VELOCITY_LIMIT)
+    toppra.AddJointAccelerationLimit(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
+    toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)
+    if math.isfinite(payload.acceleration):
+        # The load's centre of mass; along each axis, so that the vector is within the limit.
+        limit = np.array([np.inf] * 3 + [payload.acceleration / math.sqrt(3)] * 3)
+        toppra.AddFrameAccelerationLimit(plant.GetFrameByName("load"), -limit, limit)
+    speed = toppra.SolvePathParameterization()
+    return None if speed is None else PathParameterizedTrajectory(path, speed)

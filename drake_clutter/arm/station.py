@@ -1,0 +1,98 @@
+"""The work cell as a plant: the UR10 on its pedestal, the EPick, the tray with its objects.
+
+Frames: T the tray, which is the world; B the arm's base; F the flange; G the cup.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
+
+from drake_clutter.arm.epick import epick_sdf
+from drake_clutter.arm.kinematics import JOINTS
+from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.resources import shipped_path
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class ArmConfig:
+    """The arm in its cell.
+
+    Attributes:
+        base: m, m, m, deg: X_TB, a position and a turn about the vertical.
+        home: (6,) rad, where a move begins and ends; the camera sees all of the tray then.
+        suction: the tool.
+        payload: kg, of tool and object together (UR10 data sheet).
+    """
+
+    base: list[float] = field(default_factory=lambda: [-0.65, 0.0, 0.30, 0.0])
+    home: list[float] = field(default_factory=lambda: [2.622, -2.285, 2.329, -1.615, -np.pi / 2, -2.091])
+    suction: SuctionConfig = field(default_factory=SuctionConfig)
+    payload: float = 10.0
+
+    @property
+    def X_TB(self) -> Floats:
+        """(4, 4)."""
+        x, y, z, yaw = self.base
+        return np.asarray(RigidTransform(RotationMatrix.MakeZRotation(np.radians(yaw)), [x, y, z]).GetAsMatrix4())
+
+    @property
+    def X_FG(self) -> Floats:
+        """(4, 4), the cup at rest."""
+        return np.asarray(RigidTransform([0.0, 0.0, self.suction.length]).GetAsMatrix4())
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The arm in a plant.
+
+    Attributes:
+        robot, tool: model instances.
+        bodies: of both.
+        flange, cup: frames F and G.
+    """
+
+    robot: ModelInstanceIndex
+    tool: ModelInstanceIndex
+    bodies: tuple[RigidBody, ...]
+    flange: Frame
+    cup: Frame
+
+
+_GREY = np.array([0.45, 0.46, 0.48, 1.0])
+_TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
+"""Its upper surface is a millimetre below the tray's floor, which lies on it."""
+
+
+def add_arm(plant: MultibodyPlant, config: ArmConfig, camera_altitude: float, *, compliant: bool) -> Arm:
+    """Adds pedestal, arm, tool, table and the camera's housing to a plant that is not finalized; `compliant`: see `epick_sdf`."""
+    (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
+    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=compliant), "sdf")
+    world, X_TB = plant.world_body(), RigidTransform(config.X_TB)
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), X_TB)
+    flange = plant.GetFrameByName("flange", robot)
+    plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
+    height = config.base[2] + 0.01
+    things = [("table", _TABLE[1], _TABLE[0]), ("camera", RigidTransform([0.0, 0.0, camera_altitude + 0.03]), Sphere(0.06))]
+    if height > 0.01:
+        pedestal = RigidTransform(X_TB.rotation(), [*config.base[:2], height / 2 - 0.01])
+        things.append(("pedestal", pedestal, Box(0.16, 0.16, height - 0.002)))
+    for name, X_TS, shape in things:
+        plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
+        if name == "pedestal":
+            plant.RegisterVisualGeometry(world, X_TS, shape, name, _GREY)
+    bodies = tuple(plant.get_body(index) for model in (robot, tool) for index in plant.GetBodyIndices(model))
+    return Arm(robot, tool, bodies, flange, plant.GetFrameByName("cup", tool))
+
+
+def joint_numbers(plant: MultibodyPlant, arm: Arm) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where q (6,) and v (6,) of the arm lie in the finalized plant's."""
+    joints = [plant.GetJointByName(name, arm.robot) for name in JOINTS]
+    return np.array([j.position_start() for j in joints]), np.array([j.velocity_start() for j in joints])

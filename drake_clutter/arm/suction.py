@@ -1,0 +1,161 @@
+"""What a suction cup can hold: whether it seals on a surface, and which loads it bears.
+
+Frames: G the cup, origin in the middle of its lip, z out of the tool, into the object; O the object.
+
+Sources: Robotiq, "EPick vacuum gripper instruction manual" (vacuum of 80 % of the atmosphere); the body's length and radius as in
+PickNik's `epick_description` (BSD). A lip that is loaded evenly by the vacuum opens where tension and bending have used that up
+(the ring contact of Mahler et al. 2018, "Dex-Net 3.0", section III).
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from drake_clutter.catalogue import ObjectClass
+
+Floats = NDArray[np.float64]
+
+ATMOSPHERE = 101_325.0
+"""Pa."""
+GRAVITY = 9.81
+"""m/s^2."""
+_RING = 24
+"""Points of the lip that are looked at."""
+_STANDOFF = 0.05
+"""m above the lip, from which is looked."""
+
+
+@dataclass
+class SuctionConfig:
+    """The EPick with a cup of one and a half bellows on an extension tube.
+
+    Attributes:
+        cup_diameter: m, of the lip.
+        cup_length: m, without load.
+        extension: m, length of the tube between body and cup.
+        stroke: m, by which the cup can be pressed together or drawn out; stiffness: N/m along its axis.
+        vacuum: share of the atmosphere's pressure that is taken away.
+        friction: of the lip on cardboard, tin and plastic.
+        unevenness: m, out of a plane, that the lip still follows.
+        safety: by how much the cup must be able to hold more than it is planned to.
+    """
+
+    cup_diameter: float = 0.025
+    cup_length: float = 0.020
+    extension: float = 0.100
+    stroke: float = 0.006
+    stiffness: float = 2_000.0
+    vacuum: float = 0.8
+    friction: float = 0.5
+    unevenness: float = 0.001
+    safety: float = 1.5
+
+    @property
+    def pull(self) -> float:
+        """N, with which the atmosphere presses the lip on."""
+        return self.vacuum * ATMOSPHERE * math.pi * self.cup_diameter**2 / 4
+
+    @property
+    def length(self) -> float:
+        """m, from the flange to the lip."""
+        return EPICK_LENGTH + self.extension + self.cup_length
+
+
+EPICK_LENGTH, EPICK_RADIUS, EPICK_MASS = 0.1023, 0.044, 0.71
+"""m, m, kg: the gripper's body."""
+
+
+@lru_cache(maxsize=256)
+def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
+    """(F, 4) of each convex piece: it is where n . p + d <= 0."""
+    return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
+
+
+def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
+    """How far, in m, the surface under the cup's lip leaves a plane at right angles to the cup; infinite if part of the lip meets nothing.
+
+    Tilt, curvature, edges and gaps all show as this one number.
+
+    Args:
+        object_class: what the cup is on.
+        X_OG: (4, 4), z into the object.
+        diameter: m, of the lip.
+    """
+    angle = np.arange(_RING) * (2 * np.pi / _RING)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_RING)]) * diameter / 2
+    p = (ring + [0.0, 0.0, -_STANDOFF]) @ X_OG[:3, :3].T + X_OG[:3, 3]
+    along = X_OG[:3, 2]
+    depth = np.full(_RING, np.inf)
+    for half_spaces in _half_spaces(object_class):
+        steep, outside = half_spaces[:, :3] @ along, p @ half_spaces[:, :3].T + half_spaces[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -outside / steep
+        enters = np.where(steep < -1e-9, crossing, -np.inf).max(axis=1)
+        leaves = np.where(steep > 1e-9, crossing, np.inf).min(axis=1)
+        beside = (outside[:, np.abs(steep) <= 1e-9] > 0).any(axis=1)
+        depth = np.where((enters <= leaves) & ~beside, np.minimum(depth, enters), depth)
+    return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
+
+
+def load_share(force: Floats, moment: Floats, config: SuctionConfig) -> Floats:
+    """How much of what the cup can bear a load takes up; above 1 it comes off.
+
+    Args:
+        force: (..., 3) N, with which the object pulls on the lip, in G; moment: (..., 3) N m, about its middle.
+        config: the cup.
+    """
+    radius = config.cup_diameter / 2
+    bending = np.hypot(moment[..., 0], moment[..., 1])
+    opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / config.pull
+    pressed = np.maximum(config.pull - force[..., 2], 1e-9)
+    # A thin ring that turns in place slides with its whole circumference at the lever arm of its radius.
+    sliding = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius) / (config.friction * pressed)
+    return np.asarray(np.maximum(opening, sliding))
+
+
+_DIRECTIONS = np.array(
+    [
+        [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)]
+        for e in (-0.8, 0.0, 0.8)
+        for a in np.arange(8) * math.pi / 4
+    ]
+    + [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+)
+
+
+def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
+    """Force (..., 3) N and moment (..., 3) N m on the lip of a cup that points down, from a body that it carries.
+
+    Args:
+        mass: kg.
+        p_GCm: (3,) m, the body's centre of mass.
+        acceleration: (..., 3) m/s^2, of that, in G; its turning is left out.
+    """
+    down = np.array([0.0, 0.0, GRAVITY])  # z of a cup that points down
+    force = mass * (down - acceleration)
+    return force, np.cross(np.broadcast_to(p_GCm, force.shape), force)
+
+
+def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> float:
+    """m/s^2, with which a cup that points down may move a body in any direction, safety included; negative: it cannot even hold it.
+
+    Args:
+        mass: kg.
+        p_GCm: (3,) m, the body's centre of mass.
+        config: the cup.
+    """
+
+    def share(acceleration: float) -> float:
+        return float(load_share(*carried_load(mass, p_GCm, acceleration * _DIRECTIONS), config).max()) * config.safety
+
+    if share(0.0) > 1:
+        return -1.0
+    low, high = 0.0, 50.0
+    while high - low > 0.01:
+        middle = (low + high) / 2
+        low, high = (middle, high) if share(middle) <= 1 else (low, middle)
+    return low
