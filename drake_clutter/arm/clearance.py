@@ -41,7 +41,7 @@ class ClearanceScene:
         builder = DiagramBuilder()
         made = add_scene_plant(builder, objects, tray_side, 0.0, visuals=False)
         self.plant, self._bodies = made.plant, made.bodies
-        self._arm: Arm = add_arm(made.plant, config, camera_altitude, compliant=False)
+        self._arm: Arm = add_arm(made.plant, made.scene_graph, config, camera_altitude, compliant=False)
         made.plant.Finalize()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
@@ -53,13 +53,8 @@ class ClearanceScene:
         self._names = self._name_geometries()
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         self._fixed = (self.plant.world_body(), self.plant.GetBodyByName("tray"))
-        fixed = self._geometries(*self._fixed)
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
-        # Links that cannot meet, though their capsules do.
-        for first, second in (("base", "upper_arm"), ("wrist_1", "wrist_3")):
-            self._filters.Apply(CollisionFilterDeclaration().ExcludeBetween(self._of_arm(first), self._of_arm(second)))
-        self._filters.Apply(CollisionFilterDeclaration().ExcludeBetween(self._of_arm("base"), fixed))
         self._arm_names = frozenset(body.name() for body in self._arm.bodies)
         self._held: tuple[str, Floats] | None = None
         self._transient: list[object] = []

@@ -86,6 +86,7 @@ class Plan:
     Attributes:
         pick: the object's name; X_TO_pick, X_TO_place: where it is, and where it is let go.
         X_OG: (4, 4) the grasp.
+        mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
         phases: in order.
         attempts: grasps and branches that were looked at.
         seconds: that planning took.
@@ -95,6 +96,8 @@ class Plan:
     X_TO_pick: Pose
     X_TO_place: Pose
     X_OG: Floats
+    mass: float
+    p_GCm: tuple[float, float, float]
     phases: tuple[Phase, ...]
     attempts: int
     seconds: float
@@ -103,6 +106,10 @@ class Plan:
     def duration(self) -> float:
         """s, of the motion."""
         return sum(phase.duration for phase in self.phases)
+
+    def __deepcopy__(self, memo: object) -> "Plan":
+        """Itself: it never changes, and Drake copies abstract values again and again."""
+        return self
 
 
 @dataclass
@@ -392,7 +399,9 @@ class _Attempts:
                 return None
             phases = self._phases(grasp, X_OG, up, down, beside)
             if phases is not None:
-                return Plan(name, self._picked.X_TO, self._place, X_OG, phases, self.count, 0.0)
+                x, y, z = (float(v) for v in inverse(X_OG)[:3, 3])
+                ends = self._picked.X_TO, self._place
+                return Plan(name, *ends, X_OG, self._picked.object_class.mass, (x, y, z), phases, self.count, 0.0)
         return None
 
     def _phases(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, Sphere
+from pydrake.geometry import Box, CollisionFilterDeclaration, GeometrySet, SceneGraph, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
@@ -66,12 +66,15 @@ class Arm:
     cup: Frame
 
 
+_CLOSE = ("base", "upper_arm", "wrist_1", "wrist_3")
 _GREY = np.array([0.45, 0.46, 0.48, 1.0])
 _TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
 """Its upper surface is a millimetre below the tray's floor, which lies on it."""
 
 
-def add_arm(plant: MultibodyPlant, config: ArmConfig, camera_altitude: float, *, compliant: bool) -> Arm:
+def add_arm(
+    plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, camera_altitude: float, *, compliant: bool
+) -> Arm:
     """Adds pedestal, arm, tool, table and the camera's housing to a plant that is not finalized; `compliant`: see `epick_sdf`."""
     (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=compliant), "sdf")
@@ -88,6 +91,11 @@ def add_arm(plant: MultibodyPlant, config: ArmConfig, camera_altitude: float, *,
         plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
         if name == "pedestal":
             plant.RegisterVisualGeometry(world, X_TS, shape, name, _GREY)
+    # Links that cannot meet, though their capsules do; and the base stands on what it stands on.
+    of = {name: GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, robot))) for name in _CLOSE}
+    of["world"] = GeometrySet(plant.GetCollisionGeometriesForBody(world))
+    for first, second in (("base", "upper_arm"), ("wrist_1", "wrist_3"), ("base", "world")):
+        scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeBetween(of[first], of[second]))
     bodies = tuple(plant.get_body(index) for model in (robot, tool) for index in plant.GetBodyIndices(model))
     return Arm(robot, tool, bodies, flange, plant.GetFrameByName("cup", tool))
 

@@ -78,7 +78,13 @@ class ScenePlant:
 
 
 def add_scene_plant(
-    builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, time_step: float, *, visuals: bool
+    builder: DiagramBuilder,
+    objects: Sequence[tuple[str, ObjectClass]],
+    tray_side: float,
+    time_step: float,
+    *,
+    visuals: bool,
+    jointed: str = "",
 ) -> ScenePlant:
     """Adds a plant with the tray and the named objects to a diagram.
 
@@ -88,6 +94,7 @@ def add_scene_plant(
         tray_side: m, inner side of the tray.
         time_step: s; hydroelastic contact, lagged approximation, as DRAKE_NOTES found to be the truth.
         visuals: whether the textured meshes are read, for cameras and Meshcat; slow.
+        jointed: the name of an object that the caller gives a joint.
     """
     config = MultibodyPlantConfig(
         time_step=time_step, contact_model="hydroelastic_with_fallback", discrete_contact_approximation="lagged"
@@ -103,7 +110,7 @@ def add_scene_plant(
         else:
             (instance,) = parser.AddModelsFromString(physics_sdf(object_class.sdf_path), "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
-        if object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
+        if name != jointed and object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
             radius = object_class.size[0] / 2
             rolling_inertia = 1.5 * object_class.mass * radius**2  # of a solid cylinder about its line of contact
             plant.AddJoint(

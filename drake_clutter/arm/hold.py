@@ -1,0 +1,117 @@
+"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has then, and to let it go again.
+
+`JointHold` is a floating joint from the cup to the object that is locked. `HexapodHold` is six distance constraints, the legs of a
+Stewart platform, whose ends and lengths are set when it is switched on. docs/arm.md compares them.
+"""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import DistanceConstraintParams, MultibodyPlant
+from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
+from pydrake.systems.framework import Context
+
+from drake_clutter.arm.station import Arm
+from drake_clutter.arm.suction import GRAVITY
+
+Floats = NDArray[np.float64]
+
+
+class Hold(Protocol):
+    """Fixes one object, `body`, to the cup of an arm, or does not; made before the plant is finalized."""
+
+    def reset(self, context: Context) -> None:
+        """To be called once on every new context of the plant: nothing is held."""
+
+    def attach(self, context: Context) -> None:
+        """Holds the object where it is."""
+
+    def release(self, context: Context) -> None:
+        """Lets it go."""
+
+    def load(self, context: Context) -> tuple[Floats, Floats]:
+        """Force (3,) N and moment (3,) N m of the object on the lip of the cup, in G."""
+
+
+def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
+    """What the cup is loaded with besides its own weight, from the reaction in the bellows; in G."""
+    bellows = plant.GetJointByName("bellows", arm.tool)
+    reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
+    R_GT = arm.cup.CalcPoseInWorld(context).rotation().inverse()
+    weight = R_GT @ np.array([0.0, 0.0, -GRAVITY * plant.GetBodyByName("cup", arm.tool).default_mass()])
+    return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
+
+
+class JointHold:
+    """A floating joint between cup and object, locked while it holds; it takes the place of the object's joint to the world."""
+
+    def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
+        self._plant, self._arm = plant, arm
+        self._joint = plant.AddJoint(QuaternionFloatingJoint("hold", arm.cup, body.body_frame()))
+
+    def reset(self, context: Context) -> None:
+        """See `Hold`."""
+        self._joint.Unlock(context)
+
+    def put(self, context: Context, X_TO: RigidTransform) -> None:
+        """Puts the object at a pose."""
+        self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
+
+    def attach(self, context: Context) -> None:
+        """See `Hold`."""
+        velocities, start = self._plant.GetVelocities(context), self._joint.velocity_start()
+        velocities[start : start + 6] = 0.0
+        self._plant.SetVelocities(context, velocities)
+        self._joint.Lock(context)
+
+    def release(self, context: Context) -> None:
+        """See `Hold`."""
+        self._joint.Unlock(context)
+
+    def load(self, context: Context) -> tuple[Floats, Floats]:
+        """See `Hold`."""
+        return _load_of_cup(self._plant, self._arm, context)
+
+
+_LEVER = 0.08
+"""m, size of the platforms; so large that forces and moments load the legs about equally."""
+_LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
+"""N/m and N s/m: rubber yields a little in every direction; were the legs stiff, the arm's tracking errors would tear at the seal."""
+_ANGLE = 2 * math.pi / 3
+_UPPER = np.array([[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)])
+_LOWER = np.array([[_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0] for k in (0, 1, 2)])
+_LEGS = [(_UPPER[k], _LOWER[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
+
+
+class HexapodHold:
+    """Six distance constraints between cup and object, from points above the lip to points around it."""
+
+    def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
+        self._plant, self._arm, self._body = plant, arm, body
+        self._cup = plant.GetBodyByName("cup", arm.tool)
+        self._legs = [plant.AddDistanceConstraint(self._cup, top, body, foot, 1.0) for top, foot in _LEGS]
+
+    def reset(self, context: Context) -> None:
+        """See `Hold`."""
+        self.release(context)
+
+    def attach(self, context: Context) -> None:
+        """See `Hold`."""
+        X_OG = self._body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
+        for leg, (top, foot) in zip(self._legs, _LEGS, strict=True):
+            ends = self._cup.index(), top, self._body.index(), X_OG @ foot
+            params = DistanceConstraintParams(*ends, float(np.linalg.norm(top - foot)), _LEG_STIFFNESS, _LEG_DAMPING)
+            self._plant.SetDistanceConstraintParams(context, leg, params)
+            self._plant.SetConstraintActiveStatus(context, leg, True)
+
+    def release(self, context: Context) -> None:
+        """See `Hold`."""
+        for leg in self._legs:
+            self._plant.SetConstraintActiveStatus(context, leg, False)
+
+    def load(self, context: Context) -> tuple[Floats, Floats]:
+        """See `Hold`."""
+        return _load_of_cup(self._plant, self._arm, context)

@@ -1,0 +1,167 @@
+"""Carrying out plans in a running diagram."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_clutter.arm.paths import Payload, dynamics_plant
+from drake_clutter.arm.planner import Plan
+from drake_clutter.arm.station import ArmConfig
+
+Floats = NDArray[np.float64]
+
+DWELL = 0.15
+"""s, that the arm waits for the vacuum to build up, and to be gone (EPick: about that with a small cup)."""
+PERIOD = 0.01
+"""s, of the looks for a new plan, and of the samples of reference and feed-forward torque."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A plan as it is run: over the time since it began.
+
+    Attributes:
+        reference: (12,) rad and rad/s. torque: (6,) N m, feed-forward.
+        suction_on, suction_off, end: s.
+        starts: name and start, s, of each phase and dwell.
+    """
+
+    reference: PiecewisePolynomial
+    torque: PiecewisePolynomial
+    suction_on: float
+    suction_off: float
+    end: float
+    starts: tuple[tuple[str, float], ...]
+
+    def phase(self, time: float) -> str:
+        """What is done at a time, s; `idle` afterwards."""
+        return "idle" if time >= self.end else [name for name, start in self.starts if start <= time + 1e-9][-1]
+
+
+def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
+    """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take."""
+    approach, carry, retreat = plan.phases
+    mass, p_GCm = plan.mass, plan.p_GCm
+    starts, q_parts, t_parts, torque_parts, time = [], [], [], [], 0.0
+    empty, loaded = Payload(), Payload(mass, p_GCm)
+    for name, phase, payload in (
+        ("approach", approach, empty),
+        ("grasp", None, empty),
+        ("carry", carry, loaded),
+        ("release", None, loaded),
+        ("retreat", retreat, empty),
+    ):
+        starts.append((name, time))
+        duration = phase.duration if phase else DWELL
+        times = np.linspace(0.0, duration, max(2, round(duration / PERIOD) + 1))
+        if phase:
+            q = np.array([phase.trajectory.value(t).ravel() for t in times])
+            v = np.array([phase.trajectory.EvalDerivative(t, 1).ravel() for t in times])
+            a = np.array([phase.trajectory.EvalDerivative(t, 2).ravel() for t in times])
+        else:
+            q, v, a = np.repeat(q_parts[-1][-1:], len(times), axis=0), np.zeros((len(times), 6)), np.zeros((len(times), 6))
+        q_parts.append(q)
+        t_parts.append(time + times)
+        torque_parts.append(np.column_stack([v, torques(dynamics_plant(config, payload), q, v, a)]))
+        time += duration
+    on, off = starts[1][1], starts[3][1]
+    # Neighbouring parts share a time: the later sample is left a moment later.
+    t = np.concatenate([part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)])
+    q, more = np.vstack(q_parts), np.vstack(torque_parts)
+    reference = PiecewisePolynomial.FirstOrderHold(t, np.column_stack([q, more[:, :6]]).T)
+    return Schedule(reference, PiecewisePolynomial.FirstOrderHold(t, more[:, 6:].T), on, off, time, tuple(starts))
+
+
+def torques(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
+    """(n, 6) N m, that motions (n, 6) each, take."""
+    context, found = plant.CreateDefaultContext(), np.empty_like(q)
+    for k in range(len(q)):
+        plant.SetPositions(context, q[k])
+        plant.SetVelocities(context, v[k])
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        found[k] = plant.CalcInverseDynamics(context, a[k], forces)
+    return found
+
+
+@dataclass(frozen=True)
+class _Running:
+    """What is being carried out: the plan, its schedule, and when it began, s."""
+
+    plan: Plan | None = None
+    schedule: Schedule | None = None
+    begun: float = 0.0
+
+    def __deepcopy__(self, memo: object) -> "_Running":
+        """Itself, as of `Plan`."""
+        return self
+
+
+class PickPlaceExecutor(LeafSystem):
+    """Runs one plan after the other.
+
+    Input port: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended.
+    Output ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m; suction (1,), 1 for on; status, abstract, the phase.
+    """
+
+    def __init__(self, *, config: ArmConfig) -> None:
+        """Begins at home, with nothing to do."""
+        super().__init__()
+        self._config = config
+        self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(_Running()))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
+        self.DeclareVectorOutputPort("desired_state", 12, self._calc_desired_state)
+        self.DeclareVectorOutputPort("feed_forward", 6, self._calc_feed_forward)
+        self.DeclareVectorOutputPort("suction", 1, self._calc_suction)
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status)
+
+    @staticmethod
+    def AddToBuilder(builder: DiagramBuilder, *, config: ArmConfig) -> "PickPlaceExecutor":
+        """Adds one."""
+        system = builder.AddSystem(PickPlaceExecutor(config=config))
+        system.set_name("pick_place_executor")
+        return system
+
+    def _update(self, context: Context, state: State) -> EventStatus:
+        running: _Running = context.get_abstract_state(self._state).get_value()
+        plan = self._plan_port.Eval(context) if self._plan_port.HasValue(context) else None
+        over = running.schedule is None or context.get_time() >= running.begun + running.schedule.end
+        if plan is not None and plan is not running.plan and over:
+            begun = _Running(plan, scheduled(plan, self._config), context.get_time())
+            state.get_mutable_abstract_state(int(self._state)).set_value(begun)
+        return EventStatus.Succeeded()
+
+    def _now(self, context: Context) -> tuple[Schedule | None, float]:
+        running: _Running = context.get_abstract_state(self._state).get_value()
+        if running.schedule is None:
+            return None, 0.0
+        return running.schedule, min(context.get_time() - running.begun, running.schedule.end)
+
+    def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
+        schedule, time = self._now(context)
+        rest = np.concatenate([self._config.home, np.zeros(6)])
+        output.SetFromVector(rest if schedule is None else schedule.reference.value(time).ravel())
+
+    def _calc_feed_forward(self, context: Context, output: BasicVector) -> None:
+        schedule, time = self._now(context)
+        if schedule is None:
+            home = np.array(self._config.home)[None]
+            output.SetFromVector(torques(dynamics_plant(self._config, Payload()), home, 0 * home, 0 * home)[0])
+        else:
+            output.SetFromVector(schedule.torque.value(time).ravel())
+
+    def _calc_suction(self, context: Context, output: BasicVector) -> None:
+        schedule, time = self._now(context)
+        output.SetFromVector([float(schedule is not None and schedule.suction_on <= time < schedule.suction_off)])
+
+    def _calc_status(self, context: Context, output: AbstractValue) -> None:
+        schedule, time = self._now(context)
+        output.set_value("idle" if schedule is None else schedule.phase(time))
