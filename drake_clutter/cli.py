@@ -46,6 +46,7 @@ class Fidelity(Enum):
 
     FAST = "fast"
     SETTLE = "settle"
+    ARM = "arm"
 
 
 class Format(Enum):
@@ -77,7 +78,10 @@ RayOption = Annotated[
 ]
 FidelityOption = Annotated[
     Fidelity,
-    typer.Option(help="Objects are teleported; settle: Drake settles what a move touched; fast: by equilibrium, Drake in doubt."),
+    typer.Option(
+        help="arm: the UR10 carries every move out. Else objects are teleported; settle: Drake settles what a move touched; "
+        "fast: by equilibrium, Drake in doubt."
+    ),
 ]
 NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
 
@@ -119,7 +123,8 @@ def _load(scene: Path, catalogue: Path | None) -> "SceneFile":
 
 def _report(step: "Step") -> None:
     found = f", found {', '.join(step.newly_found)}" if step.newly_found else ""
-    why = f" ({step.outcome.instability})" if step.outcome.instability else ""
+    reasons = [str(reason) for reason in (step.outcome.instability, step.outcome.detail) if reason]
+    why = f" ({'; '.join(reasons)})" if reasons else ""
     _err.print(f"{step.move}: {step.outcome.result.value}{why}{found}", highlight=False)
 
 

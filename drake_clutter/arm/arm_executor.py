@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,29 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
 from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
-from drake_clutter.arm.pick_place import PickPlaceExecutor, scheduled
-from drake_clutter.arm.planner import Plan
+from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
+from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlannerConfig
 from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
-from drake_clutter.scenes.seams import Frame
+from drake_clutter.scenes.seams import Frame, Instability, Move, MoveResult, Observation, Outcome
+from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle import fallen, settle
 
 Floats = NDArray[np.float64]
 
 NEAR = 0.02
 """m; objects closer than that to where something is picked or put take part, with all that they touch."""
-SETTLE_TIME = 0.5
+SETTLE_TIME = 0.3
 """s, that is simulated after the arm is home."""
+UNTOUCHED = 1e-4
+"""m; what moved less is not settled again."""
+LOOK = 0.025
+"""s, between two looks at what takes part."""
+AHEAD, LIFTED = 0.1, 0.3
+"""s, before a contact, and after it, for which the objects around are free to move."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +64,42 @@ class Carried:
     time: float
     motion: tuple[Frame, ...] = field(repr=False, default=())
 
+    def __str__(self) -> str:
+        if not self.sealed:
+            return "the cup did not seal"
+        if not math.isnan(self.dropped):
+            return f"came off the cup after {self.dropped:.2f} s"
+        return f"{1000 * self.place_error:.1f} mm and {math.degrees(self.turn_error):.1f} deg from where it was to be"
 
-def taking_part(objects: Sequence[SceneObject], plan: Plan) -> set[str]:
-    """The names of the objects that the move may disturb: the stacks that it takes from, puts on, or comes close to."""
+
+def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], set[str]]:
+    """The names of what picking, and of what placing may disturb: the stacks that are taken from, put on, or come close to."""
     picked = next(o for o in objects if o.name == plan.pick)
-    placed = SceneObject("", picked.object_class, plan.X_TO_place)
-    found = {plan.pick}
-    for group in touching_groups(objects, 0.003):
-        if any(len(touching_groups([end, o], NEAR)) == 1 for end in (picked, placed) for o in group):
-            found |= {o.name for o in group}
-    return found
+    placed = replace(picked, X_TO=plan.X_TO_place)
+    groups = touching_groups(objects, TOUCHING_MARGIN)
+
+    def near(end: SceneObject) -> set[str]:
+        close = [g for g in groups if any(o.name != end.name and len(touching_groups([end, o], NEAR)) == 1 for o in g)]
+        return {o.name for g in close for o in g}
+
+    return near(picked), near(placed)
 
 
 class ArmSimulation:
-    """One plan among objects, in Drake."""
+    """One plan among objects, in Drake. What takes no part at a time is locked then."""
+
+    AT_REST = 0.002
+    """m/s."""
 
     def __init__(
-        self, config: ArmConfig, scene: Scene, plan: Plan, *, camera_altitude: float, time_step: float = 0.005, visuals: bool = False
+        self,
+        config: ArmConfig,
+        scene: Scene,
+        plan: Plan,
+        *,
+        camera_altitude: float,
+        time_step: float = 0.005,
+        visuals: bool = False,
     ) -> None:
         """Builds the diagram."""
         self.config, self._objects, self._plan, self._time_step = config, scene.objects, plan, time_step
@@ -102,21 +131,37 @@ class ArmSimulation:
 
     def run(self, *, record: bool = False) -> Carried:
         """Simulates until the arm is home again and all has come to rest."""
-        root = self.simulator.get_mutable_context()
-        context = self.station.plant_context(root)
-        self.station.set_scene(root, np.array(self.config.home), self._objects)
-        part = taking_part(self._objects, self._plan)
-        self.station.lock(root, [o.name for o in self._objects if o.name not in part])
+        root, station = self.simulator.get_mutable_context(), self.station
+        context, desired = station.plant_context(root), self.executor.GetOutputPort("desired_state")
+        station.set_scene(root, np.array(self.config.home), self._objects)
         self.simulator.set_monitor(self.vacuum)
+        schedule = scheduled(self._plan, self.config)
+        beside_pick, beside_place = disturbed_by(self._objects, self._plan)
+        motion, tracking, free = list[Frame](), 0.0, set[str]()
+        station.lock_all_but(root, free)
         self.simulator.Initialize()
-        end = scheduled(self._plan, self.config).end + SETTLE_TIME
-        motion, tracking = list[Frame](), 0.0
-        for k in range(1, math.ceil(end / 0.025) + 1):
-            self.simulator.AdvanceTo(k * 0.025 + self._time_step / 2)
-            wanted = self.executor.GetOutputPort("desired_state").Eval(self.executor.GetMyContextFromRoot(root))[:6]
-            tracking = max(tracking, float(np.abs(wanted - self.station.joint_angles(context)).max()))
+        for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
+            time = root.get_time()
+            wanted = set[str]()
+            if schedule.suction_on - AHEAD <= time:
+                wanted |= {self._plan.pick}
+            if schedule.suction_on - AHEAD <= time <= schedule.suction_on + DWELL + LIFTED:
+                wanted |= beside_pick
+            if schedule.suction_off - AHEAD <= time <= schedule.suction_off + DWELL + LIFTED:
+                wanted |= beside_place
+            # What still moves stays free.
+            speeds = station.scene.speeds(context)
+            wanted |= {name for name in free if speeds[name] > self.AT_REST}
+            if not math.isnan(self.vacuum.dropped) or not (self.vacuum.sealed or time < schedule.suction_on + LOOK):
+                wanted = set(speeds)  # what falls may hit anything
+            if wanted != free:
+                station.lock_all_but(root, wanted)
+                free = wanted
+            self.simulator.AdvanceTo(k * LOOK + self._time_step / 2)
+            now = desired.Eval(self.executor.GetMyContextFromRoot(root))[:6]
+            tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))
             if record:
-                motion.append(Frame(root.get_time(), self.station.scene.poses(context)))
+                motion.append(Frame(root.get_time(), station.scene.poses(context)))
         return self._judged(context, tracking, tuple(motion))
 
     def _judged(self, context: Context, tracking: float, motion: tuple[Frame, ...]) -> Carried:
@@ -134,3 +179,68 @@ class ArmSimulation:
             context.get_time(),
             motion,
         )
+
+
+class ArmExecutor:
+    """Carries out a move at fidelity `arm` (a `MoveExecutor`): planned, simulated through the whole trajectory, and judged.
+
+    The motion is simulated in steps of 5 ms; what it touched is then settled as the judge settles. A scene has collapsed when any
+    object but the picked one has moved or turned past the limits, or the picked one past them from where it was let go.
+    """
+
+    def __init__(
+        self,
+        config: ClutterConfig,
+        *,
+        follow_falls: bool = True,
+        arm: ArmConfig | None = None,
+        planner: PlannerConfig | None = None,
+    ) -> None:
+        """Makes an executor; `follow_falls` changes nothing, falls are part of the simulation."""
+        self._config, self._arm = config, arm or ArmConfig()
+        self._planner_config = planner or PlannerConfig()
+        self._planner: PickPlacePlanner | None = None
+
+    def plan(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Plan | NoPlan | None:
+        """The plan for a move, or why there is none; None if no place is known to be free."""
+        X_TO = choose_placement(observation, move, self._config.exploration, rng)
+        if X_TO is None:
+            return None
+        if self._planner is None:
+            altitude = self._config.camera.altitude
+            self._planner = PickPlacePlanner(self._arm, self._planner_config, scene.tray_side, altitude)
+        return self._planner.plan(scene.objects, move.pick, X_TO)
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        """See `MoveExecutor.execute`."""
+        plan = self.plan(scene, observation, move, rng)
+        if plan is None:
+            return Outcome(MoveResult.NO_FREE_SPOT, scene)
+        if isinstance(plan, NoPlan):
+            return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
+        simulation = ArmSimulation(self._arm, scene, plan, camera_altitude=self._config.camera.altitude)
+        carried = simulation.run(record=True)
+        after = scene.at(carried.poses)
+        wanted = scene.at({move.pick: plan.X_TO_place})
+        detail, settle_config = str(carried), self._config.settle
+        came_off = not carried.sealed or not math.isnan(carried.dropped)
+        others = [o for o in wanted.objects if o.name != move.pick or not came_off]
+        instability = worst_fall(others, after, settle_config)
+        if instability is None and not came_off:
+            moved = {n for n, distance in carried.displaced.items() if distance > UNTOUCHED} | {move.pick}
+            for group in touching_groups(after.objects, TOUCHING_MARGIN):
+                if moved.isdisjoint(o.name for o in group):
+                    continue
+                settled = settle(group, scene.tray_side, settle_config)
+                after = after.at(settled.poses)
+            instability = worst_fall(others, after, settle_config)
+        if instability is not None:
+            return Outcome(MoveResult.COLLAPSED, after, instability, carried.motion, detail=detail)
+        result = MoveResult.DROPPED if came_off else MoveResult.PLACED
+        return Outcome(result, after, None, carried.motion, detail=detail)
+
+
+def worst_fall(before: Sequence[SceneObject], after: Scene, config: SettleConfig) -> Instability | None:
+    """Of the objects that did not stay where they were, the one that went furthest."""
+    found = [fall for o in before if (fall := fallen(o, after[o.name].X_TO, after.tray_side, config))]
+    return max(found, key=lambda fall: fall.displacement, default=None)

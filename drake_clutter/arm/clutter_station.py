@@ -5,12 +5,12 @@ monitor.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
+from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
@@ -61,6 +61,10 @@ class ClutterStation(Diagram):
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
         self.hold = hold(plant, self.arm, self.scene.bodies[pick])
         plant.Finalize()
+        bodies = self.scene.bodies.items()
+        lockable = [(n, b) for n, b in bodies if n != jointed]
+        self._joints = {n: plant.get_joint(i) for n, b in lockable for i in plant.GetJointIndices(b.model_instance())}
+        self._locked_filter: FilterId | None = None
         self._q_at, self._v_at = joint_numbers(plant, self.arm)
         ports = (("desired_state", plant.get_desired_state_input_port), ("feed_forward", plant.get_actuation_input_port))
         for name, port in ports:
@@ -91,24 +95,35 @@ class ClutterStation(Diagram):
         """(6,) rad, from the plant's context."""
         return np.asarray(self.plant.GetPositions(context)[self._q_at])
 
-    def lock(self, root: Context, names: Sequence[str]) -> None:
-        """Makes objects immovable that take no part; they must be at rest.
+    def lock_all_but(self, root: Context, free: Set[str]) -> None:
+        """Makes all objects immovable but some. Those that were free must be at rest: what is locked stands still.
 
         What is locked no longer collides with the tray or with other locked objects: Drake crashes where it would penetrate them.
         """
-        if not names:
-            return
         context = self.plant_context(root)
         locked, fixed = GeometrySet(), GeometrySet()
-        for name in names:
-            locked.Add(self.plant.GetCollisionGeometriesForBody(self.scene.bodies[name]))
         for body in (self.plant.world_body(), self.plant.GetBodyByName("tray")):
             fixed.Add(self.plant.GetCollisionGeometriesForBody(body))
-        manager = self.scene.scene_graph.collision_filter_manager(self.scene.scene_graph.GetMyMutableContextFromRoot(root))
-        manager.ApplyTransient(CollisionFilterDeclaration().ExcludeBetween(locked, fixed).ExcludeWithin(locked))
-        for name in names:
-            (index,) = (i for i in self.plant.GetJointIndices(self.scene.bodies[name].model_instance()))
-            self.plant.get_joint(index).Lock(context)
+        for name, joint in self._joints.items():
+            if name in free:
+                continue
+            locked.Add(self.plant.GetCollisionGeometriesForBody(self.scene.bodies[name]))
+            if not joint.is_locked(context):
+                velocities, start = self.plant.GetVelocities(context), joint.velocity_start()
+                velocities[start : start + 6] = 0.0
+                self.plant.SetVelocities(context, velocities)
+                joint.Lock(context)
+        scene_graph = self.scene.scene_graph
+        manager = scene_graph.collision_filter_manager(scene_graph.GetMyMutableContextFromRoot(root))
+        before = self._locked_filter
+        self._locked_filter = manager.ApplyTransient(
+            CollisionFilterDeclaration().ExcludeBetween(locked, fixed).ExcludeWithin(locked)
+        )
+        if before is not None:
+            manager.RemoveDeclaration(before)
+        for name in free & self._joints.keys():
+            if self._joints[name].is_locked(context):
+                self._joints[name].Unlock(context)
 
 
 @dataclass
@@ -121,6 +136,7 @@ class Vacuum:
         held: whether the object hangs on the cup; sealed: whether it ever did; dropped: when it came off by its load, s.
         largest_share: of what the cup can bear, so far.
         overloaded: steps in a row.
+        slip: m, between cup and object from when it was taken to when it was let go.
     """
 
     station: ClutterStation
@@ -130,6 +146,7 @@ class Vacuum:
     dropped: float = math.nan
     largest_share: float = 0.0
     overloaded: int = 0
+    slip: float = math.nan
 
     def __call__(self, root: Context) -> EventStatus:
         """The monitor."""
@@ -137,12 +154,11 @@ class Vacuum:
         context = station.plant_context(root)
         wanted = self.wanted(root)
         if wanted and not self.held and math.isnan(self.dropped):
-            X_TG = station.arm.cup.CalcPoseInWorld(context)
-            X_TO = station.scene.bodies[station.pick].EvalPoseInWorld(context)
-            X_OG = (X_TO.inverse() @ X_TG).GetAsMatrix4()
+            X_OG = self._grasp(context)
             config = station.config.suction
             if unevenness(station.classes[station.pick], X_OG, config.cup_diameter) <= config.unevenness:
                 station.hold.attach(context)
+                self._X_OG = X_OG
                 self.held = self.sealed = True
         elif self.held and not wanted:
             self._release(context)
@@ -155,6 +171,13 @@ class Vacuum:
                 self._release(context)
         return EventStatus.DidNothing()
 
+    def _grasp(self, context: Context) -> Floats:
+        """X_OG, (4, 4)."""
+        X_TG = self.station.arm.cup.CalcPoseInWorld(context)
+        X_TO = self.station.scene.bodies[self.station.pick].EvalPoseInWorld(context)
+        return np.asarray((X_TO.inverse() @ X_TG).GetAsMatrix4())
+
     def _release(self, context: Context) -> None:
+        self.slip = float(np.linalg.norm(self._grasp(context)[:3, 3] - self._X_OG[:3, 3]))
         self.station.hold.release(context)
         self.held = False

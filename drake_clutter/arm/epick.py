@@ -1,7 +1,7 @@
 """The EPick vacuum gripper with tube and cup as a model; `models/epick.sdf` is what `epick_sdf` writes for the default cup.
 
-Frames: F the flange that it is screwed to, z out of the arm; G the cup, see `suction`. Sources: see `suction`; masses of tube and cup
-are ours.
+Frames: F the flange that it is screwed to, z out of the arm; G the cup, see `suction`. Sources: see `suction`; the masses of tube
+and cup are ours.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has then, and to let it go again.
+"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has, and to let it go.
 
 `JointHold` is a floating joint from the cup to the object that is locked. `HexapodHold` is six distance constraints, the legs of a
-Stewart platform, whose ends and lengths are set when it is switched on. docs/arm.md compares them.
+Stewart platform, whose feet are set when it is switched on. docs/arm.md compares them.
 """
 
 import math
@@ -79,7 +79,7 @@ class JointHold:
 _LEVER = 0.08
 """m, size of the platforms; so large that forces and moments load the legs about equally."""
 _LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
-"""N/m and N s/m: rubber yields a little in every direction; were the legs stiff, the arm's tracking errors would tear at the seal."""
+"""N/m and N s/m: rubber yields a little in every direction; stiff legs would tear at the seal with every tracking error."""
 _ANGLE = 2 * math.pi / 3
 _UPPER = np.array([[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)])
 _LOWER = np.array([[_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0] for k in (0, 1, 2)])

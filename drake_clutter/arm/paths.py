@@ -104,7 +104,7 @@ def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
 
 
 def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
-    """The path as fast as velocity, acceleration, torque and the cup's hold allow (Pham and Pham 2018, "TOPP-RA"); None if it cannot be."""
+    """The path as fast as velocity, acceleration, torque and the cup's hold allow (Pham and Pham 2018, "TOPP-RA"), or None."""
     plant = dynamics_plant(config, payload)
     grid = np.linspace(path.start_time(), path.end_time(), _GRID)
     toppra = Toppra(path, plant, grid)

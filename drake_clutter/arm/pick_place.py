@@ -48,7 +48,8 @@ def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
     """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take."""
     approach, carry, retreat = plan.phases
     mass, p_GCm = plan.mass, plan.p_GCm
-    starts, q_parts, t_parts, torque_parts, time = [], [], [], [], 0.0
+    q_parts, t_parts, torque_parts = list[Floats](), list[Floats](), list[Floats]()
+    starts, time = list[tuple[str, float]](), 0.0
     empty, loaded = Payload(), Payload(mass, p_GCm)
     for name, phase, payload in (
         ("approach", approach, empty),
@@ -126,7 +127,7 @@ class PickPlaceExecutor(LeafSystem):
     @staticmethod
     def AddToBuilder(builder: DiagramBuilder, *, config: ArmConfig) -> "PickPlaceExecutor":
         """Adds one."""
-        system = builder.AddSystem(PickPlaceExecutor(config=config))
+        system: PickPlaceExecutor = builder.AddSystem(PickPlaceExecutor(config=config))
         system.set_name("pick_place_executor")
         return system
 

@@ -1,6 +1,6 @@
 """Plans of one move: grasp, way and timing, or the reason why there is none.
 
-Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object. A move is three paths that begin and end at rest:
+Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object. A move is three paths between rests:
 `approach` from home to the grasp, `carry` from there to where the object is let go, `retreat` back home.
 """
 
@@ -166,7 +166,7 @@ def _downwards(yaw: float, p_TG: Floats) -> Floats:
     """(4, 4) X_TG of a cup that points down."""
     c, s = math.cos(yaw), math.sin(yaw)
     X = np.eye(4)
-    X[:3, :3] = [[c, s, 0], [s, -c, 0], [0, 0, -1]]
+    X[:3, :3] = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
     X[:3, 3] = p_TG
     return X
 

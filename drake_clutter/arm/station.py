@@ -72,9 +72,7 @@ _TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
 """Its upper surface is a millimetre below the tray's floor, which lies on it."""
 
 
-def add_arm(
-    plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, camera_altitude: float, *, compliant: bool
-) -> Arm:
+def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, camera_altitude: float, *, compliant: bool) -> Arm:
     """Adds pedestal, arm, tool, table and the camera's housing to a plant that is not finalized; `compliant`: see `epick_sdf`."""
     (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=compliant), "sdf")

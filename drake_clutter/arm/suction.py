@@ -76,7 +76,7 @@ def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
 
 
 def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
-    """How far, in m, the surface under the cup's lip leaves a plane at right angles to the cup; infinite if part of the lip meets nothing.
+    """How far, in m, the surface under the lip leaves a plane at right angles to the cup; infinite if the lip is partly in the air.
 
     Tilt, curvature, edges and gaps all show as this one number.
 
@@ -87,7 +87,7 @@ def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> floa
     """
     angle = np.arange(_RING) * (2 * np.pi / _RING)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_RING)]) * diameter / 2
-    p = (ring + [0.0, 0.0, -_STANDOFF]) @ X_OG[:3, :3].T + X_OG[:3, 3]
+    p = (ring - np.array([0.0, 0.0, _STANDOFF])) @ X_OG[:3, :3].T + X_OG[:3, 3]
     along = X_OG[:3, 2]
     depth = np.full(_RING, np.inf)
     for half_spaces in _half_spaces(object_class):
@@ -141,7 +141,7 @@ def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floa
 
 
 def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> float:
-    """m/s^2, with which a cup that points down may move a body in any direction, safety included; negative: it cannot even hold it.
+    """m/s^2, with which a cup that points down may move a body in any direction, safety included; negative if it cannot hold it.
 
     Args:
         mass: kg.

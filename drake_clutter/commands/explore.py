@@ -112,6 +112,7 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
                 "move": {"pick": step.move.pick, "place": step.move.place},
                 "outcome": step.outcome.result.value,
                 "instability": str(instability) if instability else None,
+                "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
                 "visible_share": step.look.visible_share,
                 "reward": step.reward,

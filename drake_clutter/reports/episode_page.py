@@ -32,7 +32,7 @@ _LEGEND = {
     Mark.IN_VIEW: "in view, with the number of its name",
 }
 _DASHED = (Mark.HIDDEN, Mark.COVERED)
-_BADGES = {MoveResult.PLACED: "good", MoveResult.COLLAPSED: "bad"}
+_BADGES = {MoveResult.PLACED: "good", MoveResult.COLLAPSED: "bad", MoveResult.DROPPED: "bad"}
 
 
 def write_episode_page(
@@ -114,7 +114,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         f"The tray from above before move {number}: {words}. Hidden: {_listed(unknown) or 'nothing'}.",
         "Before, with the move.",
     )
-    if outcome.result is not MoveResult.NO_FREE_SPOT:
+    if outcome.result.carried_out:
         still_unknown = tuple(name for name in unknown if name not in step.newly_found)
         after = Marks(
             hidden=still_unknown,
@@ -135,6 +135,8 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
     notes.append(f"Reward {step.reward:+g}.")
     if outcome.instability:
         notes.append(f"{escape(_fall_in_words(outcome.instability))}.")
+    if outcome.detail:
+        notes.append(f"{escape(outcome.detail)}.")
     badge = f'<span class="badge {_BADGES.get(outcome.result, "")}">{escape(outcome.result.value)}</span>'
     threshold = look.observation.camera.hidden_below
     return (
@@ -147,7 +149,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
 
 def _place(scene: Scene, step: Step) -> Pose | None:
     """Where the picked object was let go; of a move that was not carried out, above the object it was meant for."""
-    if step.outcome.result is not MoveResult.NO_FREE_SPOT:
+    if step.outcome.result.carried_out:
         motion = step.outcome.motion
         released = motion[0].poses.get(step.move.pick) if motion else None
         return released or step.outcome.scene[step.move.pick].X_TO

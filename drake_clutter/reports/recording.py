@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drake_clutter.files import write_text
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.seams import Frame, MoveResult
+from drake_clutter.scenes.seams import Frame
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 from drake_clutter.tasks.exploration import Step
 
@@ -58,7 +58,7 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
     frames = [Frame(0.0, dict(poses))]
     scene = start
     for step in steps:
-        if step.outcome.result not in (MoveResult.PLACED, MoveResult.COLLAPSED):
+        if not step.outcome.result.carried_out:
             continue
         pick, motion = step.move.pick, step.outcome.motion
         released = motion[0].poses.get(pick) if motion else None

@@ -131,6 +131,13 @@ class MoveResult(Enum):
     COLLAPSED = "collapsed"
     NO_FREE_SPOT = "no free spot"
     CANNOT_JUDGE = "cannot be judged"
+    NOT_PLANNED = "not planned"
+    DROPPED = "dropped"
+
+    @property
+    def carried_out(self) -> bool:
+        """Whether anything was moved."""
+        return self in (MoveResult.PLACED, MoveResult.COLLAPSED, MoveResult.DROPPED)
 
 
 @dataclass(frozen=True)
@@ -151,11 +158,12 @@ class Outcome:
     """What a move led to.
 
     Attributes:
-        result: placed, collapsed, or why it could not be carried out.
+        result: placed, collapsed, dropped on the way, or why it could not be carried out.
         scene: the scene afterwards; the scene before, if the move could not be carried out.
         instability: what did not stay, when it collapsed.
         motion: the objects' motion, for pictures.
         cannot_judge: what is beyond the executor's model, when that is the result.
+        detail: in words, why no plan was found, or how well it was carried out.
     """
 
     result: MoveResult
@@ -163,6 +171,7 @@ class Outcome:
     instability: Instability | None = None
     motion: tuple[Frame, ...] = ()
     cannot_judge: CannotJudge | None = None
+    detail: str = ""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ class Settled:
     motion: tuple[Frame, ...]
 
 
-def _fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleConfig) -> Instability | None:
+def fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleConfig) -> Instability | None:
+    """How an object has fallen that was before, and is now; None if it stayed within the limits."""
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
     x, y, z = after.translation
@@ -92,8 +93,8 @@ def settle(
             motion.append(Frame(sample * SAMPLE_PERIOD, poses))
         # Every second time: by then what topples has turned so far that it is not taken for something that slides.
         if instability is None and (sample % 2 == 0 or sample == last):
-            fallen = [found for o in objects if (found := _fallen(o, poses[o.name], tray_side, config)) is not None]
-            instability = max(fallen, key=lambda f: f.displacement, default=None)
+            gone = [found for o in objects if (found := fallen(o, poses[o.name], tray_side, config)) is not None]
+            instability = max(gone, key=lambda f: f.displacement, default=None)
             if instability is not None and not follow_falls:
                 return Settled(instability, poses, tuple(motion))
         reference = history[-2] if instability else history[0]

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from drake_clutter.arm.arm_executor import ArmExecutor
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector, Look
 from drake_clutter.scenes.scene import TRAY, Scene
@@ -21,7 +22,7 @@ class ExecutorMaker(Protocol):
         """`follow_falls`: whether to simulate what a collapse, which ends the episode, does to the whole scene."""
 
 
-EXECUTORS: dict[str, ExecutorMaker] = {"fast": FastOrDrakeExecutor, "settle": SettleExecutor}
+EXECUTORS: dict[str, ExecutorMaker] = {"fast": FastOrDrakeExecutor, "settle": SettleExecutor, "arm": ArmExecutor}
 """How moves are carried out, by the name of the fidelity."""
 
 
@@ -106,7 +107,7 @@ class ExplorationTask:
         outcome = self._executor.execute(self.scene, self.look.observation, move, rng)
         collapsed = outcome.result is MoveResult.COLLAPSED
         self.scene = outcome.scene
-        if outcome.result is not MoveResult.NO_FREE_SPOT:
+        if outcome.result.carried_out:
             self.look = self._detector.look(self.scene)
         seen = {d.name for d in self.look.observation.detections}
         newly = () if collapsed else tuple(name for name in self.scene.names if name in seen and name not in self.known)
