@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
 from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
+from drake_clutter.arm.hold import HexapodHold, HoldMaker
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
 from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlannerConfig
 from drake_clutter.arm.station import ArmConfig
@@ -45,7 +46,7 @@ class Carried:
         poses: X_TO by name, at the end.
         sealed: whether the cup sealed.
         dropped: s, when the object came off by its load; NaN if it did not.
-        largest_share: of what the cup can bear.
+        largest_share: of what the cup can bear. slip: m, between cup and object.
         place_error: m, and turn_error: rad, of where the object came to lie from where it was to be let go; heights left out.
         displaced: m, by name, how far each other object was moved.
         tracking: rad, largest error of a joint.
@@ -57,6 +58,7 @@ class Carried:
     sealed: bool
     dropped: float
     largest_share: float
+    slip: float
     place_error: float
     turn_error: float
     displaced: dict[str, float]
@@ -99,7 +101,7 @@ class ArmSimulation:
         *,
         camera_altitude: float,
         time_step: float = 0.005,
-        visuals: bool = False,
+        hold: HoldMaker = HexapodHold,
     ) -> None:
         """Builds the diagram."""
         self.config, self._objects, self._plan, self._time_step = config, scene.objects, plan, time_step
@@ -113,7 +115,7 @@ class ArmSimulation:
                 tray_side=scene.tray_side,
                 camera_altitude=camera_altitude,
                 time_step=time_step,
-                visuals=visuals,
+                hold=hold,
             )
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=config)
@@ -168,16 +170,17 @@ class ArmSimulation:
         poses = self.station.scene.poses(context)
         at, wanted, objects = poses[self._plan.pick], self._plan.X_TO_place, {o.name: o for o in self._objects}
         return Carried(
-            poses,
-            self.vacuum.sealed,
-            self.vacuum.dropped,
-            self.vacuum.largest_share,
-            float(np.linalg.norm((at.p - wanted.p)[:2])),
-            tilt_between(objects[self._plan.pick].object_class, wanted, at),
-            {n: float(np.linalg.norm(poses[n].p - o.X_TO.p)) for n, o in objects.items() if n != self._plan.pick},
-            tracking,
-            context.get_time(),
-            motion,
+            poses=poses,
+            sealed=self.vacuum.sealed,
+            dropped=self.vacuum.dropped,
+            largest_share=self.vacuum.largest_share,
+            slip=self.vacuum.slip,
+            place_error=float(np.linalg.norm((at.p - wanted.p)[:2])),
+            turn_error=tilt_between(objects[self._plan.pick].object_class, wanted, at),
+            displaced={n: float(np.linalg.norm(poses[n].p - o.X_TO.p)) for n, o in objects.items() if n != self._plan.pick},
+            tracking=tracking,
+            time=context.get_time(),
+            motion=motion,
         )
 
 
@@ -206,10 +209,13 @@ class ArmExecutor:
         X_TO = choose_placement(observation, move, self._config.exploration, rng)
         if X_TO is None:
             return None
-        if self._planner is None:
-            altitude = self._config.camera.altitude
-            self._planner = PickPlacePlanner(self._arm, self._planner_config, scene.tray_side, altitude)
-        return self._planner.plan(scene.objects, move.pick, X_TO)
+        return self.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
+
+    def planner(self, tray_side: float) -> PickPlacePlanner:
+        """For a tray; kept."""
+        if self._planner is None or self._planner.tray_side != tray_side:
+            self._planner = PickPlacePlanner(self._arm, self._planner_config, tray_side, self._config.camera.altitude)
+        return self._planner
 
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""

@@ -14,7 +14,7 @@ from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
-from drake_clutter.arm.hold import HexapodHold, JointHold
+from drake_clutter.arm.hold import HexapodHold, HoldMaker, JointHold
 from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.station import ArmConfig, add_arm, joint_numbers
 from drake_clutter.arm.suction import load_share, unevenness
@@ -47,7 +47,7 @@ class ClutterStation(Diagram):
         camera_altitude: float,
         time_step: float,
         visuals: bool = False,
-        hold: type[JointHold] | type[HexapodHold] = HexapodHold,
+        hold: HoldMaker = HexapodHold,
     ) -> None:
         """Builds it; objects are (name, class), `pick` the name of the one that the cup can take; `hold` how."""
         super().__init__()

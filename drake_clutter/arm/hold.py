@@ -1,7 +1,7 @@
-"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has, and to let it go.
+"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has then.
 
-`JointHold` is a floating joint from the cup to the object that is locked. `HexapodHold` is six distance constraints, the legs of a
-Stewart platform, whose feet are set when it is switched on. docs/arm.md compares them.
+`JointHold` is a floating joint from the cup to the object that is locked. `HexapodHold` is six distance constraints, the legs of
+a Stewart platform, whose feet are set when it is switched on. docs/arm.md compares them.
 """
 
 import math
@@ -115,3 +115,6 @@ class HexapodHold:
     def load(self, context: Context) -> tuple[Floats, Floats]:
         """See `Hold`."""
         return _load_of_cup(self._plant, self._arm, context)
+
+
+HoldMaker = type[JointHold] | type[HexapodHold]

@@ -189,7 +189,7 @@ class PickPlacePlanner:
 
     def __init__(self, config: ArmConfig, planner: PlannerConfig, tray_side: float, camera_altitude: float) -> None:
         self.config, self.planner = config, planner
-        self._tray_side, self._camera_altitude = tray_side, camera_altitude
+        self.tray_side, self._camera_altitude = tray_side, camera_altitude
         self._X_BT, self._X_GF = inverse(config.X_TB), inverse(config.X_FG)
         self._scenes: dict[tuple[tuple[str, ObjectClass], ...], ClearanceScene] = {}
 
@@ -198,7 +198,7 @@ class PickPlacePlanner:
         key = tuple((o.name, o.object_class) for o in objects)
         if key not in self._scenes:
             self._scenes.clear()
-            self._scenes[key] = ClearanceScene(self.config, key, self._tray_side, self._camera_altitude)
+            self._scenes[key] = ClearanceScene(self.config, key, self.tray_side, self._camera_altitude)
         scene = self._scenes[key]
         scene.put(objects)
         return scene
@@ -270,6 +270,15 @@ class PickPlacePlanner:
             reason = PlanFailure.NO_SEAL if least > suction.unevenness else PlanFailure.TOO_HEAVY
             return NoPlan(reason, picked.name, least if reason is PlanFailure.NO_SEAL else picked.object_class.mass)
         return found
+
+    def ends_exist(self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose) -> bool:
+        """Whether any grasp that holds reaches both ends of a move without collision: what no plan can do without."""
+        picked = next(o for o in objects if o.name == pick)
+        grasps = self._grasps(picked)
+        if rests_on(picked, objects) or isinstance(grasps, NoPlan):
+            return False
+        attempts = _Attempts(self, self.clearance_scene(objects), objects, picked, X_TO_place)
+        return any(attempts.exist(grasp) for grasp in grasps)
 
     def reach(self, X_TG: Floats) -> Floats:
         """(..., 8, 6) rad, see `branches`."""
@@ -374,22 +383,34 @@ class _Attempts:
         close = [here for here in self._scene.close(q, near) if here.pair[0] == name]
         return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
 
-    def carry_out(self, grasp: _Grasp, q_pick: Floats, q_place: Floats, branch: int, yaw: float) -> Plan | None:
-        """A plan with this grasp, yaw and branch, at the least height that is free; None if there is none."""
-        config, name = self._config, self._picked.name
-        self.count += 1
-        X_pick = self._lifted(_downwards(yaw, grasp.p_TG), config.lip_gap)
-        X_place = self._at_place(X_pick)
-        X_OG = inverse(self._X_TO) @ X_pick
+    def _poses(self, grasp: _Grasp, yaw: float) -> tuple[Floats, Floats, Floats]:
+        """X_TG at the grasp and at the place, and X_OG, (4, 4) each."""
+        X_pick = self._lifted(_downwards(yaw, grasp.p_TG), self._config.lip_gap)
+        return X_pick, self._at_place(X_pick), inverse(self._X_TO) @ X_pick
+
+    def ends_free(self, X_OG: Floats, q_pick: Floats, q_place: Floats) -> tuple[dict[str, float], dict[str, float]] | None:
+        """What the object touches at either end, see `_beside`; None if the arm or the object is in collision there."""
+        name = self._picked.name
         self._scene.release()
         self._scene.touch(name)
         if self._free(q_pick[None], {}, 1, "at the grasp") is None:
             return None
-        hangs = X_pick[2, 3] - self._picked.bounds_T[0][2]
         self._scene.hold(name, inverse(X_OG))
         beside = self._beside(q_pick), self._beside(q_place)
-        if self._free(q_place[None], beside[1], 2, "at the place") is None:
+        return None if self._free(q_place[None], beside[1], 2, "at the place") is None else beside
+
+    def exist(self, grasp: _Grasp) -> bool:
+        """Whether some yaw and branch reach both ends without collision."""
+        return any(self.ends_free(self._poses(grasp, yaw)[2], q, p) is not None for q, p, _, yaw in self.ends(grasp))
+
+    def carry_out(self, grasp: _Grasp, q_pick: Floats, q_place: Floats, branch: int, yaw: float) -> Plan | None:
+        """A plan with this grasp, yaw and branch, at the least height that is free; None if there is none."""
+        self.count += 1
+        X_pick, X_place, X_OG = self._poses(grasp, yaw)
+        beside = self.ends_free(X_OG, q_pick, q_place)
+        if beside is None:
             return None
+        name, hangs = self._picked.name, X_pick[2, 3] - self._picked.bounds_T[0][2]
         for bottom in self._bottoms:
             self.count += 1
             up = self._column(X_pick, bottom + hangs, branch, q_pick)

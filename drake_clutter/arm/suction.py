@@ -76,7 +76,7 @@ def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
 
 
 def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
-    """How far, in m, the surface under the lip leaves a plane at right angles to the cup; infinite if the lip is partly in the air.
+    """How far, in m, the surface under the lip leaves a plane across the cup; infinite if the lip is partly in the air.
 
     Tilt, curvature, edges and gaps all show as this one number.
 

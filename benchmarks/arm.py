@@ -1,0 +1,244 @@
+"""The arm: planning and carrying out random legal moves in stable RG scenes, and the two ways to hold an object.
+
+python benchmarks/arm.py moves --count 1000 --workers 2 --out benchmarks/results/arm_moves.json
+python benchmarks/arm.py holds --count 20 --out benchmarks/results/arm_holds.json
+"""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from calibrate import commit
+from rich.console import Console
+from rich.progress import track
+
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
+from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
+from drake_clutter.arm.hold import HexapodHold, JointHold
+from drake_clutter.arm.planner import NoPlan, Plan, PlannerConfig
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.exploration import legal_moves
+
+MOVES_PER_SCENE = 10
+PLACED_WITHIN, TURNED_WITHIN, UNDISTURBED = 0.005, math.radians(3), 0.005
+"""m, rad, m: what counts as carried out."""
+WORLD = ClutterConfig()
+console = Console(stderr=True)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One move.
+
+    Attributes:
+        result: the reason why there is no plan, or what became of the plan.
+        possible: whether some grasp reaches both ends without collision.
+        object_class: of the picked object.
+        planning, motion, wall: s, to plan, of the planned motion, to build and simulate it.
+        place_error: m. turn_error: rad. disturbed: m, of the object that was moved furthest. slip: m.
+        tracking: rad.
+        clearance: m, the least of the plan.
+        unstable_anyway: whether what is left, or what it was put on, falls without an arm too.
+    """
+
+    result: str
+    possible: bool
+    object_class: str
+    planning: float
+    motion: float = math.nan
+    wall: float = math.nan
+    place_error: float = math.nan
+    turn_error: float = math.nan
+    disturbed: float = math.nan
+    slip: float = math.nan
+    tracking: float = math.nan
+    clearance: float = math.nan
+    unstable_anyway: bool = False
+
+
+def judged(carried: Carried) -> str:
+    """What became of a plan."""
+    if not carried.sealed:
+        return "not sealed"
+    if not math.isnan(carried.dropped):
+        return "dropped"
+    if max(carried.displaced.values(), default=0.0) > UNDISTURBED:
+        return "disturbed others"
+    return "carried out" if carried.place_error < PLACED_WITHIN and carried.turn_error < TURNED_WITHIN else "misplaced"
+
+
+def teleported_falls(scene: Scene, plan: Plan) -> bool:
+    """Whether the pile falls, or the object does not stay, when it is moved by teleport."""
+    after = scene.at({plan.pick: plan.X_TO_place})
+    verdict = DrakeJudge(WORLD).judge(after, np.random.default_rng(0))
+    strict = replace(WORLD.settle, max_displacement=UNDISTURBED, max_tilt_deg=3.0)
+    return not verdict.stable or worst_fall(after.objects, after.at(verdict.settled), strict) is not None
+
+
+class Scenes:
+    """Stable RG scenes, as they settle; the same for the same seed and number."""
+
+    def __init__(self, nodes: int, seed: int) -> None:
+        self._make = SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, WORLD))
+        self._judge, self._seed = DrakeJudge(WORLD), seed
+
+    def __call__(self, number: int) -> Scene:
+        """The one of a number."""
+        rng = item_rng(self._seed, number)
+        while True:
+            scene, _ = self._make.lay_out(rng)
+            verdict = self._judge.judge(scene, rng)
+            if verdict.stable:
+                return scene.at(verdict.settled)
+
+
+class Mover:
+    """Tries random legal moves in a scene; a worker for the runner."""
+
+    def __init__(self, nodes: int, seed: int) -> None:
+        self._scenes, self._seed = Scenes(nodes, seed), seed
+        self._detector, self._executor = LabelDetector(WORLD.camera), ArmExecutor(WORLD)
+
+    def __call__(self, number: int) -> list[Trial]:
+        """Moves in the scene of a number."""
+        scene, rng = self._scenes(number), item_rng(self._seed, number, 1)
+        observation = self._detector.look(scene).observation
+        moves = legal_moves(observation)
+        self._executor.planner(scene.tray_side).clearance_scene(scene.objects)  # as when moves follow each other
+        return [self._tried(scene, moves[k], rng, observation) for k in rng.permutation(len(moves))[:MOVES_PER_SCENE]]
+
+    def _tried(self, scene: Scene, move: Any, rng: np.random.Generator, observation: Any) -> Trial:
+        name = scene[move.pick].object_class.name
+        X_TO = choose_placement(observation, move, WORLD.exploration, rng)
+        if X_TO is None:
+            return Trial("no free spot", False, name, 0.0)
+        planner = self._executor.planner(scene.tray_side)
+        plan = planner.plan(scene.objects, move.pick, X_TO)
+        if isinstance(plan, NoPlan):
+            return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, plan.seconds)
+        begun = time.perf_counter()
+        carried = ArmSimulation(ArmConfig(), scene, plan, camera_altitude=WORLD.camera.altitude).run()
+        wall, result = time.perf_counter() - begun, judged(carried)
+        return Trial(
+            result=result,
+            possible=True,
+            object_class=name,
+            planning=plan.seconds,
+            motion=plan.duration,
+            wall=wall,
+            place_error=carried.place_error,
+            turn_error=carried.turn_error,
+            disturbed=max(carried.displaced.values(), default=0.0),
+            slip=carried.slip,
+            tracking=carried.tracking,
+            clearance=min(phase.clearance.distance for phase in plan.phases),
+            unstable_anyway=result != "carried out" and teleported_falls(scene, plan),
+        )
+
+
+def quantiles(values: Sequence[float]) -> dict[str, float]:
+    """Median, 95th and 99th percentile."""
+    found = np.quantile(values, [0.5, 0.95, 0.99]) if len(values) else [math.nan] * 3
+    return dict(zip(("p50", "p95", "p99"), map(float, found), strict=True))
+
+
+def share(successes: int, count: int) -> dict[str, Any]:
+    """With its 95 % interval."""
+    return {"of": count, "share": successes / count if count else None, "interval": wilson_interval(successes, count)}
+
+
+def moves(
+    out: Annotated[Path, typer.Option(help="Results, JSON.")],
+    count: Annotated[int, typer.Option(help="Moves.")] = 1000,
+    nodes: Annotated[int, typer.Option(help="Size of the scenes' graphs.")] = 25,
+    seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes.")] = 1,
+) -> None:
+    """Plans and carries out random legal moves."""
+    scenes = range(math.ceil(count / MOVES_PER_SCENE))
+    done = map_ordered(partial(Mover, nodes, seed), scenes, workers=workers)
+    trials = [trial for found in track(done, "scenes", len(scenes), console=console) for trial in found][:count]
+    planned = [t for t in trials if not math.isnan(t.motion)]
+    fair = [t for t in planned if not t.unstable_anyway]
+    good = sum(t.result == "carried out" for t in fair)
+    fields = {
+        "command": f"benchmarks/arm.py moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}",
+        "commit": commit(),
+        "arm": asdict(ArmConfig()),
+        "planner": asdict(PlannerConfig()),
+        "results": Counter(t.result for t in trials),
+        "not_planned_by_class": Counter(f"{t.object_class}: {t.result}" for t in trials if math.isnan(t.motion)),
+        "planned_of_possible": share(len(planned), sum(t.possible for t in trials)),
+        "carried_out_of_planned": share(sum(t.result == "carried out" for t in planned), len(planned)),
+        "carried_out_unless_unstable_anyway": share(good, len(fair)),
+        "planning_s": quantiles([t.planning for t in planned]),
+        "motion_s": quantiles([t.motion for t in planned]),
+        "simulation_wall_s": quantiles([t.wall for t in planned]),
+        "place_error_m": quantiles([t.place_error for t in planned if t.result == "carried out"]),
+        "slip_m": quantiles([t.slip for t in planned if not math.isnan(t.slip)]),
+        "tracking_rad": quantiles([t.tracking for t in planned]),
+        "least_clearance_m": min((t.clearance for t in planned), default=math.nan),
+    }
+    write_json(out, fields)
+    console.print_json(data=fields)
+
+
+def holds(
+    out: Annotated[Path, typer.Option(help="Results, JSON.")],
+    count: Annotated[int, typer.Option(help="Moves of each kind.")] = 20,
+    seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
+) -> None:
+    """Carries the same moves out with both ways to hold, of an object alone and in scenes of 25 nodes."""
+    detector, executor, rows = LabelDetector(WORLD.camera), ArmExecutor(WORLD), list[dict[str, Any]]()
+    for kind, nodes in (("one object", 4), ("25 nodes", 25)):
+        scenes, plans, number = Scenes(nodes, seed), list[tuple[Scene, Plan]](), 0
+        while len(plans) < count:
+            scene, rng = scenes(number), item_rng(seed, number, 1)
+            number += 1
+            observation = detector.look(scene).observation
+            choices = legal_moves(observation)
+            found = executor.plan(scene, observation, choices[rng.integers(len(choices))], rng)
+            if isinstance(found, Plan):
+                plans.append((scene, found))
+        for hold in (JointHold, HexapodHold):
+            results, walls = list[Carried](), list[float]()
+            for scene, plan in track(plans, f"{kind}, {hold.__name__}", console=console):
+                begun = time.perf_counter()
+                results.append(ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6, hold=hold).run())
+                walls.append(time.perf_counter() - begun)
+            rows.append(
+                {
+                    "scenes": kind,
+                    "hold": hold.__name__,
+                    "moves": count,
+                    "results": Counter(judged(c) for c in results),
+                    "slip_m": quantiles([c.slip for c in results if not math.isnan(c.slip)]),
+                    "place_error_m": quantiles([c.place_error for c in results]),
+                    "wall_s": quantiles(walls),
+                }
+            )
+    fields = {"command": f"benchmarks/arm.py holds --count {count} --seed {seed}", "commit": commit(), "rows": rows}
+    write_json(out, fields)
+    console.print_json(data=fields)
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False)
+    app.command()(moves)
+    app.command()(holds)
+    with told_in_one_line():
+        app()

@@ -1,0 +1,153 @@
+"""Plans carried out in Drake: placed where they should be, let go when they must, the same again from a cloned context."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import resting, rng, scene_of
+from pydrake.systems.analysis import Simulator
+
+from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried
+from drake_clutter.arm.hold import HexapodHold, HoldMaker, JointHold
+from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
+from drake_clutter.arm.planner import PickPlacePlanner, Plan, PlannerConfig
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import Move, MoveResult
+
+SCENE = scene_of(
+    resting("sugar_box", Orientation.UPRIGHT_0),
+    resting("tomato_soup_can", xy=(0.08, 0.0)),
+    resting("pudding_box", xy=(-0.15, 0.1)),
+)
+PLACE = Pose((0.2, -0.2, 0.0885), SCENE["sugar_box"].X_TO.quaternion)
+
+
+def planned(scene: Scene = SCENE, pick: str = "sugar_box", X_TO: Pose = PLACE) -> Plan:
+    found = PickPlacePlanner(ArmConfig(), PlannerConfig(), 0.70, 1.60).plan(scene.objects, pick, X_TO)
+    assert isinstance(found, Plan)
+    return found
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return planned()
+
+
+def run(plan: Plan, arm: ArmConfig | None = None, hold: HoldMaker = HexapodHold) -> Carried:
+    return ArmSimulation(arm or ArmConfig(), SCENE, plan, camera_altitude=1.6, hold=hold).run()
+
+
+def test_placed_where_it_should_be(plan: Plan) -> None:
+    carried = run(plan)
+    assert carried.sealed
+    assert math.isnan(carried.dropped)
+    assert carried.place_error < 0.003
+    assert carried.turn_error < math.radians(1)
+    assert carried.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), "it stands on the tray"
+    assert carried.slip < 0.001
+    assert max(carried.displaced.values()) < 0.001
+    assert carried.tracking < 0.02
+    assert 0.1 < carried.largest_share < 1
+
+
+def test_a_locked_joint_does_not_slip(plan: Plan) -> None:
+    carried = run(plan, hold=JointHold)
+    assert carried.sealed
+    assert carried.slip < 1e-9
+
+
+def test_a_vacuum_that_fails_drops_the_object(plan: Plan) -> None:
+    """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
+    carried = run(plan, ArmConfig(suction=SuctionConfig(vacuum=0.1)))
+    assert carried.sealed
+    on = scheduled(plan, ArmConfig()).suction_on
+    assert on < carried.dropped < on + DWELL + 0.5, "as soon as it is lifted"
+    assert carried.place_error > 0.2
+
+
+def test_without_a_seal_nothing_is_lifted(plan: Plan) -> None:
+    carried = run(plan, ArmConfig(suction=SuctionConfig(unevenness=-1.0)))
+    assert not carried.sealed
+    assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
+
+
+def test_the_schedule(plan: Plan) -> None:
+    schedule = scheduled(plan, ArmConfig())
+    assert [name for name, _ in schedule.starts] == ["approach", "grasp", "carry", "release", "retreat"]
+    assert schedule.end == pytest.approx(plan.duration + 2 * DWELL)
+    assert schedule.phase(0.0) == "approach"
+    assert schedule.phase(schedule.suction_on) == "grasp"
+    assert schedule.phase(schedule.suction_off + 0.01) == "release"
+    assert schedule.phase(schedule.end) == "idle"
+    home = np.concatenate([ArmConfig().home, np.zeros(6)])
+    assert schedule.reference.value(0.0).ravel() == pytest.approx(home, abs=1e-3)
+    assert schedule.reference.value(schedule.end).ravel() == pytest.approx(home, abs=1e-3)
+
+
+def test_an_executor_without_a_plan_stays_at_home() -> None:
+    executor = PickPlaceExecutor(config=ArmConfig())
+    context = executor.CreateDefaultContext()
+    assert executor.GetOutputPort("desired_state").Eval(context)[:6] == pytest.approx(ArmConfig().home)
+    assert executor.GetOutputPort("suction").Eval(context)[0] == 0
+    assert executor.GetOutputPort("status").Eval(context) == "idle"
+
+
+def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
+    """The executor's state is in its context, not in the system."""
+    executor = PickPlaceExecutor(config=ArmConfig())
+    context = executor.CreateDefaultContext()
+    executor.GetInputPort("plan").FixValue(context, plan)
+    simulator = Simulator(executor, context)
+    simulator.AdvanceTo(1.0)
+    clone = Simulator(executor, simulator.get_context().Clone())
+    simulator.AdvanceTo(2.0)
+    clone.AdvanceTo(2.0)
+    for port in ("desired_state", "feed_forward", "suction"):
+        first, second = (executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone))
+        assert (first == second).all()
+    assert executor.GetOutputPort("status").Eval(clone.get_context()) == scheduled(plan, ArmConfig()).phase(2.0)
+    assert executor.GetOutputPort("desired_state").Eval(clone.get_context())[:6] != pytest.approx(ArmConfig().home)
+
+
+def test_the_same_plan_has_the_same_outcome(plan: Plan) -> None:
+    first, second = run(plan), run(plan)
+    assert first.poses == second.poses
+    assert first.largest_share == second.largest_share
+
+
+def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> None:
+    """What holds is placed, a marker is not planned, and neither is what carries something."""
+    scene = scene_of(
+        resting("pudding_box"),
+        resting("gelatin_box", floor=0.035),
+        resting("large_marker", xy=(0.2, 0.2)),
+    )
+    executor, observation = ArmExecutor(config), detector.look(scene).observation
+    placed = executor.execute(scene, observation, Move("gelatin_box"), rng())
+    assert placed.result is MoveResult.PLACED
+    assert placed.instability is None
+    assert "mm" in placed.detail
+    assert placed.scene["gelatin_box"].bounds_T[0][2] == pytest.approx(0.0, abs=0.001)
+    assert placed.scene["pudding_box"].X_TO.p == pytest.approx(scene["pudding_box"].X_TO.p, abs=0.002)
+    assert placed.motion
+    for name, why in (("large_marker", "no seal"), ("pudding_box", "carries others")):
+        outcome = executor.execute(scene, observation, Move(name), rng())
+        assert outcome.result is MoveResult.NOT_PLANNED
+        assert outcome.detail.startswith(why)
+        assert outcome.scene == scene
+        assert not outcome.result.carried_out
+
+
+def test_what_is_put_on_an_edge_falls() -> None:
+    """A box is put on the edge of a slim one: it goes down when it is let go."""
+    scene = scene_of(resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0)))
+    beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
+    plan = planned(scene, "gelatin_box", beside)
+    carried = ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6).run()
+    assert carried.sealed
+    assert carried.poses["gelatin_box"].translation[2] < 0.1

@@ -1,0 +1,171 @@
+"""Plans of moves: what they promise, checked again with samples of their own; and every reason why there is none."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CLASSES, random_scene, resting, rng
+
+from drake_clutter.arm.kinematics import forward_kinematics
+from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlanFailure, PlannerConfig, inverse, matrix, rests_on
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.scene import Pose, SceneObject
+
+TRAY_SIDE, ALTITUDE = 0.70, 1.60
+LYING = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+
+
+def planner(arm: ArmConfig | None = None, config: PlannerConfig | None = None) -> PickPlacePlanner:
+    return PickPlacePlanner(arm or ArmConfig(), config or PlannerConfig(), TRAY_SIDE, ALTITUDE)
+
+
+def lifted(o: SceneObject, x: float, y: float) -> Pose:
+    """Where it is let go: a millimetre above the tray."""
+    return Pose((x, y, o.X_TO.translation[2] + 0.001), o.X_TO.quaternion)
+
+
+PILE = [
+    resting("sugar_box", Orientation.UPRIGHT_0),
+    resting("tomato_soup_can", xy=(0.10, 0.0)),
+    resting("cracker_box", Orientation.UPRIGHT_0, (-0.1, 0.15)),
+    resting("gelatin_box", Orientation.UPRIGHT_0, (0.10, 0.0), 0.101),
+]
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    found = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    assert isinstance(found, Plan)
+    return found
+
+
+def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
+    approach, carry, retreat = (phase.trajectory for phase in plan.phases)
+    home = np.array(ArmConfig().home)
+    assert approach.value(0.0).ravel() == pytest.approx(home)
+    assert carry.value(0.0).ravel() == pytest.approx(approach.value(approach.end_time()).ravel(), abs=1e-9)
+    assert retreat.value(0.0).ravel() == pytest.approx(carry.value(carry.end_time()).ravel(), abs=1e-9)
+    assert retreat.value(retreat.end_time()).ravel() == pytest.approx(home)
+    for trajectory in (approach, carry, retreat):
+        for time in (0.0, trajectory.end_time()):
+            assert np.abs(trajectory.EvalDerivative(time, 1)).max() < 1e-3
+
+
+def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: Plan) -> None:
+    arm = ArmConfig()
+    carry = plan.phases[1].trajectory
+    X_TG_pick, X_TG_place = (arm.X_TB @ forward_kinematics(carry.value(t).ravel()) @ arm.X_FG for t in (0.0, carry.end_time()))
+    assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), "the top of the sugar box"
+    assert X_TG_pick[:3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
+    assert X_TG_pick @ inverse(plan.X_OG) == pytest.approx(matrix(plan.X_TO_pick), abs=1e-6)
+    assert X_TG_place @ inverse(plan.X_OG) == pytest.approx(matrix(plan.X_TO_place), abs=1e-6)
+
+
+def test_nothing_is_hit_on_the_way(plan: Plan) -> None:
+    """At moments of the test's own, three times as dense."""
+    scene = planner().clearance_scene(PILE)
+    for phase in plan.phases:
+        scene.put(PILE)
+        if phase.name == "carry":
+            scene.hold(plan.pick, inverse(plan.X_OG))
+        else:
+            scene.put_one(plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place)
+            scene.touch(plan.pick)
+        least = math.inf
+        for time in np.linspace(0.0, phase.duration, 300):
+            for here in scene.close(phase.trajectory.value(time).ravel(), 0.03):
+                if here.pair == (plan.pick, "floor"):
+                    assert here.distance > -0.001
+                else:
+                    least = min(least, here.distance)
+        assert least > PlannerConfig().clearance - 0.001
+        assert least > min(phase.clearance.distance, 0.03) - 0.001
+
+
+def test_the_same_question_has_the_same_answer(plan: Plan) -> None:
+    again = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    assert isinstance(again, Plan)
+    for phase, other in zip(plan.phases, again.phases, strict=True):
+        assert phase.duration == other.duration
+        assert (phase.trajectory.value(0.3) == other.trajectory.value(0.3)).all()
+    assert (plan.attempts, plan.X_OG.tolist()) == (again.attempts, again.X_OG.tolist())
+
+
+def reason(found: Plan | NoPlan) -> PlanFailure:
+    assert isinstance(found, NoPlan)
+    return found.reason
+
+
+def test_a_marker_does_not_seal() -> None:
+    marker = SceneObject("marker", CLASSES["large_marker"], Pose((0.0, 0.0, 0.009), LYING))
+    found = planner().plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
+    assert reason(found) is PlanFailure.NO_SEAL
+    assert isinstance(found, NoPlan)
+    assert found.number > SuctionConfig().unevenness
+    assert str(found) == "no seal: marker"
+
+
+def test_what_carries_something_is_not_picked() -> None:
+    found = planner().plan(PILE, "tomato_soup_can", lifted(PILE[1], 0.2, -0.2))
+    assert reason(found) is PlanFailure.CARRIES_OTHERS
+    assert isinstance(found, NoPlan)
+    assert found.about == "gelatin_box"
+    assert rests_on(PILE[3], PILE) == ()
+
+
+def test_too_heavy() -> None:
+    """A weak vacuum does not hold half a kilogram; and an arm may not be asked for more than its payload."""
+    weak = ArmConfig(suction=SuctionConfig(vacuum=0.1))
+    assert reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
+    frail = ArmConfig(payload=1.0)
+    assert reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
+
+
+def test_out_of_reach() -> None:
+    far = ArmConfig(base=[-2.5, 0.0, 0.3, 0.0])
+    found = planner(far).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the grasp")
+    nearer = ArmConfig(base=[-1.15, 0.0, 0.3, 0.0])
+    found = planner(nearer).plan(PILE, "cracker_box", lifted(PILE[2], 0.3, -0.3))
+    assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the place")
+
+
+def test_a_tower_beside_it_is_in_the_way() -> None:
+    """A low box between two high ones: the gripper's body does not fit."""
+    low = resting("gelatin_box", Orientation.UPRIGHT_0, name="low")
+    places = [(x, z) for x in (0.06, -0.06) for z in (0.0, 0.23)]
+    walls = [resting("cracker_box", Orientation.UPRIGHT_0, (x, 0.0), z, f"wall_{k}") for k, (x, z) in enumerate(places)]
+    found = planner().plan([low, *walls], "low", lifted(low, 0.2, -0.2))
+    assert reason(found) is PlanFailure.IN_COLLISION
+    assert isinstance(found, NoPlan)
+    assert "at the grasp" in found.about
+    assert found.number < PlannerConfig().clearance
+    assert not planner().ends_exist([low, *walls], "low", lifted(low, 0.2, -0.2))
+
+
+def test_time_may_run_out() -> None:
+    found = planner(config=PlannerConfig(time_limit=0.0)).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    assert reason(found) is PlanFailure.TIME_OUT
+
+
+def test_what_reaches_both_ends_is_planned() -> None:
+    """Objects of random scenes, put up into the air, where there is room."""
+    tried, draw = 0, rng(0)
+    for seed in range(3):
+        scene = random_scene(seed, 12, 12)
+        for o in scene.objects:
+            x, y = draw.uniform(-0.2, 0.2, 2)
+            place = Pose((x, y, o.X_TO.translation[2] + 0.5), o.X_TO.quaternion)
+            if planner().ends_exist(scene.objects, o.name, place):
+                tried += 1
+                assert isinstance(planner().plan(scene.objects, o.name, place), Plan), o.name
+    assert tried >= 5
+
+
+def test_turned_by_a_quarter() -> None:
+    quarter = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    place = replace(lifted(PILE[0], 0.2, -0.2), quaternion=quarter)
+    assert isinstance(planner().plan(PILE, "sugar_box", place), Plan)
