@@ -163,7 +163,8 @@ class ArmSimulation:
             now = desired.Eval(self.executor.GetMyContextFromRoot(root))[:6]
             tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))
             if record:
-                motion.append(Frame(root.get_time(), station.scene.poses(context)))
+                q = tuple(station.joint_angles(context).tolist())
+                motion.append(Frame(root.get_time(), station.scene.poses(context), q))
         return self._judged(context, tracking, tuple(motion))
 
     def _judged(self, context: Context, tracking: float, motion: tuple[Frame, ...]) -> Carried:
@@ -241,9 +242,9 @@ class ArmExecutor:
                 after = after.at(settled.poses)
             instability = worst_fall(others, after, settle_config)
         if instability is not None:
-            return Outcome(MoveResult.COLLAPSED, after, instability, carried.motion, detail=detail)
+            return Outcome(MoveResult.COLLAPSED, after, instability, carried.motion, detail=detail, released=plan.X_TO_place)
         result = MoveResult.DROPPED if came_off else MoveResult.PLACED
-        return Outcome(result, after, None, carried.motion, detail=detail)
+        return Outcome(result, after, None, carried.motion, detail=detail, released=plan.X_TO_place)
 
 
 def worst_fall(before: Sequence[SceneObject], after: Scene, config: SettleConfig) -> Instability | None:

@@ -3,6 +3,7 @@
 Frames: T the tray, which is the world; B the arm's base; F the flange; G the cup.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
+from pydrake.systems.framework import Context
 
 from drake_clutter.arm.epick import epick_sdf
 from drake_clutter.arm.kinematics import JOINTS
@@ -102,3 +104,10 @@ def joint_numbers(plant: MultibodyPlant, arm: Arm) -> tuple[NDArray[np.int64], N
     """Where q (6,) and v (6,) of the arm lie in the finalized plant's."""
     joints = [plant.GetJointByName(name, arm.robot) for name in JOINTS]
     return np.array([j.position_start() for j in joints]), np.array([j.velocity_start() for j in joints])
+
+
+def set_joint_angles(plant: MultibodyPlant, context: Context, arm: Arm, q: Sequence[float]) -> None:
+    """Puts the arm at q (6,) rad; the rest of the plant stays as it is."""
+    positions = plant.GetPositions(context)
+    positions[joint_numbers(plant, arm)[0]] = q
+    plant.SetPositions(context, positions)

@@ -13,6 +13,7 @@ from PIL import Image
 
 from drake_clutter.files import replacing, write_text
 from drake_clutter.perception.label_detector import Look
+from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
 from drake_clutter.reports.recording import episode_frames, write_recording
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
@@ -137,6 +138,10 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         notes.append(f"{escape(_fall_in_words(outcome.instability))}.")
     if outcome.detail:
         notes.append(f"{escape(outcome.detail)}.")
+    if outcome.motion and outcome.motion[0].q:
+        moments = arm_moments(outcome.motion, step.move.pick)
+        alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"
+        figures += pictures.figure(f"move_{number:02d}_arm", strip(scene, moments), alt, "The arm: lift, carry, place, retreat.")
     badge = f'<span class="badge {_BADGES.get(outcome.result, "")}">{escape(outcome.result.value)}</span>'
     threshold = look.observation.camera.hidden_below
     return (
@@ -150,9 +155,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
 def _place(scene: Scene, step: Step) -> Pose | None:
     """Where the picked object was let go; of a move that was not carried out, above the object it was meant for."""
     if step.outcome.result.carried_out:
-        motion = step.outcome.motion
-        released = motion[0].poses.get(step.move.pick) if motion else None
-        return released or step.outcome.scene[step.move.pick].X_TO
+        return step.outcome.released or step.outcome.scene[step.move.pick].X_TO
     return (
         None if step.move.place == TRAY else Pose(scene[step.move.place].X_TO.translation, scene[step.move.pick].X_TO.quaternion)
     )

@@ -40,7 +40,7 @@ def _lamp(kind: str, position: tuple[float, float, float], intensity: float, fra
 
 
 # Only the spot casts shadows: point lights cannot, and directional ones would also shine through what is parked out of sight.
-_ENGINE = RenderEngineVtkParams(
+ENGINE = RenderEngineVtkParams(
     backend="EGL",
     default_clear_color=[0.95, 0.955, 0.96],
     lights=[
@@ -109,7 +109,7 @@ def _short(name: str) -> str:
     return number.group() if number else humanised(name)
 
 
-def _look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Pose:
+def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Pose:
     """X_TC of a camera at `eye` (3,) m that looks at `target` (3,) m, upright."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -130,7 +130,7 @@ class PictureCamera:
     def oblique(self, scene: Scene) -> NDArray[np.uint8]:
         """The tray from the front, at an angle, (720, 960, 3) uint8."""
         scale = scene.tray_side / _TRAY_SIDE
-        images = self._oblique.render(scene, _look_at(scale * np.array(_EYE), scale * np.array(_TARGET)))
+        images = self._oblique.render(scene, look_at(scale * np.array(_EYE), scale * np.array(_TARGET)))
         return _scaled(Image.fromarray(images.color))
 
     def annotated(self, scene: Scene, marks: Marks) -> NDArray[np.uint8]:
@@ -200,7 +200,7 @@ class PictureCamera:
 
 def _camera(size: tuple[int, int]) -> OverheadCamera:
     width, height = size
-    return OverheadCamera(CameraConfig(_OVERSAMPLING * width, _OVERSAMPLING * height, _FOV_Y_DEG, _ALTITUDE), _ENGINE)
+    return OverheadCamera(CameraConfig(_OVERSAMPLING * width, _OVERSAMPLING * height, _FOV_Y_DEG, _ALTITUDE), ENGINE)
 
 
 def _bounds(points: NDArray[np.float64]) -> Rectangle:

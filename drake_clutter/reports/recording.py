@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,12 @@ from pydrake.geometry import (
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation, Slerp
 
+from drake_clutter.arm.station import ArmConfig, add_arm, set_joint_angles
+from drake_clutter.config import CameraConfig
 from drake_clutter.files import write_text
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.seams import Frame
-from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
 from drake_clutter.tasks.exploration import Step
 
 FRAMES_PER_SECOND = 40
@@ -51,8 +53,8 @@ _SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
     """An episode's moves as one motion: each object is lifted, carried over and set down, then everything settles.
 
-    The lifting and carrying illustrates what happens in one instant when moves are made by teleport; it is not a robot's
-    motion. Moves that could not be carried out are left out.
+    Where a move was made by teleport, in one instant, lifting and carrying are an illustration, and no robot's motion. Moves that
+    could not be carried out are left out.
     """
     poses, time = dict(start.poses), _LONG_PAUSE
     frames = [Frame(0.0, dict(poses))]
@@ -61,14 +63,14 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
         if not step.outcome.result.carried_out:
             continue
         pick, motion = step.move.pick, step.outcome.motion
-        released = motion[0].poses.get(pick) if motion else None
-        for X_TO in _carried(scene, pick, released or step.outcome.scene[pick].X_TO):
-            poses[pick] = X_TO
-            frames.append(Frame(time, dict(poses)))
-            time += 1 / FRAMES_PER_SECOND
+        if not (motion and motion[0].q):
+            for X_TO in _carried(scene, pick, step.outcome.released or step.outcome.scene[pick].X_TO):
+                poses[pick] = X_TO
+                frames.append(Frame(time, dict(poses)))
+                time += 1 / FRAMES_PER_SECOND
         for frame in motion:
             poses |= frame.poses
-            frames.append(Frame(time + frame.time, dict(poses)))
+            frames.append(Frame(time + frame.time, dict(poses), frame.q))
         scene = step.outcome.scene
         poses = dict(scene.poses)
         time = frames[-1].time + _PAUSE
@@ -106,17 +108,22 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
         scene: the objects, and the pose of those that a frame does not name.
         frames: in order of time; a single one is a still scene.
     """
+    known = [frame.q for frame in frames if frame.q]
     with _quiet():
-        meshcat, paths = _shown(scene)
+        meshcat, paths, arm_poses = _shown(scene, arm=bool(known))
     if len(frames) > 1:
         animation = MeshcatAnimation(FRAMES_PER_SECOND)
         animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
         animation.set_repetitions(_FOREVER)
         animation.set_autoplay(True)
         numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
-        for name, at_rest in scene.poses.items():
-            for index, pose in _key_frames([frame.poses.get(name, at_rest) for frame in frames]):
-                animation.SetTransform(numbers[index], paths[name], rigid_transform(pose))
+        all_poses, q = list[dict[str, Pose]](), known[0] if known else ()
+        for frame in frames:
+            q = frame.q or q  # it stays where it was
+            all_poses.append({**scene.poses, **frame.poses, **arm_poses(q)})
+        for name, shown_at in paths.items():
+            for index, pose in _key_frames([poses[name] for poses in all_poses]):
+                animation.SetTransform(numbers[index], shown_at, rigid_transform(pose))
         meshcat.SetAnimation(animation)
     # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
     write_text(path, _SOURCE_COMMENT.sub("", meshcat.StaticHtml()))
@@ -140,12 +147,20 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
-    """A viewer with the scene in it, and the Meshcat path of each object by name."""
+ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]
+"""X_TL of the arm's links by name, from its joint angles."""
+
+
+def _shown(scene: Scene, *, arm: bool = False) -> tuple[Meshcat, dict[str, str], ArmPoses]:
+    """A viewer with the scene in it, with or without the arm; the Meshcat path of each object and link by name; `ArmPoses`."""
     builder = DiagramBuilder()
     objects = [(o.name, o.object_class) for o in scene.objects]
     scene_plant = add_scene_plant(builder, objects, scene.tray_side, 0.01, visuals=True)
     plant = scene_plant.plant
+    links, added = {}, None
+    if arm:
+        added = add_arm(plant, scene_plant.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=False)
+        links = {f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body for body in added.bodies}
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     visualizer = MeshcatVisualizer.AddToBuilder(
@@ -153,7 +168,8 @@ def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
     )
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
-    scene_plant.set_poses(plant.GetMyMutableContextFromRoot(context), scene.objects)
+    plant_context = plant.GetMyMutableContextFromRoot(context)
+    scene_plant.set_poses(plant_context, scene.objects)
     visualizer.ForcedPublish(visualizer.GetMyContextFromRoot(context))
 
     scale = scene.tray_side / 0.70
@@ -169,8 +185,15 @@ def _shown(scene: Scene) -> tuple[Meshcat, dict[str, str]]:
     for which, colour in (("top_color", [0.50, 0.53, 0.57]), ("bottom_color", [0.70, 0.71, 0.73])):
         meshcat.SetProperty("/Background", which, colour)
     inspector = scene_plant.scene_graph.model_inspector()
-    frame_ids = {name: plant.GetBodyFrameIdOrThrow(body.index()) for name, body in scene_plant.bodies.items()}
-    return meshcat, {name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()}
+    frame_ids = {name: plant.GetBodyFrameIdOrThrow(body.index()) for name, body in (scene_plant.bodies | links).items()}
+
+    def arm_poses(q: Sequence[float]) -> dict[str, Pose]:
+        if added is not None:
+            set_joint_angles(plant, plant_context, added, q)
+        return {name: pose_of(body.EvalPoseInWorld(plant_context)) for name, body in links.items()}
+
+    paths = {name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()}
+    return meshcat, paths, arm_poses
 
 
 def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:

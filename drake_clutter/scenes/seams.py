@@ -147,10 +147,12 @@ class Frame:
     Attributes:
         time: s since the move began.
         poses: X_TO by name.
+        q: rad, joint angles of the arm that carries them; none if they move by themselves.
     """
 
     time: float
     poses: Mapping[str, Pose]
+    q: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,8 @@ class Outcome:
         result: placed, collapsed, dropped on the way, or why it could not be carried out.
         scene: the scene afterwards; the scene before, if the move could not be carried out.
         instability: what did not stay, when it collapsed.
-        motion: the objects' motion, for pictures.
+        motion: for pictures: from when the picked object was let go, or of a robot's whole move.
+        released: X_TO where the picked object was let go.
         cannot_judge: what is beyond the executor's model, when that is the result.
         detail: in words, why no plan was found, or how well it was carried out.
     """
@@ -172,6 +175,7 @@ class Outcome:
     motion: tuple[Frame, ...] = ()
     cannot_judge: CannotJudge | None = None
     detail: str = ""
+    released: Pose | None = None
 
 
 @dataclass(frozen=True)

@@ -57,11 +57,14 @@ class SettleExecutor:
             if settled[-1].instability is not None:
                 if not self._follow_falls:
                     after = moved.at(settled[-1].poses)
-                    return Outcome(MoveResult.COLLAPSED, after, settled[-1].instability, _together(moved.poses, settled))
+                    motion = _together(moved.poses, settled)
+                    return Outcome(MoveResult.COLLAPSED, after, settled[-1].instability, motion, released=released.X_TO)
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
                 whole = settle(moved.objects, scene.tray_side, coarse, record=True, follow_falls=True)
-                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), settled[-1].instability, whole.motion)
-        return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, _together(moved.poses, settled))
+                fall = settled[-1].instability
+                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), fall, whole.motion, released=released.X_TO)
+        motion = _together(moved.poses, settled)
+        return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, motion, released=released.X_TO)
 
 
 def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:

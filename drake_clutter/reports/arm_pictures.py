@@ -1,0 +1,67 @@
+"""Pictures of the arm at work: moments of a recorded move, side by side."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+)
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import CameraInfo
+
+from drake_clutter.arm.station import ArmConfig, add_arm, set_joint_angles
+from drake_clutter.config import CameraConfig
+from drake_clutter.reports.pictures import ENGINE, look_at
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.seams import Frame
+from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+
+_SIZE = (480, 480)
+_OVERSAMPLING = 2
+_EYE, _TARGET, _FOV_Y_DEG = (1.10, -1.90, 1.30), (-0.22, 0.0, 0.46), 36.0
+_RENDERER = "arm_pictures"
+
+
+def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
+    """The frames of a recorded move that tell it: before, the object's rise, its way, and when it stands."""
+    height = np.array([frame.poses[pick].p[2] for frame in frames])
+    aside = np.array([np.linalg.norm(frame.poses[pick].p[:2] - frames[0].poses[pick].p[:2]) for frame in frames])
+    lifted = np.flatnonzero(height > height[0] + 0.002)
+    first = int(lifted[0]) if len(lifted) else len(frames) // 2
+    there = int(np.flatnonzero(aside >= 0.98 * aside.max())[0]) if len(lifted) else len(frames) // 2
+    still = np.flatnonzero(np.abs(height - height[-1]) > 0.002)
+    down = min(int(still[-1]) + 1, len(frames) - 1) if len(still) else len(frames) - 1
+    return [frames[k] for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)]
+
+
+def strip(scene: Scene, frames: Sequence[Frame]) -> NDArray[np.uint8]:
+    """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
+    builder = DiagramBuilder()
+    made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.tray_side, 0.01, visuals=True)
+    plant = made.plant
+    arm = add_arm(plant, made.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=True)
+    plant.Finalize()
+    made.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(ENGINE))
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    width, height = (_OVERSAMPLING * size for size in _SIZE)
+    info = CameraInfo(width, height, np.radians(_FOV_Y_DEG))
+    camera = ColorRenderCamera(RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False)
+    X_TC = rigid_transform(look_at(np.array(_EYE), np.array(_TARGET)))
+    query_port = made.scene_graph.get_query_output_port()
+    pictures = []
+    for frame in frames:
+        for name, body in made.bodies.items():
+            plant.SetFreeBodyPose(context, body, rigid_transform(frame.poses[name]))
+        set_joint_angles(plant, context, arm, frame.q)
+        query = query_port.Eval(made.scene_graph.GetMyContextFromRoot(root))
+        color = query.RenderColorImage(camera, query.inspector().world_frame_id(), X_TC).data[:, :, :3]
+        pictures.append(np.asarray(Image.fromarray(color).resize(_SIZE, Image.Resampling.LANCZOS)))
+    return np.hstack(pictures)
