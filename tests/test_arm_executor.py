@@ -1,6 +1,9 @@
 """Plans carried out in Drake: placed where they should be, let go when they must, the same again from a cloned context."""
 
+import itertools
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +19,8 @@ from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.reports.arm_pictures import arm_moments, strip
+from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.seams import Move, MoveResult
 
@@ -141,6 +146,25 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         assert outcome.detail.startswith(why)
         assert outcome.scene == scene
         assert not outcome.result.carried_out
+
+
+def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None:
+    motion = ArmSimulation(ArmConfig(), SCENE, plan, camera_altitude=1.6).run(record=True).motion
+    assert motion[0].q == pytest.approx(ArmConfig().home, abs=0.01)
+    moments = arm_moments(motion, "sugar_box")
+    times = [frame.time for frame in moments]
+    assert times == sorted(times)
+    assert moments[0].poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.01)
+    assert moments[1].poses["sugar_box"].p[2] > 0.1
+    assert moments[2].poses["sugar_box"].p[:2] == pytest.approx(PLACE.p[:2], abs=0.005)
+    picture = strip(SCENE, moments)
+    assert picture.shape == (480, 4 * 480, 3)
+    quarters = np.split(picture.astype(int), 4, axis=1)
+    assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"
+    write_recording(tmp_path / "with.html", SCENE, motion[::8])
+    write_recording(tmp_path / "without.html", SCENE, [replace(frame, q=()) for frame in motion[::8]])
+    with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))
+    assert with_arm > without + 20_000, "its links, and their key frames"
 
 
 def test_what_is_put_on_an_edge_falls() -> None:

@@ -68,7 +68,7 @@ class Arm:
     cup: Frame
 
 
-_CLOSE = ("base", "upper_arm", "wrist_1", "wrist_3")
+_CLOSE = ("base", "shoulder", "upper_arm", "wrist_1", "wrist_3")
 _GREY = np.array([0.45, 0.46, 0.48, 1.0])
 _TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
 """Its upper surface is a millimetre below the tray's floor, which lies on it."""
@@ -91,10 +91,10 @@ def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, c
         plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
         if name == "pedestal":
             plant.RegisterVisualGeometry(world, X_TS, shape, name, _GREY)
-    # Links that cannot meet, though their capsules do; and the base stands on what it stands on.
+    # Links that cannot meet, though their capsules do; and base and shoulder never leave their place on the pedestal.
     of = {name: GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, robot))) for name in _CLOSE}
     of["world"] = GeometrySet(plant.GetCollisionGeometriesForBody(world))
-    for first, second in (("base", "upper_arm"), ("wrist_1", "wrist_3"), ("base", "world")):
+    for first, second in (("base", "upper_arm"), ("wrist_1", "wrist_3"), ("base", "world"), ("shoulder", "world")):
         scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeBetween(of[first], of[second]))
     bodies = tuple(plant.get_body(index) for model in (robot, tool) for index in plant.GetBodyIndices(model))
     return Arm(robot, tool, bodies, flange, plant.GetFrameByName("cup", tool))
