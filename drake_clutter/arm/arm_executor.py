@@ -13,7 +13,7 @@ from pydrake.systems.primitives import ConstantValueSource
 
 from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
 from drake_clutter.arm.hold import HexapodHold, HoldMaker
-from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
+from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor
 from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlannerConfig
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig, SettleConfig
@@ -137,11 +137,12 @@ class ArmSimulation:
         context, desired = station.plant_context(root), self.executor.GetOutputPort("desired_state")
         station.set_scene(root, np.array(self.config.home), self._objects)
         self.simulator.set_monitor(self.vacuum)
-        schedule = scheduled(self._plan, self.config)
         beside_pick, beside_place = disturbed_by(self._objects, self._plan)
         motion, tracking, free = list[Frame](), 0.0, set[str]()
         station.lock_all_but(root, free)
         self.simulator.Initialize()
+        schedule = self.executor.schedule(self.executor.GetMyContextFromRoot(root))
+        assert schedule is not None, "the executor begins with the plan that it is given"
         for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
             time = root.get_time()
             wanted = set[str]()

@@ -5,6 +5,7 @@ a Stewart platform, whose feet are set when it is switched on. docs/arm.md compa
 """
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -117,4 +118,4 @@ class HexapodHold:
         return _load_of_cup(self._plant, self._arm, context)
 
 
-HoldMaker = type[JointHold] | type[HexapodHold]
+HoldMaker = Callable[[MultibodyPlant, Arm, RigidBody], Hold]

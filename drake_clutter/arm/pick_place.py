@@ -140,6 +140,11 @@ class PickPlaceExecutor(LeafSystem):
             state.get_mutable_abstract_state(int(self._state)).set_value(begun)
         return EventStatus.Succeeded()
 
+    def schedule(self, context: Context) -> Schedule | None:
+        """Of the plan that is being carried out, or was last."""
+        running: _Running = context.get_abstract_state(self._state).get_value()
+        return running.schedule
+
     def _now(self, context: Context) -> tuple[Schedule | None, float]:
         running: _Running = context.get_abstract_state(self._state).get_value()
         if running.schedule is None:
