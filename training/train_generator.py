@@ -43,6 +43,7 @@ class TrainGenerator:
         warm_start: a checkpoint to begin with, or "".
         evaluate_every: steps; evaluation_scenes: that are then sampled and judged by the fast judge.
         save_every: steps, after which all that is needed to go on is written.
+        sampling_temperature: of the policy once it is trained; 0 for the one that it was trained with.
         task, learning, world: see there.
     """
 
@@ -53,6 +54,7 @@ class TrainGenerator:
     evaluate_every: int = 32_000
     evaluation_scenes: int = 256
     save_every: int = 64_000
+    sampling_temperature: float = 0.0
     task: GenerationTask = field(default_factory=GenerationTask)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
     world: ClutterConfig = field(default_factory=ClutterConfig)
@@ -144,6 +146,7 @@ def main(
     about = {
         "kind": "generator",
         "network": about_values(example.grammar, run.learning.width),
+        "temperature": run.sampling_temperature or run.learning.temperature,
         "config": asdict(run),
         "metrics": history[-1],
         "commits": list(dict.fromkeys(row["commit"] for row in history)),

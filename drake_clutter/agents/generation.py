@@ -91,7 +91,7 @@ def make_generation_agent(name: str, config: ClutterConfig, temperature: float |
     Args:
         name: which.
         config: the world.
-        temperature: of a trained agent's policy; None: the one it was trained with.
+        temperature: of a trained agent's policy; None: the one that its checkpoint names.
 
     Raises:
         InputError: no such agent, a file that is no checkpoint of one, or a temperature for an agent that has none.

@@ -69,7 +69,7 @@ class LearnedGenerator:
         Args:
             path: a checkpoint of `training/train_generator.py`.
             config: the world.
-            temperature: None: the one it was trained with.
+            temperature: None: the one that its checkpoint names.
 
         Raises:
             InputError: the checkpoint cannot be read, or is none of a generator.
@@ -78,7 +78,7 @@ class LearnedGenerator:
         if self._checkpoint.about.get("kind") != "generator":
             raise InputError(f"{path}: is a checkpoint of another kind; allowed is one of training/train_generator.py")
         about = self._checkpoint.about
-        self._temperature = about["config"]["learning"]["temperature"] if temperature is None else temperature
+        self._temperature = about["temperature"] if temperature is None else temperature
         self._judge = FastJudge(config, margin=about["config"]["task"]["margin"])
         self._network: RuleValues | None = None
 
