@@ -134,9 +134,9 @@ class PlannerConfig:
     grasp_spacing: float = 0.012
     grasps: int = 9
     yaws: int = 12
-    attempts: int = 60
+    attempts: int = 400
     least_acceleration: float = 0.3
-    time_limit: float = 10.0
+    time_limit: float = 5.0
 
 
 REPORTED = 0.03
