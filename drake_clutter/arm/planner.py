@@ -117,7 +117,7 @@ class PlannerConfig:
     """How plans are searched.
 
     Attributes:
-        clearance: m, kept from everything, but for what the held object touches, or has within `near`, at an end of its way.
+        clearance: m, kept from everything, but for what the held object is closer to at an end of its way.
         rise: m, that the held object is lifted over what it must pass.
         lip_gap: m, between lip and face when the vacuum is switched on.
         grasp_spacing: m, between the points of a face that are tried; grasps: of them, at most.
@@ -128,7 +128,6 @@ class PlannerConfig:
     """
 
     clearance: float = 0.005
-    near: float = 0.003
     rise: float = 0.020
     lip_gap: float = 0.0005
     grasp_spacing: float = 0.012
@@ -378,9 +377,9 @@ class _Attempts:
         return found
 
     def _beside(self, q: Floats) -> dict[str, float]:
-        """What the held object touches, or nearly, and how close it may come to that; at joint angles (6,) rad."""
-        name, near = self._picked.name, self._config.near
-        close = [here for here in self._scene.close(q, near) if here.pair[0] == name]
+        """What the held object is close to, and how close it may come to that; at joint angles (6,) rad."""
+        name = self._picked.name
+        close = [here for here in self._scene.close(q, self._config.clearance) if here.pair[0] == name]
         return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
 
     def _poses(self, grasp: _Grasp, yaw: float) -> tuple[Floats, Floats, Floats]:
