@@ -8,6 +8,7 @@ from conftest import CLASSES
 
 from drake_clutter.arm.epick import epick_sdf
 from drake_clutter.arm.suction import GRAVITY, SuctionConfig, carried_load, greatest_acceleration, load_share, unevenness
+from drake_clutter.catalogue import Rest, Shape, load_catalogue
 from drake_clutter.resources import shipped_path
 
 CUP = SuctionConfig()
@@ -50,6 +51,23 @@ def test_tilt_and_curvature_show_in_millimetres() -> None:
     side[:3, 3] = (0.033, 0.0, 0.0)
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
     assert unevenness(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(sagitta, rel=0.1)  # of a prism of 32 sides
+
+
+def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
+    """On all faces of the boxes, and the tops of the cans, of all fourteen classes."""
+
+    def seals(diameter: float) -> bool:
+        for o in load_catalogue().object_set("pantry14"):
+            for axis in range(3) if o.shape is Shape.BOX else [2] if o.only_rest is Rest.UPRIGHT else []:
+                z = -np.eye(3)[axis]
+                x = np.eye(3)[(axis + 1) % 3]
+                X = np.eye(4)
+                X[:3, :3], X[:3, 3] = np.column_stack([x, np.cross(z, x), z]), -z * o.size[axis] / 2
+                if unevenness(o, X, diameter) > CUP.unevenness:
+                    return False
+        return True
+
+    assert [d for d in (0.015, 0.020, 0.025, 0.030, 0.040, 0.055) if seals(d)] == [0.015, 0.020, CUP.cup_diameter]
 
 
 def test_a_marker_cannot_be_held() -> None:

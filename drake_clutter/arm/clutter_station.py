@@ -46,7 +46,6 @@ class ClutterStation(Diagram):
         tray_side: float,
         camera_altitude: float,
         time_step: float,
-        visuals: bool = False,
         hold: HoldMaker = HexapodHold,
     ) -> None:
         """Builds it; objects are (name, class), `pick` the name of the one that the cup can take; `hold` how."""
@@ -54,7 +53,7 @@ class ClutterStation(Diagram):
         self.config, self.pick, self.classes, self.time_step = config, pick, dict(objects), time_step
         builder = DiagramBuilder()
         jointed = pick if hold is JointHold else ""
-        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=visuals, jointed=jointed)
+        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=False, jointed=jointed)
         self.plant = plant = self.scene.plant
         self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True)
         for name in JOINTS:
@@ -65,7 +64,7 @@ class ClutterStation(Diagram):
         lockable = [(n, b) for n, b in bodies if n != jointed]
         self._joints = {n: plant.get_joint(i) for n, b in lockable for i in plant.GetJointIndices(b.model_instance())}
         self._locked_filter: FilterId | None = None
-        self._q_at, self._v_at = joint_numbers(plant, self.arm)
+        self._q_at, _ = joint_numbers(plant, self.arm)
         ports = (("desired_state", plant.get_desired_state_input_port), ("feed_forward", plant.get_actuation_input_port))
         for name, port in ports:
             builder.ExportInput(port(self.arm.robot), name)

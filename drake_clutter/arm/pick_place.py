@@ -17,7 +17,7 @@ from drake_clutter.arm.station import ArmConfig
 Floats = NDArray[np.float64]
 
 DWELL = 0.15
-"""s, that the arm waits for the vacuum to build up, and to be gone (EPick: about that with a small cup)."""
+"""s, that the arm waits for the vacuum to build up, and to be gone."""
 PERIOD = 0.01
 """s, of the looks for a new plan, and of the samples of reference and feed-forward torque."""
 

@@ -65,13 +65,11 @@ class Phase:
         name: approach, carry or retreat.
         trajectory: q (6,) rad over time, s.
         clearance: the least along it, densely checked, of what was not allowed to touch.
-        optimised: whether it comes from trajectory optimisation, or is the sure path.
     """
 
     name: str
     trajectory: Trajectory
     clearance: Clearance
-    optimised: bool = False
 
     @property
     def duration(self) -> float:
@@ -235,7 +233,7 @@ class PickPlacePlanner:
         return attempt.furthest
 
     def _grasps(self, picked: SceneObject) -> list[_Grasp] | NoPlan:
-        """Where the cup seals on top and can hold, the strongest first."""
+        """Where the cup seals on top and can hold, the nearest to its middle first."""
         suction = self.config.suction
         lower, upper = picked.bounds_T
         X_TO = matrix(picked.X_TO)
@@ -246,7 +244,7 @@ class PickPlacePlanner:
         middle = (lower[:2] + upper[:2]) / 2
         points = middle + np.column_stack([x.ravel(), y.ravel()])
         points = points[np.argsort(np.round(np.linalg.norm(points - middle, axis=1), 6), kind="stable")]
-        found, least, weakest = list[_Grasp](), math.inf, -1.0
+        found, least = list[_Grasp](), math.inf
         for point in points:
             X_TG = _downwards(0.0, np.array([*point, top]))
             X_OG = inverse(X_TO) @ X_TG
@@ -256,7 +254,6 @@ class PickPlacePlanner:
                 continue
             p_GCm = inverse(X_TG)[:3, :3] @ (X_TO[:3, 3] - X_TG[:3, 3])
             acceleration = greatest_acceleration(picked.object_class.mass, p_GCm, suction)
-            weakest = max(weakest, acceleration)
             if acceleration >= self.planner.least_acceleration:
                 # How the load hangs to the side depends on the cup's yaw; its distance from the axis does not.
                 payload = Payload(picked.object_class.mass, (0.0, 0.0, round(float(p_GCm[2]), 2)), round(acceleration, 1))
@@ -367,7 +364,7 @@ class _Attempts:
         """
         found, name, least = Clearance(math.inf), self._picked.name, self._config.clearance
         for q in way:
-            for here in self._scene.close(q, max(least, REPORTED)):
+            for here in self._scene.close(q, REPORTED):
                 allowed = beside.get(here.pair[1], least) if here.pair[0] == name else least
                 if here.distance < allowed:
                     self.fail(progress, PlanFailure.IN_COLLISION, f"{what}: {' and '.join(here.pair)}", here.distance)

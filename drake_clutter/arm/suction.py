@@ -2,7 +2,7 @@
 
 Frames: G the cup, origin in the middle of its lip, z out of the tool, into the object; O the object.
 
-Sources: Robotiq, "EPick vacuum gripper instruction manual" (vacuum of 80 % of the atmosphere); the body's length and radius as in
+Sources: the vacuum of 80 % of the atmosphere is from memory of Robotiq's data sheet; the body's length and radius as in
 PickNik's `epick_description` (BSD). A lip that is loaded evenly by the vacuum opens where tension and bending have used that up
 (the ring contact of Mahler et al. 2018, "Dex-Net 3.0", section III).
 """
