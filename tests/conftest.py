@@ -1,7 +1,11 @@
 """Objects and scenes that the tests share; what is costly to make is made once for the whole run."""
 
 import gc
+import importlib.util
+import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -53,6 +57,17 @@ def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "yc
         scene = lay_out(derivation, CLASSES, LayoutConfig(), generator, seed)
         if isinstance(scene, Scene):
             return scene
+
+
+def training_script(name: str) -> ModuleType:
+    """A script of `training/`, as a module."""
+    path = Path(__file__).parents[1] / "training" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def rng(seed: int = 0) -> np.random.Generator:

@@ -1,26 +1,18 @@
 """Table I's script, on a few small scenes."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from conftest import training_script
 
 from drake_clutter.files import InputError
-
-SCRIPT = Path(__file__).parents[1] / "training" / "generator_results.py"
 
 
 @pytest.fixture(scope="module")
 def results() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generator_results", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    sys.modules["generator_results"] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return training_script("generator_results")
 
 
 def test_a_table_of_one_row(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

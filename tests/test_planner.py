@@ -8,7 +8,8 @@ import pytest
 from conftest import CLASSES, random_scene, resting, rng
 
 from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlanFailure, PlannerConfig, inverse, matrix, rests_on
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner, PlannerConfig, inverse, matrix, rests_on
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.grammar import Orientation

@@ -1,18 +1,16 @@
 """Soft Q-learning: the policy and the value as defined, learning where the answer is known, going on after a kill."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
-from conftest import rng
+from conftest import rng, training_script
 
 from drake_clutter.agents.checkpoint import load_checkpoint
 from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, chances, play, soft_value, softmax_choice
@@ -152,21 +150,11 @@ SETTINGS = ["task.nodes=6", "learning.steps=480", "learning.environments=4", "le
 SETTINGS += ["learning.replay=300", "learning.width=8", "evaluate_every=160", "evaluation_scenes=8", "save_every=80"]
 
 
-def train_generator() -> ModuleType:
-    """The training script, as a module."""
-    spec = importlib.util.spec_from_file_location("train_generator", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    sys.modules["train_generator"] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> None:
     options = [argument for setting in SETTINGS for argument in ("--set", setting)]
     command = [sys.executable, str(SCRIPT), "--out", str(tmp_path / "killed"), *options]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    train = train_generator()
+    train = training_script("train_generator")
     train.main(tmp_path / "whole", settings=SETTINGS)
     while not (tmp_path / "killed" / "state.safetensors").exists():
         assert killed.poll() is None
@@ -195,7 +183,7 @@ REFUSED += ["learning.replay=35"]
 def test_what_no_training_can_do_is_refused(setting: str, tmp_path: Path) -> None:
     """Before anything is written."""
     with pytest.raises(InputError, match=setting.partition("=")[0]):
-        train_generator().main(tmp_path / "out", settings=[*SETTINGS, setting])
+        training_script("train_generator").main(tmp_path / "out", settings=[*SETTINGS, setting])
     assert not (tmp_path / "out").exists()
 
 

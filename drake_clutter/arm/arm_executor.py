@@ -14,7 +14,8 @@ from pydrake.systems.primitives import ConstantValueSource
 from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
 from drake_clutter.arm.hold import HexapodHold, HoldMaker
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor
-from drake_clutter.arm.planner import NoPlan, PickPlacePlanner, Plan, PlannerConfig
+from drake_clutter.arm.plan import NoPlan, Plan
+from drake_clutter.arm.planner import PickPlacePlanner, PlannerConfig
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.scenes.geometry import touching_groups

@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Even
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.arm.paths import Payload, dynamics_plant
-from drake_clutter.arm.planner import Plan
+from drake_clutter.arm.plan import Plan
 from drake_clutter.arm.station import ArmConfig
 
 Floats = NDArray[np.float64]

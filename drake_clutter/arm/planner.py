@@ -1,14 +1,12 @@
-"""Plans of one move: grasp, way and timing, or the reason why there is none.
+"""Finds plans of moves: grasp, way and timing.
 
-Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object. A move is three paths between rests:
-`approach` from home to the grasp, `carry` from there to where the object is let go, `retreat` back home.
+Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object.
 """
 
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,97 +15,13 @@ from pydrake.trajectories import Trajectory
 from drake_clutter.arm.clearance import Clearance, ClearanceScene
 from drake_clutter.arm.kinematics import branches
 from drake_clutter.arm.paths import Payload, nearest_turns, sampled, smooth, straight, timed
+from drake_clutter.arm.plan import NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import EPICK_MASS, greatest_acceleration, unevenness
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]
-
-
-class PlanFailure(Enum):
-    """Why there is no plan."""
-
-    NO_SEAL = "no seal"
-    TOO_HEAVY = "too heavy"
-    CARRIES_OTHERS = "carries others"
-    UNREACHABLE = "unreachable"
-    IN_COLLISION = "in collision"
-    TRAJECTORY_INFEASIBLE = "trajectory infeasible"
-    TIME_OUT = "time out"
-
-
-@dataclass(frozen=True)
-class NoPlan:
-    """No plan, and what stands behind that.
-
-    Attributes:
-        reason: of the attempt that came furthest.
-        about: what is in the way, what lies on the object, which pose is out of reach.
-        number: m of unevenness under the best grasp, kg, m of penetration, s; as the reason has it.
-        seconds: that were spent.
-    """
-
-    reason: PlanFailure
-    about: str = ""
-    number: float = math.nan
-    seconds: float = 0.0
-
-    def __str__(self) -> str:
-        return f"{self.reason.value}{f': {self.about}' if self.about else ''}"
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A part of a plan that begins and ends at rest.
-
-    Attributes:
-        name: approach, carry or retreat.
-        trajectory: q (6,) rad over time, s.
-        clearance: the least along it, densely checked, of what was not allowed to touch.
-    """
-
-    name: str
-    trajectory: Trajectory
-    clearance: Clearance
-
-    @property
-    def duration(self) -> float:
-        """s."""
-        return float(self.trajectory.end_time())
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How a move is carried out.
-
-    Attributes:
-        pick: the object's name; X_TO_pick, X_TO_place: where it is, and where it is let go.
-        X_OG: (4, 4) the grasp.
-        mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
-        phases: in order.
-        attempts: grasps and branches that were looked at.
-        seconds: that planning took.
-    """
-
-    pick: str
-    X_TO_pick: Pose
-    X_TO_place: Pose
-    X_OG: Floats
-    mass: float
-    p_GCm: tuple[float, float, float]
-    phases: tuple[Phase, ...]
-    attempts: int
-    seconds: float
-
-    @property
-    def duration(self) -> float:
-        """s, of the motion."""
-        return sum(phase.duration for phase in self.phases)
-
-    def __deepcopy__(self, memo: object) -> "Plan":
-        """Itself: it never changes, and Drake copies abstract values again and again."""
-        return self
 
 
 @dataclass

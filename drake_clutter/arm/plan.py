@@ -1,0 +1,103 @@
+"""What a planner answers: how a move is carried out, or why it cannot be.
+
+Frames: T the tray, G the cup, O the picked object. A move is three paths between rests: `approach` from home to the grasp,
+`carry` from there to where the object is let go, `retreat` back home.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from drake_clutter.arm.clearance import Clearance
+from drake_clutter.scenes.scene import Pose
+
+Floats = NDArray[np.float64]
+
+
+class PlanFailure(Enum):
+    """Why there is no plan."""
+
+    NO_SEAL = "no seal"
+    TOO_HEAVY = "too heavy"
+    CARRIES_OTHERS = "carries others"
+    UNREACHABLE = "unreachable"
+    IN_COLLISION = "in collision"
+    TRAJECTORY_INFEASIBLE = "trajectory infeasible"
+    TIME_OUT = "time out"
+
+
+@dataclass(frozen=True)
+class NoPlan:
+    """No plan, and what stands behind that.
+
+    Attributes:
+        reason: of the attempt that came furthest.
+        about: what is in the way, what lies on the object, which pose is out of reach.
+        number: m of unevenness under the best grasp, kg, m of penetration, s; as the reason has it.
+        seconds: that were spent.
+    """
+
+    reason: PlanFailure
+    about: str = ""
+    number: float = math.nan
+    seconds: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.reason.value}{f': {self.about}' if self.about else ''}"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of a plan that begins and ends at rest.
+
+    Attributes:
+        name: approach, carry or retreat.
+        trajectory: q (6,) rad over time, s.
+        clearance: the least along it, densely checked, of what was not allowed to touch.
+    """
+
+    name: str
+    trajectory: Trajectory
+    clearance: Clearance
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return float(self.trajectory.end_time())
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a move is carried out.
+
+    Attributes:
+        pick: the object's name; X_TO_pick, X_TO_place: where it is, and where it is let go.
+        X_OG: (4, 4) the grasp.
+        mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
+        phases: in order.
+        attempts: grasps and branches that were looked at.
+        seconds: that planning took.
+    """
+
+    pick: str
+    X_TO_pick: Pose
+    X_TO_place: Pose
+    X_OG: Floats
+    mass: float
+    p_GCm: tuple[float, float, float]
+    phases: tuple[Phase, ...]
+    attempts: int
+    seconds: float
+
+    @property
+    def duration(self) -> float:
+        """s, of the motion."""
+        return sum(phase.duration for phase in self.phases)
+
+    def __deepcopy__(self, memo: object) -> "Plan":
+        """Itself: it never changes, and Drake copies abstract values again and again."""
+        return self
