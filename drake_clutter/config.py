@@ -145,6 +145,7 @@ _ALLOWED = {
     "exploration.max_moves": (1, math.inf),
     "exploration.collapse_penalty": (-math.inf, 0.0),
     "task.nodes": (3, 1000),
+    "task.balance_reward": (0.0, math.inf),
     "task.instability_reward": (-math.inf, 0.0),
     "learning.steps": (1, math.inf),
     "learning.environments": (1, math.inf),

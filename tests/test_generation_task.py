@@ -106,9 +106,10 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
 
 
 def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
-    task = GenerationTask(nodes=14, hidden_reward=0.5, instability_reward=-1.0)
+    task = GenerationTask(nodes=14, hidden_reward=0.5, balance_reward=0.25, instability_reward=-1.0)
     environment, draw = ClutterGeneration(task=task), rng(3)
     stable = unstable = 0
+    balanced = set()
     for episode in range(120):
         _, info = environment.reset(seed=episode)
         total, over = 0.0, False
@@ -118,7 +119,9 @@ def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
         if "scene" in info:
             stable += 1
             assert info["verdict"].stable
-            assert total == pytest.approx(0.5 * len(info["verdict"].hidden))
+            sizes = [len(stack) for stack in info["scene"].graph.stack_objects()]
+            balanced.add(max(sizes) <= 0.6 * sum(sizes))
+            assert total == pytest.approx(0.5 * len(info["verdict"].hidden) + (0.25 if max(sizes) <= 0.6 * sum(sizes) else 0))
             assert info["scene"].graph.is_terminal
             assert len(info["scene"].graph) == 14
             derived = environment.grammar.replay(info["scene"].derivation)
@@ -128,6 +131,7 @@ def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
             assert total == pytest.approx(-1.0)
     assert stable > 20
     assert unstable > 20
+    assert balanced == {True, False}
 
 
 def test_an_infeasible_rule_changes_nothing() -> None:

@@ -26,11 +26,11 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, config_yaml, load_typed
 from drake_clutter.files import InputError, output_directory, told_in_one_line, write_json, write_text
 from drake_clutter.grammar import canonical_form
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
 
 CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
 CHECKPOINT = "generator.safetensors"
-FIGURES = ("score", "stable", "hidden", "distinct", "stacks", "rarest_class")
+FIGURES = ("score", "stable", "hidden", "distinct", "stacks", "balanced", "rarest_class")
 
 
 @dataclass
@@ -65,13 +65,15 @@ def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float
     made = [episode.info for episode in episodes if "scene" in episode.info]
     hidden = [len(info["verdict"].hidden) for info in made]
     used = Counter(object_.object_class.name for info in made for object_ in info["scene"].objects)
-    forms = {canonical_form(info["scene"].graph, classes) for info in made}
+    graphs = [info["scene"].graph for info in made]
+    forms = {canonical_form(graph, classes) for graph in graphs}
     return {
         "score": float(np.mean([episode.score for episode in episodes])),
         "stable": len(made) / len(episodes),
         "hidden": float(np.mean(hidden)) if hidden else 0.0,
         "distinct": len(forms) / max(1, len(made)),
-        "stacks": float(np.mean([len(info["scene"].graph.stacks()) for info in made])) if made else 0.0,
+        "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if made else 0.0,
+        "balanced": float(np.mean([graph.largest_stack_share() <= MOST_IN_A_STACK for graph in graphs])) if made else 0.0,
         "rarest_class": min(used[name] for name in classes) / max(1, used.total()),
     }
 

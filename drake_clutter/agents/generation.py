@@ -21,12 +21,10 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
-from drake_clutter.tasks.generation import GenerationTask, PartialScene
+from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
 
 SEARCH_BUDGET = 400
 """Moves that are tried to find out whether a scene is solvable."""
-MOST_IN_A_STACK = 0.6
-"""Of a balanced scene's objects."""
 LAYOUT_TRIES = 1000
 """Graphs in a row that may fail to be laid out before the budget is called too large for the tray."""
 
@@ -78,7 +76,7 @@ class HillClimber:
                 partial.apply(grammar.index[name])
             while not partial.finished:
                 partial.apply(int(rng.choice(np.flatnonzero(partial.mask))))
-            worth = task.instability_reward if partial.fault else task.hidden_reward * partial.hidden
+            worth = task.instability_reward if partial.fault else partial.worth(partial.hidden)
             if worth >= best_worth:
                 best, best_worth = Derivation(partial.graph, tuple(partial.rules)), worth
         assert best is not None
@@ -221,10 +219,9 @@ def summarise(
     largest = []
     for scene, verdict in scenes:
         assert scene.graph is not None
-        heights = [len(stack) for stack in scene.graph.stack_objects()]
-        stacks.append(len(heights))
+        stacks.append(len(scene.graph.stacks()))
         objects.append(len(scene.objects))
-        largest.append(max(heights) / sum(heights))
+        largest.append(scene.graph.largest_stack_share())
         kinds.update(o.object_class.name for o in scene.objects)
         forms.add(canonical_form(scene.graph, classes))
         if verdict.instability is None:

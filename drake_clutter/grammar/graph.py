@@ -115,6 +115,11 @@ class ClutterGraph:
             found.append([node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS])
         return found
 
+    def largest_stack_share(self) -> float:
+        """Of the objects, the share that the stack with most of them holds; 0 without objects."""
+        sizes = [len(stack) for stack in self.stack_objects()]
+        return max(sizes) / sum(sizes) if sizes else 0.0
+
     def objects(self) -> Iterator[tuple[int, str]]:
         """(node, class) of every object node, in order of creation."""
         return ((node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS)

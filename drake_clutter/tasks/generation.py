@@ -18,6 +18,9 @@ from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import CannotJudge, Verdict
 
+MOST_IN_A_STACK = 0.6
+"""Of a balanced scene's objects."""
+
 GraphObservation = dict[str, NDArray[Any]]
 
 
@@ -28,6 +31,7 @@ class GenerationTask:
     Attributes:
         nodes: exact size of the graphs.
         hidden_reward: w_u, per hidden object of a stable scene.
+        balance_reward: for a stable scene of which no stack holds more than `MOST_IN_A_STACK` of the objects. Not in the paper.
         instability_reward: w_s, for a scene that is unstable, or that cannot be laid out or judged.
         must_come_apart: whether a stack that cannot be taken away from the top, object by object, counts as unstable.
         margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
@@ -35,6 +39,7 @@ class GenerationTask:
 
     nodes: int = 25
     hidden_reward: float = 0.5
+    balance_reward: float = 0.5
     instability_reward: float = -1.0
     must_come_apart: bool = True
     margin: float = 0.003
@@ -143,6 +148,11 @@ class PartialScene:
             shares = self._judge.rays.visible_shares(scene.objects).values()
             self.hidden += sum(share < self._config.camera.hidden_below for share in shares)
 
+    def worth(self, hidden: int) -> float:
+        """Of the derived graph, if its scene is stable and hides that many objects."""
+        balanced = self.graph.largest_stack_share() <= MOST_IN_A_STACK
+        return self._task.hidden_reward * hidden + self._task.balance_reward * balanced
+
     def scene(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:
         """The finished scene with its stacks in places drawn at random, judged; None if it cannot stand on the tray."""
         derivation = Derivation(self.graph, tuple(self.rules))
@@ -197,8 +207,8 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
     Action: a rule of the grammar. `info["action_mask"]` (rules,) says which are feasible; one that is not changes nothing.
     Reward: w_u for each object that a stack hides, as soon as it is finished and stands by itself. A stack that does not
         stand ends the episode: what was earned is taken back, and w_s paid. At the end the finished scene is laid out and judged,
-        and what it hides more or less than its stacks is made up for. So the rewards of an episode sum up to w_u times the hidden
-        objects of a stable scene, or to w_s. They are meant to be summed without discount.
+        and what it hides more or less than its stacks is made up for; `balance_reward` is paid for a balanced one. So the rewards
+        of an episode sum up to what a stable scene is worth, or to w_s. They are meant to be summed without discount.
     The last `info` has the `scene` and its `verdict`, or the `fault` (a `StackFault`, or None if there was no room).
     """
 
@@ -258,5 +268,5 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
                 worth, info["fault"] = self.task.instability_reward, partial.fault
             else:
                 info["scene"], info["verdict"] = made
-                worth = self.task.hidden_reward * len(made[1].hidden)
+                worth = partial.worth(len(made[1].hidden))
         return partial.observe(), worth - earned, over, False, info
