@@ -21,9 +21,9 @@ from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
+from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.hold import HexapodHold, JointHold
 from drake_clutter.arm.plan import NoPlan, Plan
-from drake_clutter.arm.planner import PlannerConfig
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json

@@ -11,10 +11,11 @@ from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried
+from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.hold import HexapodHold, HoldMaker, JointHold
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
 from drake_clutter.arm.plan import Plan
-from drake_clutter.arm.planner import PickPlacePlanner, PlannerConfig
+from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.config import ClutterConfig

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from conftest import CLASSES, random_scene, resting, rng
 
+from drake_clutter.arm.attempts import PlannerConfig, inverse, matrix
 from drake_clutter.arm.kinematics import forward_kinematics
 from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner, PlannerConfig, inverse, matrix, rests_on
+from drake_clutter.arm.planner import PickPlacePlanner, rests_on
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.grammar import Orientation
@@ -170,3 +171,41 @@ def test_turned_by_a_quarter() -> None:
     quarter = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
     place = replace(lifted(PILE[0], 0.2, -0.2), quaternion=quarter)
     assert isinstance(planner().plan(PILE, "sugar_box", place), Plan)
+
+
+def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
+    scene, step = planner().clearance_scene(PILE), 1e-4
+    scene.hold(plan.pick, inverse(plan.X_OG))
+    errors = list[float]()
+    for time in np.linspace(0.0, plan.phases[1].duration, 7):
+        q = plan.phases[1].trajectory.value(time).ravel()
+        gradients = scene.gradients(q, 0.2)
+        assert [clearance for clearance, _ in gradients] == scene.close(q, 0.2)
+        pairs = [clearance.pair for clearance, _ in gradients]
+        once = {pair for pair in pairs if pairs.count(pair) == 1}  # some parts have several shapes
+        found = {c.pair: (c.distance, gradient) for c, gradient in gradients if c.pair in once}
+        for joint in range(6):
+            ahead = {c.pair: c.distance for c in scene.close(q + step * np.eye(6)[joint], 0.21)}
+            behind = {c.pair: c.distance for c in scene.close(q - step * np.eye(6)[joint], 0.21)}
+            for pair, (_, gradient) in found.items():
+                sides = (ahead[pair] - found[pair][0]) / step, (found[pair][0] - behind[pair]) / step
+                if abs(sides[0] - sides[1]) < 1e-2:  # not where the nearest corner changes
+                    errors.append(abs(float(gradient[joint] - sum(sides) / 2)))
+    assert len(errors) > 100
+    assert np.quantile(errors, 0.9) < 2e-3
+    assert max(errors) < 0.05  # between faces that are nearly parallel the nearest points jump
+
+
+def test_optimised_ways_are_quicker(plan: Plan) -> None:
+    sure = planner(config=PlannerConfig(optimise=False)).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    assert isinstance(sure, Plan)
+    assert sure.duration == sure.sure == plan.sure
+    assert plan.duration < 0.9 * plan.sure
+    assert all(phase.duration <= phase.sure for phase in plan.phases)
+
+
+def test_from_a_height_the_arm_goes_back_before_it_goes_home() -> None:
+    """Straight home would take the gripper through the box that it has just put there."""
+    box = resting("pudding_box", Orientation.FLAT_0)
+    high = Pose((0.1, 0.0, 0.5), box.X_TO.quaternion)
+    assert isinstance(planner().plan([box], box.name, high), Plan)

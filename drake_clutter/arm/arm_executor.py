@@ -11,11 +11,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
+from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
 from drake_clutter.arm.hold import HexapodHold, HoldMaker
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor
-from drake_clutter.arm.plan import NoPlan, Plan
-from drake_clutter.arm.planner import PickPlacePlanner, PlannerConfig
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.scenes.geometry import touching_groups
@@ -207,11 +208,11 @@ class ArmExecutor:
         self._planner_config = planner or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
-    def plan(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Plan | NoPlan | None:
-        """The plan for a move, or why there is none; None if no place is known to be free."""
+    def plan(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Plan | NoPlan:
+        """The plan for a move, or why there is none."""
         X_TO = choose_placement(observation, move, self._config.exploration, rng)
         if X_TO is None:
-            return None
+            return NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
         return self.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
 
     def planner(self, tray_side: float) -> PickPlacePlanner:
@@ -223,10 +224,10 @@ class ArmExecutor:
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         plan = self.plan(scene, observation, move, rng)
-        if plan is None:
-            return Outcome(MoveResult.NO_FREE_SPOT, scene)
         if isinstance(plan, NoPlan):
-            return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
+            no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
+            result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
+            return Outcome(result, scene, detail="" if no_spot else str(plan))
         simulation = ArmSimulation(self._arm, scene, plan, camera_altitude=self._config.camera.altitude)
         carried = simulation.run(record=True)
         after = scene.at(carried.poses)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SignedDistancePair
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
@@ -31,6 +31,10 @@ class Clearance:
     pair: tuple[str, str] = ("", "")
 
 
+_MOVES_WITH = {"base": 0, "shoulder": 1, "upper_arm": 2, "forearm": 3, "wrist_1": 4, "wrist_2": 5}
+"""How many of the joints move a link; all of them the rest of arm and tool."""
+
+
 class ClearanceScene:
     """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put."""
 
@@ -49,7 +53,7 @@ class ClearanceScene:
         self._scene_graph, self._geometry_context = made.scene_graph, made.scene_graph.GetMyMutableContextFromRoot(self._root)
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
-        self._at, _ = joint_numbers(self.plant, self._arm)
+        self._at, self._v_at = joint_numbers(self.plant, self._arm)
         self._names = self._name_geometries()
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         self._fixed = (self.plant.world_body(), self.plant.GetBodyByName("tray"))
@@ -113,17 +117,60 @@ class ClearanceScene:
         allowed = CollisionFilterDeclaration().ExcludeBetween(self._geometries(self._bodies[name]), self._of_arm("cup"))
         self._transient.append(self._filters.ApplyTransient(allowed))
 
-    def close(self, q: Floats, within: float) -> list[Clearance]:
-        """At joint angles (6,) rad: all that is closer than `within`, m."""
+    def _close(self, q: Floats, within: float) -> list[SignedDistancePair]:
         self._q[self._at] = q
         self.plant.SetPositions(self._context, self._q)
         if self._held is not None:
             name, X_GO = self._held
             X_TG = self._arm.cup.CalcPoseInWorld(self._context).GetAsMatrix4()
             self.plant.SetFreeBodyPose(self._context, self._bodies[name], RigidTransform(X_TG @ X_GO))
-        found = []
-        moves = {self._held[0] if self._held else "", *self._arm_names}
-        for pair in self._query_port.Eval(self._geometry_context).ComputeSignedDistancePairwiseClosestPoints(within):
-            first, second = self._names[pair.id_A], self._names[pair.id_B]
-            found.append(Clearance(float(pair.distance), (first, second) if first in moves else (second, first)))
+        found: list[SignedDistancePair] = self._query_port.Eval(
+            self._geometry_context
+        ).ComputeSignedDistancePairwiseClosestPoints(within)
         return found
+
+    def _named(self, pair: SignedDistancePair) -> Clearance:
+        first, second = self._names[pair.id_A], self._names[pair.id_B]
+        moves = first in self._arm_names or (self._held is not None and first == self._held[0])
+        return Clearance(float(pair.distance), (first, second) if moves else (second, first))
+
+    def close(self, q: Floats, within: float) -> list[Clearance]:
+        """At joint angles (6,) rad: all that is closer than `within`, m."""
+        return [self._named(pair) for pair in self._close(q, within)]
+
+    def gradients(self, q: Floats, within: float) -> list[tuple[Clearance, Floats]]:
+        """As `close`, each with how the distance changes with the joint angles, (6,) m/rad."""
+        pairs = self._close(q, within)
+        if not pairs:
+            return []
+        query, world = self._query_port.Eval(self._geometry_context), self.plant.world_frame()
+        J = self.plant.CalcJacobianSpatialVelocity(
+            self._context, JacobianWrtVariable.kV, self._arm.flange, np.zeros(3), world, world
+        )[:, self._v_at]
+        p_TF = self._arm.flange.CalcPoseInWorld(self._context).translation()
+        found = []
+        for pair in pairs:
+            gradient = np.zeros(6)
+            for geometry, p_S, sign in ((pair.id_A, pair.p_ACa, 1.0), (pair.id_B, pair.p_BCb, -1.0)):
+                if joints := self._joints_that_move(self._names[geometry]):
+                    n, p_FC = sign * pair.nhat_BA_W, query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
+                    x, y, z = p_FC
+                    moment = (y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0])  # p_FC x n
+                    gradient[:joints] += np.append(moment, n) @ J[:, :joints]
+            found.append((self._named(pair), gradient))
+        return found
+
+    def cup_jacobian(self, q: Floats) -> Floats:
+        """(6, 6) at joint angles (6,) rad: how the cup turns (first three rows) and moves, in T."""
+        self._q[self._at] = q
+        self.plant.SetPositions(self._context, self._q)
+        world = self.plant.world_frame()
+        J = self.plant.CalcJacobianSpatialVelocity(
+            self._context, JacobianWrtVariable.kV, self._arm.cup, np.zeros(3), world, world
+        )
+        return np.asarray(J[:, self._v_at])
+
+    def _joints_that_move(self, name: str) -> int:
+        if name in self._arm_names:
+            return _MOVES_WITH.get(name, 6)
+        return 6 if self._held is not None and name == self._held[0] else 0

@@ -47,6 +47,11 @@ class Payload:
     p_GCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acceleration: float = math.inf
 
+    @property
+    def along_axis(self) -> float:
+        """m/s^2, along each axis alone, so that the vector is within the limit."""
+        return self.acceleration / math.sqrt(3)
+
 
 @lru_cache(maxsize=64)
 def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], base: tuple[float, ...]) -> MultibodyPlant:
@@ -76,6 +81,13 @@ def nearest_turns(q: Floats, reference: Floats) -> Floats:
     turned = q + 2 * np.pi * np.round((reference - q) / (2 * np.pi))
     over = np.abs(turned) > JOINT_RANGE
     return np.asarray(np.where(over, turned - 2 * np.pi * np.sign(turned), turned))
+
+
+def least_time(turns: Floats) -> Floats:
+    """(...) s, in which joints turn so far (..., 6) rad from rest to rest, by their limits of speed and acceleration alone."""
+    far, speed, acceleration = np.abs(turns), VELOCITY_LIMIT, ACCELERATION_LIMIT
+    quick = far < speed**2 / acceleration
+    return np.asarray(np.where(quick, 2 * np.sqrt(far / acceleration), far / speed + speed / acceleration).max(axis=-1))
 
 
 def straight(start: Floats, end: Floats) -> Floats:
@@ -112,8 +124,7 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     toppra.AddJointAccelerationLimit(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
     toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)
     if math.isfinite(payload.acceleration):
-        # The load's centre of mass; along each axis, so that the vector is within the limit.
-        limit = np.array([np.inf] * 3 + [payload.acceleration / math.sqrt(3)] * 3)
+        limit = np.array([np.inf] * 3 + [payload.along_axis] * 3)  # of the load's centre of mass
         toppra.AddFrameAccelerationLimit(plant.GetFrameByName("load"), -limit, limit)
     speed = toppra.SolvePathParameterization()
     return None if speed is None else PathParameterizedTrajectory(path, speed)

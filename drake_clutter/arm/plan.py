@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 class PlanFailure(Enum):
     """Why there is no plan."""
 
+    NO_FREE_SPOT = "no free spot"
     NO_SEAL = "no seal"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"
@@ -58,11 +59,13 @@ class Phase:
         name: approach, carry or retreat.
         trajectory: q (6,) rad over time, s.
         clearance: the least along it, densely checked, of what was not allowed to touch.
+        sure: s, that the sure way takes; the duration, unless the way was optimised.
     """
 
     name: str
     trajectory: Trajectory
     clearance: Clearance
+    sure: float
 
     @property
     def duration(self) -> float:
@@ -97,6 +100,11 @@ class Plan:
     def duration(self) -> float:
         """s, of the motion."""
         return sum(phase.duration for phase in self.phases)
+
+    @property
+    def sure(self) -> float:
+        """s, of the motion along the sure ways."""
+        return sum(phase.sure for phase in self.phases)
 
     def __deepcopy__(self, memo: object) -> "Plan":
         """Itself: it never changes, and Drake copies abstract values again and again."""

@@ -35,7 +35,7 @@ class ArmConfig:
     """
 
     base: list[float] = field(default_factory=lambda: [-0.65, 0.0, 0.30, 0.0])
-    home: list[float] = field(default_factory=lambda: [2.622, -2.285, 2.329, -1.615, -np.pi / 2, -2.091])
+    home: list[float] = field(default_factory=lambda: [-2.741, -1.766, 2.556, -1.798, -1.349, 0.337])
     suction: SuctionConfig = field(default_factory=SuctionConfig)
     payload: float = 10.0
 
