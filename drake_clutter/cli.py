@@ -2,23 +2,41 @@
 
 import dataclasses
 import json
-import sys
-import time
-from collections.abc import Iterable, Iterator
-from contextlib import redirect_stdout
+from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from drake_clutter.cli_arm import replay
+from drake_clutter.cli_options import (
+    CatalogueOption,
+    ConfigOption,
+    Fidelity,
+    FidelityOption,
+    HtmlOption,
+    JsonOption,
+    MaxMovesOption,
+    NodesOption,
+    ObjectsOption,
+    OutOption,
+    RayOption,
+    SceneArgument,
+    SeedOption,
+    WorkersOption,
+    err_console,
+    load,
+    out_console,
+    plain,
+    show,
+    tracked,
+    watch,
+)
 from drake_clutter.files import InputError, output_directory, told_in_one_line
 
 if TYPE_CHECKING:
-    from drake_clutter.scenes.scene_file import SceneFile
     from drake_clutter.tasks.exploration import Step
 
 app = typer.Typer(
@@ -28,9 +46,7 @@ app = typer.Typer(
 )
 assets_app = typer.Typer(help="Build the models of object classes.", no_args_is_help=True)
 app.add_typer(assets_app, name="assets")
-
-_err = Console(stderr=True)
-_out = Console()
+app.command()(replay)
 
 
 class ExplorerName(Enum):
@@ -39,14 +55,6 @@ class ExplorerName(Enum):
     RANDOM = "random"
     LARGEST_FIRST = "largest-first"
     LARGEST_CLEAR = "largest-clear"
-
-
-class Fidelity(Enum):
-    """How moves are carried out."""
-
-    FAST = "fast"
-    SETTLE = "settle"
-    ARM = "arm"
 
 
 class Format(Enum):
@@ -58,74 +66,17 @@ class Format(Enum):
     GLB = "glb"
 
 
-SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A scene file.")]
-OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; new or empty.")]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same result.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
-CatalogueOption = Annotated[
-    Path | None, typer.Option("--catalogue", metavar="DIR", help="An asset folder with object classes of your own.")
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="YAML with the config's fields that differ from the defaults.")
-]
-ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")]
-MaxMovesOption = Annotated[
-    int | None, typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given.")
-]
-WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
-RayOption = Annotated[
-    str | None, typer.Option("--ray", metavar="ADDRESS", help="Put the workers on this Ray cluster, e.g. auto, instead of here.")
-]
-FidelityOption = Annotated[
-    Fidelity,
-    typer.Option(
-        help="arm: the UR10 carries every move out. Else objects are teleported; settle: Drake settles what a move touched; "
-        "fast: by equilibrium, Drake in doubt."
-    ),
-]
-NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
-
-
 def main() -> None:
     """The console script: a user's mistake is one line and exit code 2."""
     with told_in_one_line():
         app()
 
 
-def _plain(text: str) -> str:
-    return text.replace("[", "\\[")
-
-
-def _print(fields: dict[str, Any], as_json: bool, title: str) -> None:
-    if as_json:
-        print(json.dumps(fields, indent=2))
-        return
-    table = Table("", "", title=title, show_header=False)
-    for key, value in fields.items():
-        if isinstance(value, float):
-            value = f"{value:.4g}"
-        elif isinstance(value, list | tuple) and value and isinstance(value[0], float):
-            value = " to ".join(f"{v:.4g}" for v in value)
-        elif isinstance(value, list | tuple):
-            value = ", ".join(str(v) for v in value) or "none"
-        elif isinstance(value, dict):
-            value = ", ".join(f"{v} {k}" for k, v in value.items()) or "none"
-        table.add_row(key.replace("_", " "), _plain(str(value)))
-    _out.print(table)
-
-
-def _load(scene: Path, catalogue: Path | None) -> "SceneFile":
-    from drake_clutter.catalogue import load_catalogue
-    from drake_clutter.scenes.scene_file import load_scene
-
-    return load_scene(scene, load_catalogue(catalogue))
-
-
 def _report(step: "Step") -> None:
     found = f", found {', '.join(step.newly_found)}" if step.newly_found else ""
     reasons = [str(reason) for reason in (step.outcome.instability, step.outcome.detail) if reason]
     why = f" ({'; '.join(reasons)})" if reasons else ""
-    _err.print(f"{step.move}: {step.outcome.result.value}{why}{found}", highlight=False)
+    err_console.print(f"{step.move}: {step.outcome.result.value}{why}{found}", highlight=False)
 
 
 @app.command()
@@ -153,11 +104,11 @@ def generate(
     job = GenerationJob(agent, objects, catalogue, nodes, seed, load_config(config), temperature)
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-        return _tracked("scenes", made, done, total)
+        return tracked("scenes", made, done, total)
 
     summary = command.generate(job, count, out, workers, progress, ray)
     shown = {key: value for key, value in summary.items() if key != "config"}
-    _print(summary if as_json else shown, as_json, f"{out}")
+    show(summary if as_json else shown, as_json, f"{out}")
 
 
 @app.command()
@@ -176,7 +127,7 @@ def explore(
     from drake_clutter.commands import explore as command
     from drake_clutter.config import load_config
 
-    world, file = load_config(config), _load(scene, catalogue)
+    world, file = load_config(config), load(scene, catalogue)
     output_directory(out)
     limit = max_moves or world.exploration.max_moves
     task = command.explore(command.at_rest(file.scene, world, seed), agent.value, fidelity.value, limit, seed, world, _report)
@@ -187,10 +138,10 @@ def explore(
 
 def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
     if as_json:
-        _print(fields, True, "")
+        show(fields, True, "")
         return
     shown = {key: fields[key] for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")}
-    _print(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
+    show(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
 
 
 @app.command()
@@ -218,7 +169,7 @@ def evaluate(
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
-        return _tracked("episodes", results, 0, total)
+        return tracked("episodes", results, 0, total)
 
     rows = command.evaluate(played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray)
     if as_json:
@@ -235,18 +186,7 @@ def evaluate(
         )
         ended = ", ".join(f"{n} {why}" for why, n in row["ended"].items())
         table.add_row(row["agent"], str(row["episodes"]), *numbers, f"{row['moves_mean']:.1f}", ended)
-    _out.print(table)
-
-
-def _tracked(what: str, items: Iterable[Any], done: int, total: int) -> Iterator[Any]:
-    """The items, with a progress bar that appears with the first of them.
-
-    While they are made, standard output goes to standard error: Ray writes what it has to say there, and --json's result has to
-    stay alone.
-    """
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with redirect_stdout(sys.stderr), Progress(*columns, console=_err) as bar:
-        yield from bar.track(items, total=total, completed=done)
+    out_console.print(table)
 
 
 @app.command()
@@ -257,6 +197,9 @@ def move(
     place: Annotated[str | None, typer.Option(help="Name of the object to put it on, or tray.")] = None,
     moves: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}.")] = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
+    plan_only: Annotated[
+        bool, typer.Option("--plan-only", help="With --fidelity arm: write how the arm would move (plan.json), move nothing.")
+    ] = False,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
@@ -269,9 +212,15 @@ def move(
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
         raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
+    if plan_only and fidelity is not Fidelity.ARM:
+        raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
     chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
-    world, file = load_config(config), _load(scene, catalogue)
+    world, file = load_config(config), load(scene, catalogue)
     output_directory(out)
+    if plan_only:
+        plans = command.plan_only(command.at_rest(file.scene, world, seed), chosen, seed, world, out)
+        show({"plans": plans} if as_json else command.plans_in_words(plans), as_json, f"{out}")
+        return
     task = command.carry_out(command.at_rest(file.scene, world, seed), chosen, seed, world, _report, fidelity.value)
     fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed)
     _print_episode(fields, as_json, out)
@@ -291,10 +240,10 @@ def solve(
     from drake_clutter.commands import explore, solve
     from drake_clutter.config import load_config
 
-    world, file = load_config(config), _load(scene, catalogue)
+    world, file = load_config(config), load(scene, catalogue)
     output_directory(out)
     fields = solve.solve(explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, _report)
-    _print(fields, as_json, f"{out}")
+    show(fields, as_json, f"{out}")
 
 
 @app.command()
@@ -320,27 +269,16 @@ def demo(
 @app.command()
 def view(
     scene: SceneArgument,
-    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page instead of showing it live.")] = None,
+    html: HtmlOption = None,
     laid_out: Annotated[bool, typer.Option("--laid-out", help="Show the objects as laid out, not as settled.")] = False,
     catalogue: CatalogueOption = None,
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
-    from drake_clutter.reports.recording import serve, write_recording
     from drake_clutter.scenes.seams import Frame
 
-    file = _load(scene, catalogue)
+    file = load(scene, catalogue)
     shown = file.scene if laid_out else file.settled_scene
-    if html is not None:
-        try:
-            write_recording(html, shown, [Frame(0.0, shown.poses)])
-        except OSError as error:
-            raise InputError(f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write") from error
-        _out.print(f"wrote {html}")
-        return
-    meshcat = serve(shown)
-    _out.print(f"{scene} is at {meshcat.web_url()}; Ctrl-C ends it")
-    while True:
-        time.sleep(1)
+    watch(scene, shown, [Frame(0.0, shown.poses)], html)
 
 
 @app.command()
@@ -349,10 +287,10 @@ def render(scene: SceneArgument, out: OutOption, catalogue: CatalogueOption = No
     from drake_clutter.commands.render import render_scene
     from drake_clutter.config import load_config
 
-    world, file = load_config(config), _load(scene, catalogue)
+    world, file = load_config(config), load(scene, catalogue)
     output_directory(out)
     shares = render_scene(file.settled_scene, world, out)
-    _print({name: round(share, 3) for name, share in shares.items()}, False, "visible share")
+    show({name: round(share, 3) for name, share in shares.items()}, False, "visible share")
 
 
 @app.command()
@@ -366,9 +304,9 @@ def export(
     """Export a scene to a self-contained folder."""
     from drake_clutter.export import ExportFormat, export_scene
 
-    file = _load(scene, catalogue)
+    file = load(scene, catalogue)
     output_directory(out)
-    _out.print(f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}")
+    out_console.print(f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}")
 
 
 @app.command()
@@ -382,9 +320,9 @@ def doctor(as_json: JsonOption = False) -> None:
     else:
         table = Table("", "check", "found", "how to mend it")
         for check in found:
-            remedy = "" if check.ok else _plain(check.remedy)
-            table.add_row("[green]ok" if check.ok else "[red]no", check.name, _plain(check.detail), remedy)
-        _out.print(table)
+            remedy = "" if check.ok else plain(check.remedy)
+            table.add_row("[green]ok" if check.ok else "[red]no", check.name, plain(check.detail), remedy)
+        out_console.print(table)
     if not all(check.ok for check in found):
         raise typer.Exit(1)
 
@@ -398,4 +336,4 @@ def build(
     from drake_clutter.assets import build_assets
 
     for built in build_assets(folder, only):
-        _out.print(f"built {built}")
+        out_console.print(f"built {built}")

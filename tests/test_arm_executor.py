@@ -152,7 +152,8 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
 
 def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None:
     motion = ArmSimulation(ArmConfig(), SCENE, plan, camera_altitude=1.6).run(record=True).motion
-    assert motion[0].q == pytest.approx(ArmConfig().home, abs=0.01)
+    assert motion[0].arm is not None
+    assert motion[0].arm.q == pytest.approx(ArmConfig().home, abs=0.01)
     moments = arm_moments(motion, "sugar_box")
     times = [frame.time for frame in moments]
     assert times == sorted(times)
@@ -164,7 +165,7 @@ def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None
     quarters = np.split(picture.astype(int), 4, axis=1)
     assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"
     write_recording(tmp_path / "with.html", SCENE, motion[::8])
-    write_recording(tmp_path / "without.html", SCENE, [replace(frame, q=()) for frame in motion[::8]])
+    write_recording(tmp_path / "without.html", SCENE, [replace(frame, arm=None) for frame in motion[::8]])
     with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))
     assert with_arm > without + 20_000, "its links, and their key frames"
 

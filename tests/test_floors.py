@@ -18,7 +18,7 @@ FLOORS = {
     5: {"tasks"},
     6: {"agents"},
     7: {"systems"},
-    8: {"cli", "commands", "doctor", "reports"},
+    8: {"cli", "cli_arm", "cli_options", "commands", "doctor", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts)

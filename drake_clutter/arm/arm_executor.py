@@ -166,8 +166,8 @@ class ArmSimulation:
             now = desired.Eval(self.executor.GetMyContextFromRoot(root))[:6]
             tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))
             if record:
-                q = tuple(station.joint_angles(context).tolist())
-                motion.append(Frame(root.get_time(), station.scene.poses(context), q))
+                state = station.arm_state(context, self._vacuum_wanted(root))
+                motion.append(Frame(root.get_time(), station.scene.poses(context), state))
         return self._judged(context, tracking, tuple(motion))
 
     def _judged(self, context: Context, tracking: float, motion: tuple[Frame, ...]) -> Carried:

@@ -20,6 +20,7 @@ from drake_clutter.arm.station import ArmConfig, add_arm, joint_numbers
 from drake_clutter.arm.suction import load_share, unevenness
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.seams import ArmState
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -64,7 +65,7 @@ class ClutterStation(Diagram):
         lockable = [(n, b) for n, b in bodies if n != jointed]
         self._joints = {n: plant.get_joint(i) for n, b in lockable for i in plant.GetJointIndices(b.model_instance())}
         self._locked_filter: FilterId | None = None
-        self._q_at, _ = joint_numbers(plant, self.arm)
+        self._q_at, self._v_at = joint_numbers(plant, self.arm)
         ports = (("desired_state", plant.get_desired_state_input_port), ("feed_forward", plant.get_actuation_input_port))
         for name, port in ports:
             builder.ExportInput(port(self.arm.robot), name)
@@ -93,6 +94,12 @@ class ClutterStation(Diagram):
     def joint_angles(self, context: Context) -> Floats:
         """(6,) rad, from the plant's context."""
         return np.asarray(self.plant.GetPositions(context)[self._q_at])
+
+    def arm_state(self, context: Context, suction: bool) -> ArmState:
+        """From the plant's context, with the torques of the last step."""
+        torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
+        q, v = self.joint_angles(context), self.plant.GetVelocities(context)[self._v_at]
+        return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
 
     def lock_all_but(self, root: Context, free: Set[str]) -> None:
         """Makes all objects immovable but some. Those that were free must be at rest: what is locked stands still.

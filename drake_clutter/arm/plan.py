@@ -7,6 +7,7 @@ Frames: T the tray, G the cup, O the picked object. A move is three paths betwee
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,3 +110,35 @@ class Plan:
     def __deepcopy__(self, memo: object) -> "Plan":
         """Itself: it never changes, and Drake copies abstract values again and again."""
         return self
+
+
+def plan_fields(found: Plan | NoPlan) -> dict[str, Any]:
+    """A plan as a document: its phases' ways sampled at 100 Hz (s, rad); or why there is none."""
+    if isinstance(found, NoPlan):
+        number = found.number if math.isfinite(found.number) else None  # infinite: the lip is partly in the air
+        return {"planned": False, "reason": found.reason.value, "about": found.about, "number": number, "seconds": found.seconds}
+    phases = []
+    for phase in found.phases:
+        times = np.linspace(0.0, phase.duration, math.ceil(100 * phase.duration) + 1)
+        near = math.isfinite(phase.clearance.distance)
+        phases.append(
+            {
+                "name": phase.name,
+                "duration": phase.duration,
+                "sure_duration": phase.sure,
+                "clearance": phase.clearance.distance if near else None,
+                "between": list(phase.clearance.pair) if near else [],
+                "time": times.tolist(),
+                "q": phase.trajectory.vector_values(times).T.tolist(),
+            }
+        )
+    pose = found.X_TO_place
+    return {
+        "planned": True,
+        "place": {"translation": list(pose.translation), "quaternion": list(pose.quaternion)},
+        "X_OG": found.X_OG.tolist(),
+        "duration": found.duration,
+        "phases": phases,
+        "attempts": found.attempts,
+        "seconds": found.seconds,
+    }

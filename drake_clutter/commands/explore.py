@@ -8,6 +8,10 @@ import yaml
 
 from drake_clutter.agents.exploration import EXPLORATION_AGENTS, play
 from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator
+from drake_clutter.arm.arm_executor import ArmExecutor
+from drake_clutter.arm.plan import plan_fields
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.trajectory_file import write_trajectories
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -60,6 +64,14 @@ def explore(
     return task
 
 
+def _check_names(moves: Sequence[Move], number: int, in_view: Sequence[str], scene: Scene) -> None:
+    move = moves[number]
+    for role, name, allowed in (("pick", move.pick, in_view), ("place", move.place, [TRAY, *in_view])):
+        if name not in allowed or (role == "place" and name == move.pick):
+            known = "is not in view, or the object itself" if name in (*scene.names, TRAY) else "is not in the scene"
+            raise InputError(f"move {number + 1}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}")
+
+
 def carry_out(
     scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, report: Report, fidelity: str = "settle"
 ) -> ExplorationTask:
@@ -69,16 +81,43 @@ def carry_out(
         InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
     """
     task, rng = _task(scene, config, len(moves), fidelity), item_rng(seed)
-    for number, move in enumerate(moves, start=1):
-        in_view = [d.name for d in task.look.observation.detections]
-        for role, name, allowed in (("pick", move.pick, in_view), ("place", move.place, [TRAY, *in_view])):
-            if name not in allowed or (role == "place" and name == move.pick):
-                known = "is not in view, or the object itself" if name in (*scene.names, TRAY) else "is not in the scene"
-                raise InputError(f"move {number}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}")
+    for number, move in enumerate(moves):
+        _check_names(moves, number, [d.name for d in task.look.observation.detections], task.scene)
         report(task.step(move, rng))
         if task.end is EpisodeEnd.COLLAPSED:
             break
     return task
+
+
+def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path) -> list[dict[str, Any]]:
+    """Plans how the arm would carry out each move in a scene at rest, as it is; writes `plan.json`, and returns what it holds.
+
+    Raises:
+        InputError: as `carry_out`.
+    """
+    look, rng, executor = LabelDetector(config.camera).look(scene), item_rng(seed), ArmExecutor(config)
+    plans = list[dict[str, Any]]()
+    for number, move in enumerate(moves):
+        _check_names(moves, number, [d.name for d in look.observation.detections], scene)
+        found = executor.plan(scene, look.observation, move, rng)
+        plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
+    write_json(out / "plan.json", {"seed": seed, "plans": plans})
+    return plans
+
+
+def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What of `plan.json` fits on a screen."""
+    words = {}
+    for plan in plans:
+        move = f"{plan['move']['pick']} to {plan['move']['place']}"
+        if plan["planned"]:
+            parts = [f"{phase['name']} {phase['duration']:.2f} s" for phase in plan["phases"]]
+            nearest = min((phase["clearance"] for phase in plan["phases"] if phase["clearance"] is not None), default=None)
+            clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
+            words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['seconds']:.2f} s"
+        else:
+            words[move] = f"no plan: {plan['reason']}{': ' + plan['about'] if plan['about'] else ''}"
+    return words
 
 
 def read_moves(path: Path) -> list[Move]:
@@ -136,10 +175,15 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
 def write_episode(
     out: Path, task: ExplorationTask, title: str, agent: str, fidelity: str, seed: int, **more: int
 ) -> dict[str, Any]:
-    """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds."""
+    """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
+
+    At fidelity `arm` also `trajectory.h5`, see `arm/trajectory_file.py`.
+    """
     fields = {**more, **episode_fields(task, agent, fidelity, seed)}
     save_scene(out / "after.yaml", task.scene)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
+    if fidelity == "arm":
+        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], ArmConfig())
     write_json(out / "episode.json", fields)
     return fields
 

@@ -60,7 +60,8 @@ def strip(scene: Scene, frames: Sequence[Frame]) -> NDArray[np.uint8]:
     for frame in frames:
         for name, body in made.bodies.items():
             plant.SetFreeBodyPose(context, body, rigid_transform(frame.poses[name]))
-        set_joint_angles(plant, context, arm, frame.q)
+        assert frame.arm is not None, "these are an arm's motions"
+        set_joint_angles(plant, context, arm, frame.arm.q)
         query = query_port.Eval(made.scene_graph.GetMyContextFromRoot(root))
         color = query.RenderColorImage(camera, query.inspector().world_frame_id(), X_TC).data[:, :, :3]
         pictures.append(np.asarray(Image.fromarray(color).resize(_SIZE, Image.Resampling.LANCZOS)))

@@ -138,7 +138,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         notes.append(f"{escape(_fall_in_words(outcome.instability))}.")
     if outcome.detail:
         notes.append(f"{escape(outcome.detail)}.")
-    if outcome.motion and outcome.motion[0].q:
+    if outcome.motion and outcome.motion[0].arm:
         moments = arm_moments(outcome.motion, step.move.pick)
         alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"
         figures += pictures.figure(f"move_{number:02d}_arm", strip(scene, moments), alt, "The arm: lift, carry, place, retreat.")

@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,20 +64,29 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
         if not step.outcome.result.carried_out:
             continue
         pick, motion = step.move.pick, step.outcome.motion
-        if not (motion and motion[0].q):
+        if not (motion and motion[0].arm):
             for X_TO in _carried(scene, pick, step.outcome.released or step.outcome.scene[pick].X_TO):
                 poses[pick] = X_TO
                 frames.append(Frame(time, dict(poses)))
                 time += 1 / FRAMES_PER_SECOND
         for frame in motion:
             poses |= frame.poses
-            frames.append(Frame(time + frame.time, dict(poses), frame.q))
+            frames.append(Frame(time + frame.time, dict(poses), frame.arm))
         scene = step.outcome.scene
         poses = dict(scene.poses)
         time = frames[-1].time + _PAUSE
         frames.append(Frame(time, dict(poses)))
     frames.append(Frame(frames[-1].time + _LONG_PAUSE, dict(poses)))
     return frames
+
+
+def joined(motions: Sequence[Sequence[Frame]]) -> list[Frame]:
+    """Motions one after the other, with pauses."""
+    frames, time = list[Frame](), 0.0
+    for motion in motions:
+        frames += [replace(frame, time=time + frame.time) for frame in motion]
+        time = frames[-1].time + _PAUSE
+    return [*frames, replace(frames[-1], time=frames[-1].time + _LONG_PAUSE)]
 
 
 def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
@@ -108,7 +118,12 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
         scene: the objects, and the pose of those that a frame does not name.
         frames: in order of time; a single one is a still scene.
     """
-    known = [frame.q for frame in frames if frame.q]
+    # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
+    write_text(path, _SOURCE_COMMENT.sub("", _animated(scene, frames).StaticHtml()))
+
+
+def _animated(scene: Scene, frames: Sequence[Frame]) -> Meshcat:
+    known = [frame.arm.q for frame in frames if frame.arm]
     with _quiet():
         meshcat, paths, arm_poses = _shown(scene, arm=bool(known))
     if len(frames) > 1:
@@ -119,20 +134,18 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
         numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
         all_poses, q = list[dict[str, Pose]](), known[0] if known else ()
         for frame in frames:
-            q = frame.q or q  # it stays where it was
+            q = frame.arm.q if frame.arm else q  # it stays where it was
             all_poses.append({**scene.poses, **frame.poses, **arm_poses(q)})
         for name, shown_at in paths.items():
             for index, pose in _key_frames([poses[name] for poses in all_poses]):
                 animation.SetTransform(numbers[index], shown_at, rigid_transform(pose))
         meshcat.SetAnimation(animation)
-    # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
-    write_text(path, _SOURCE_COMMENT.sub("", meshcat.StaticHtml()))
+    return meshcat
 
 
-def serve(scene: Scene) -> Meshcat:
-    """Shows a scene at `web_url()` of what is returned, on this machine only, for as long as that is kept."""
-    with _quiet():
-        return _shown(scene)[0]
+def serve(scene: Scene, frames: Sequence[Frame] = ()) -> Meshcat:
+    """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
+    return _animated(scene, frames)
 
 
 @contextmanager

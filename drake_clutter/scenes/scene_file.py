@@ -129,9 +129,18 @@ def load_scene(path: Path, catalogue: Catalogue) -> SceneFile:
         InputError: the file, the field and what is allowed, for whatever cannot be a scene.
     """
     try:
-        document = _Reader(yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.CSafeLoader), str(path))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not YAML, or cut off ({error})") from error
+    return scene_from_text(text, str(path), catalogue)
+
+
+def scene_from_text(text: str, path: str, catalogue: Catalogue) -> SceneFile:
+    """Reads what a scene file holds; see `load_scene`. `path` is how errors name it."""
+    try:
+        document = _Reader(yaml.load(text, Loader=yaml.CSafeLoader), path)
     except Exception as error:  # its constructors raise whatever a bad date, number or nesting leads to
         raise InputError(f"{path}: is not YAML, or cut off ({error})") from error
     fields = document.mapping(("version", "objects"), ("tray", "graph", "derivation", "seed", "verdict"))
@@ -280,5 +289,10 @@ def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
 
 def save_scene(path: Path, scene: Scene, verdict: Verdict | None = None) -> None:
     """Writes a scene file in one step."""
-    text = yaml.dump(scene_fields(scene, verdict), Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=160)
-    write_text(path, text)
+    write_text(path, scene_text(scene, verdict))
+
+
+def scene_text(scene: Scene, verdict: Verdict | None = None) -> str:
+    """What a scene file holds."""
+    fields = scene_fields(scene, verdict)
+    return str(yaml.dump(fields, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=160))

@@ -141,18 +141,33 @@ class MoveResult(Enum):
 
 
 @dataclass(frozen=True)
+class ArmState:
+    """An arm at a time.
+
+    Attributes:
+        q, v, torque: rad, rad/s, and N m of the motors, by joint.
+        suction: whether the vacuum is switched on.
+    """
+
+    q: tuple[float, ...]
+    v: tuple[float, ...]
+    torque: tuple[float, ...]
+    suction: bool
+
+
+@dataclass(frozen=True)
 class Frame:
     """Where the objects were at a time.
 
     Attributes:
         time: s since the move began.
         poses: X_TO by name.
-        q: rad, joint angles of the arm that carries them; none if they move by themselves.
+        arm: that carries them; None if they move by themselves.
     """
 
     time: float
     poses: Mapping[str, Pose]
-    q: tuple[float, ...] = ()
+    arm: ArmState | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,98 @@
+"""Recorded arm motions as HDF5, for a researcher's own analysis and for `drake-clutter replay`.
+
+Attributes of the file: `version`, `scene` (a scene file's text: how everything lay at first), `arm` (an `ArmConfig` as YAML).
+A group `move_0001`, ... for each move that the arm carried out; its attributes are `pick`, `place`, `result` and `detail`, its
+datasets, over n moments:
+
+    time     (n,)             s, since the move began
+    q        (n, 6)           rad
+    v        (n, 6)           rad/s
+    torque   (n, 6)           N m, of the motors
+    suction  (n,)             whether the vacuum is switched on
+    X_TO     (n, objects, 7)  qw, qx, qy, qz, x, y, z (m), in the order of the scene file's objects
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.catalogue import Catalogue
+from drake_clutter.config import config_yaml
+from drake_clutter.files import InputError, replacing
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene_file import scene_from_text, scene_text
+from drake_clutter.scenes.seams import ArmState, Frame, Move, Outcome
+
+VERSION = 1
+_ARM = ("q", "v", "torque")
+
+
+def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], arm: ArmConfig) -> int:
+    """Writes the moves of which there is an arm's motion, in one step; returns how many there are.
+
+    Args:
+        path: the file.
+        start: the scene before the first move.
+        moves: and what they led to.
+        arm: that carried them out.
+    """
+    count = 0
+    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update({"version": VERSION, "scene": scene_text(start), "arm": config_yaml(arm)})
+        for move, outcome in moves:
+            states = [frame.arm for frame in outcome.motion if frame.arm]
+            if not states:
+                continue
+            count += 1
+            group = file.create_group(f"move_{count:04d}")
+            group.attrs.update({"pick": move.pick, "place": move.place, "result": outcome.result.value, "detail": outcome.detail})
+            arrays = {name: np.array([getattr(state, name) for state in states]) for name in _ARM}
+            arrays["time"] = np.array([frame.time for frame in outcome.motion])
+            arrays["suction"] = np.array([state.suction for state in states])
+            poses = [[frame.poses[o.name] for o in start.objects] for frame in outcome.motion]
+            arrays["X_TO"] = np.array([[(*X.quaternion, *X.translation) for X in row] for row in poses])
+            for name, values in arrays.items():
+                group.create_dataset(name, data=values, compression="gzip", shuffle=True)
+    return count
+
+
+def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, list[tuple[Move, tuple[Frame, ...]]]]:
+    """The scene at first, and the motion of each move.
+
+    Raises:
+        InputError: the file, the field and what is allowed, for whatever cannot be such a file.
+    """
+    try:
+        file = h5py.File(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as HDF5 ({error})") from error
+    with file:
+        if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
+            raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
+        scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
+        return scene, [_move(path, name, file[name], scene) for name in sorted(file)]
+
+
+def _move(path: Path, name: str, group: h5py.Group, scene: Scene) -> tuple[Move, tuple[Frame, ...]]:
+    arrays: dict[str, NDArray[np.float64]] = {}
+    shapes = {"time": (), "q": (6,), "v": (6,), "torque": (6,), "suction": (), "X_TO": (len(scene.objects), 7)}
+    for field, shape in shapes.items():
+        found = group.get(field)
+        if not isinstance(found, h5py.Dataset) or len(found.shape) == 0 or found.shape[1:] != shape:
+            raise InputError(f"{path}:{name}.{field}; allowed is a dataset of shape {('n', *shape)}")
+        arrays[field] = found[()]
+    lengths = {field: len(values) for field, values in arrays.items()}
+    if len(set(lengths.values())) != 1:
+        raise InputError(f"{path}:{name}: lengths {lengths}; allowed is one and the same")
+    frames = []
+    for k, time in enumerate(arrays["time"].tolist()):
+        q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM)
+        arm = ArmState(q, v, torque, bool(arrays["suction"][k]))
+        rows = arrays["X_TO"][k].tolist()
+        poses = {o.name: Pose(tuple(row[4:]), tuple(row[:4])) for o, row in zip(scene.objects, rows, strict=True)}
+        frames.append(Frame(time, poses, arm))
+    return Move(str(group.attrs["pick"]), str(group.attrs["place"])), tuple(frames)

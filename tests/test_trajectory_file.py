@@ -1,0 +1,103 @@
+"""Recorded motions: written, read back the same, refused when they are something else, replayed from the command line."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import resting, rng, scene_of
+from typer.testing import CliRunner
+
+from drake_clutter.arm.arm_executor import ArmExecutor
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.trajectory_file import read_trajectories, write_trajectories
+from drake_clutter.arm.ur10 import LINKS
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cli import app
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.scenes.seams import Move, MoveResult, Outcome
+
+SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", floor=0.035), resting("large_marker", xy=(0.2, 0.2)))
+MOVES = (Move("gelatin_box"), Move("large_marker"))
+
+
+@pytest.fixture(scope="module")
+def outcomes(config: ClutterConfig, detector: LabelDetector) -> list[tuple[Move, Outcome]]:
+    observation, executor = detector.look(SCENE).observation, ArmExecutor(config)
+    return [(move, executor.execute(SCENE, observation, move, rng())) for move in MOVES]
+
+
+@pytest.fixture
+def file(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> Path:
+    path = tmp_path / "trajectory.h5"
+    assert write_trajectories(path, SCENE, outcomes, ArmConfig()) == 1, "the marker is not moved"
+    return path
+
+
+def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Outcome]]) -> None:
+    scene, moves = read_trajectories(file, load_catalogue())
+    assert scene.poses == SCENE.poses
+    ((move, motion),) = moves
+    assert move == MOVES[0]
+    written = outcomes[0][1].motion
+    assert [frame.time for frame in motion] == [frame.time for frame in written]
+    assert [frame.arm for frame in motion] == [frame.arm for frame in written]
+    for frame, other in zip(motion, written, strict=True):
+        for name in scene.names:
+            assert frame.poses[name].translation == other.poses[name].translation
+            assert frame.poses[name].quaternion == pytest.approx(other.poses[name].quaternion)
+
+
+def test_the_arrays_belong_together(file: Path) -> None:
+    with h5py.File(file) as stored:
+        move = stored["move_0001"]
+        time, q, v, torque, suction = (move[name][()] for name in ("time", "q", "v", "torque", "suction"))
+        assert move.attrs["result"] == MoveResult.PLACED.value
+        assert move["X_TO"].shape == (len(time), 3, 7)
+    middle = (q[2:] - q[:-2]) / (time[2:] - time[:-2])[:, None]
+    assert np.abs(middle - v[1:-1]).max() < 0.15
+    assert np.abs(torque).max() > 10
+    assert (np.abs(torque) <= [1.01 * link.torque for link in LINKS]).all()
+    assert (np.abs(v) <= [1.01 * link.speed for link in LINKS]).all()
+    switches = np.flatnonzero(np.diff(suction.astype(int)))
+    assert len(switches) == 2, "on once, off once"
+
+
+def test_what_is_no_such_file_is_refused(file: Path, tmp_path: Path) -> None:
+    catalogue = load_catalogue()
+    (tmp_path / "text.h5").write_text("text")
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
+        read_trajectories(tmp_path / "text.h5", catalogue)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["x"] = 1
+    with pytest.raises(InputError, match="allowed is a trajectory file of version 1"):
+        read_trajectories(tmp_path / "other.h5", catalogue)
+    with h5py.File(file, "a") as stored:
+        del stored["move_0001/q"]
+    with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
+        read_trajectories(file, catalogue)
+
+
+def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> None:
+    runner = CliRunner()
+    told = runner.invoke(app, ["replay", str(file), "--html", str(tmp_path / "replay.html")])
+    assert told.exit_code == 0, told.output
+    assert "gelatin_box -> tray" in told.output
+    assert (tmp_path / "replay.html").stat().st_size > 100_000
+    save_scene(tmp_path / "scene.yaml", SCENE)
+    moves = tmp_path / "moves.yaml"
+    moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
+    arguments = ["move", str(tmp_path / "scene.yaml"), "--moves", str(moves), "--fidelity", "arm", "--plan-only"]
+    told = runner.invoke(app, [*arguments, "--out", str(tmp_path / "plans")])
+    assert told.exit_code == 0, told.output
+    planned, refused = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
+    assert planned["planned"]
+    assert [phase["name"] for phase in planned["phases"]] == ["approach", "carry", "retreat"]
+    assert planned["phases"][0]["q"][0] == pytest.approx(ArmConfig().home)
+    assert len(planned["phases"][1]["q"]) == len(planned["phases"][1]["time"])
+    assert (refused["planned"], refused["reason"], refused["about"]) == (False, "no seal", "large_marker")
+    assert refused["number"] is None, "its lip would be partly in the air"
