@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from drake_clutter.cli_arm import replay
+from drake_clutter.cli_arm import feasibility, replay
 from drake_clutter.cli_options import (
     CatalogueOption,
     ConfigOption,
@@ -47,6 +47,7 @@ app = typer.Typer(
 assets_app = typer.Typer(help="Build the models of object classes.", no_args_is_help=True)
 app.add_typer(assets_app, name="assets")
 app.command()(replay)
+app.command()(feasibility)
 
 
 class ExplorerName(Enum):

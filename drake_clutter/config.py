@@ -158,6 +158,15 @@ _ALLOWED = {
     "learning.temperature": (1e-6, math.inf),
     "learning.target_rate": (0.0, 1.0),
     "learning.width": (1, math.inf),
+    "base": (-360.0, 360.0),
+    "home": (-2 * math.pi, 2 * math.pi),
+    "suction.cup_diameter": (0.005, 0.1),
+    "suction.cup_length": (0.005, 0.1),
+    "suction.extension": (0.01, 0.5),
+    "suction.stroke": (0.001, 0.05),
+    "suction.stiffness": (100.0, 1e5),
+    "suction.vacuum": (0.0, 1.0),
+    "suction.safety": (1.0, 100.0),
     "evaluate_every": (1, math.inf),
     "evaluation_scenes": (1, math.inf),
     "save_every": (1, math.inf),
@@ -182,12 +191,21 @@ def _check(given: Any, defaults: Any, source: str, where: str = "") -> None:
                 raise InputError(
                     f"{source}: {field}: {value!r}; allowed is {'a text' if isinstance(default, str) else 'a truth value'}"
                 )
+        elif isinstance(default, list):
+            if not isinstance(value, list) or len(value) != len(default):
+                raise InputError(f"{source}: {field}: {value!r}; allowed is a list of {len(default)} numbers")
+            for number in value:
+                _check_number(number, default[0], source, field)
         else:
-            low, high = _ALLOWED.get(".".join(field.split(".")[-2:]), _ANY)
-            kind = int if isinstance(default, int) else (int, float)
-            if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
-                whole = "a whole number" if isinstance(default, int) else "a finite number"
-                raise InputError(f"{source}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
+            _check_number(value, default, source, field)
+
+
+def _check_number(value: Any, default: float, source: str, field: str) -> None:
+    low, high = _ALLOWED.get(".".join(field.split(".")[-2:]), _ANY)
+    kind = int if isinstance(default, int) else (int, float)
+    if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
+        whole = "a whole number" if isinstance(default, int) else "a finite number"
+        raise InputError(f"{source}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
 
 
 Config = TypeVar("Config")

@@ -188,7 +188,7 @@ class Attempts:
                 if here.distance < allowed:
                     self.fail(progress, PlanFailure.IN_COLLISION, f"{what}: {' and '.join(here.pair)}", here.distance)
                     return None
-                if allowed == least and here.distance < found.distance:
+                if allowed == least and here.distance < found.distance and here.pair[1] not in self._scene.arm_names:
                     found = here
         return found
 

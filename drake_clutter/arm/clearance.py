@@ -36,7 +36,11 @@ _MOVES_WITH = {"base": 0, "shoulder": 1, "upper_arm": 2, "forearm": 3, "wrist_1"
 
 
 class ClearanceScene:
-    """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put."""
+    """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put.
+
+    Attributes:
+        arm_names: of the bodies of arm and tool.
+    """
 
     def __init__(
         self, config: ArmConfig, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
@@ -59,7 +63,7 @@ class ClearanceScene:
         self._fixed = (self.plant.world_body(), self.plant.GetBodyByName("tray"))
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
-        self._arm_names = frozenset(body.name() for body in self._arm.bodies)
+        self.arm_names = frozenset(body.name() for body in self._arm.bodies)
         self._held: tuple[str, Floats] | None = None
         self._transient: list[object] = []
 
@@ -131,7 +135,7 @@ class ClearanceScene:
 
     def _named(self, pair: SignedDistancePair) -> Clearance:
         first, second = self._names[pair.id_A], self._names[pair.id_B]
-        moves = first in self._arm_names or (self._held is not None and first == self._held[0])
+        moves = first in self.arm_names or (self._held is not None and first == self._held[0])
         return Clearance(float(pair.distance), (first, second) if moves else (second, first))
 
     def close(self, q: Floats, within: float) -> list[Clearance]:
@@ -171,6 +175,6 @@ class ClearanceScene:
         return np.asarray(J[:, self._v_at])
 
     def _joints_that_move(self, name: str) -> int:
-        if name in self._arm_names:
+        if name in self.arm_names:
             return _MOVES_WITH.get(name, 6)
         return 6 if self._held is not None and name == self._held[0] else 0

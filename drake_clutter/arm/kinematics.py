@@ -74,9 +74,15 @@ def jacobian(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
     return np.vstack([axes.T, np.cross(axes, p_B6 - X[:-1, :3, 3]).T])
 
 
-def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> float:
-    """sqrt(det(J J^T)) = |det J|, m^3 (Yoshikawa 1985); 0 in a singular configuration."""
-    return float(abs(np.linalg.det(jacobian(q, parameters))))
+def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
+    """(...) |det J|, m^3, at joint angles (..., 6) rad (Yoshikawa 1985); 0 in a singular configuration.
+
+    The reach of the wrist in the arm's plane, times the elbow's and the wrist's bend: the determinant of an arm of the UR family.
+    """
+    _, a2, a3 = parameters.a[:3]
+    in_plane = np.cumsum(q[..., 1:4], axis=-1)
+    reach = a2 * np.cos(in_plane[..., 0]) + a3 * np.cos(in_plane[..., 1]) + parameters.d[4] * np.sin(in_plane[..., 2])
+    return np.asarray(np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * reach))
 
 
 def inverse_kinematics(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:

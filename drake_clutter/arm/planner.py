@@ -62,7 +62,13 @@ class PickPlacePlanner:
         grasps = self._grasps(picked)
         if isinstance(grasps, NoPlan):
             return grasps
+        if self.config.over_tray(self.tray_side):
+            return NoPlan(PlanFailure.IN_COLLISION, "pedestal and tray")
         scene = self.clearance_scene(objects)
+        scene.touch(picked.name)
+        if hit := scene.close(np.array(self.config.home), self.planner.clearance):
+            nearest = min(hit, key=lambda here: here.distance)
+            return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
         attempt = Attempts(self.config, self.planner, self.reach, scene, objects, picked, X_TO_place)
         for grasp in grasps:
             for q_pick, q_place, branch, yaw in attempt.ends(grasp):

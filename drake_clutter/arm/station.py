@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context
 from drake_clutter.arm.epick import epick_sdf
 from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.assets.tray import RIM_THICKNESS
 from drake_clutter.resources import shipped_path
 
 Floats = NDArray[np.float64]
@@ -50,6 +51,10 @@ class ArmConfig:
         """(4, 4), the cup at rest."""
         return np.asarray(RigidTransform([0.0, 0.0, self.suction.length]).GetAsMatrix4())
 
+    def over_tray(self, tray_side: float) -> bool:
+        """Whether the pedestal would stand in the tray."""
+        return max(abs(self.base[0]), abs(self.base[1])) < tray_side / 2 + RIM_THICKNESS + PEDESTAL_SIDE / 2
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -68,6 +73,8 @@ class Arm:
     cup: Frame
 
 
+PEDESTAL_SIDE = 0.16
+"""m, of its square section."""
 _CLOSE = ("base", "shoulder", "upper_arm", "wrist_1", "wrist_3")
 _GREY = np.array([0.45, 0.46, 0.48, 1.0])
 _TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
@@ -86,7 +93,7 @@ def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, c
     things = [("table", _TABLE[1], _TABLE[0]), ("camera", RigidTransform([0.0, 0.0, camera_altitude + 0.03]), Sphere(0.06))]
     if height > 0.01:
         pedestal = RigidTransform(X_TB.rotation(), [*config.base[:2], height / 2 - 0.01])
-        things.append(("pedestal", pedestal, Box(0.16, 0.16, height - 0.002)))
+        things.append(("pedestal", pedestal, Box(PEDESTAL_SIDE, PEDESTAL_SIDE, height - 0.002)))
     for name, X_TS, shape in things:
         plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
         if name == "pedestal":

@@ -40,12 +40,12 @@ def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
     return [frames[k] for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)]
 
 
-def strip(scene: Scene, frames: Sequence[Frame]) -> NDArray[np.uint8]:
+def strip(scene: Scene, frames: Sequence[Frame], arm_config: ArmConfig | None = None) -> NDArray[np.uint8]:
     """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
     builder = DiagramBuilder()
     made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.tray_side, 0.01, visuals=True)
     plant = made.plant
-    arm = add_arm(plant, made.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=True)
+    arm = add_arm(plant, made.scene_graph, arm_config or ArmConfig(), CameraConfig().altitude, compliant=True)
     plant.Finalize()
     made.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(ENGINE))
     diagram = builder.Build()

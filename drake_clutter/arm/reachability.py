@@ -1,0 +1,121 @@
+"""Where the cup can go: poses that the arm reaches in its cell without collision, however it is folded.
+
+Frames: T the tray, G the cup. The cell has table, tray, pedestal and camera, and no objects.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.arm.attempts import PlannerConfig, downwards
+from drake_clutter.arm.kinematics import manipulability
+from drake_clutter.arm.paths import nearest_turns
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+
+Floats = NDArray[np.float64]
+
+YAWS = 12
+MARGIN = 0.05
+"""m, from the tray's rim: no object's middle comes closer."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How poses of the cup are reached.
+
+    Attributes:
+        branches: (n,) of the arm's eight, without collision.
+        manipulability: (n,) m^3, the best of them; 0 where there is none.
+        q: (n, 6) rad, of that one; NaN where there is none.
+        in_the_way: what the arm would hit where it reaches a pose, but only with collision; else "".
+    """
+
+    branches: NDArray[np.int64]
+    manipulability: Floats
+    q: Floats
+    in_the_way: tuple[str, ...]
+
+
+class Reachability:
+    """Of an arm in its cell."""
+
+    def __init__(self, config: ArmConfig, tray_side: float, camera_altitude: float) -> None:
+        """Makes the empty cell."""
+        self._config, self._tray_side = config, tray_side
+        self._planner = PickPlacePlanner(config, PlannerConfig(), tray_side, camera_altitude)
+        self._scene = self._planner.clearance_scene(())
+        self._least = self._planner.planner.clearance
+
+    def poses(self, X_TG: Floats) -> Reach:
+        """Of poses (n, 4, 4) of the cup."""
+        q = self._planner.reach(X_TG)
+        worth = np.nan_to_num(manipulability(q), nan=-1.0)
+        count, best = np.zeros(len(q), int), np.zeros(len(q))
+        best_q, in_the_way = np.full((len(q), 6), np.nan), [""] * len(q)
+        for k in range(len(q)):
+            for branch in np.argsort(-worth[k]):
+                if worth[k, branch] < 0:
+                    break
+                at = nearest_turns(q[k, branch], np.array(self._config.home))
+                if hit := self._scene.close(at, self._least):
+                    in_the_way[k] = in_the_way[k] or " and ".join(min(hit, key=lambda c: c.distance).pair)
+                    continue
+                if count[k] == 0:
+                    best[k], best_q[k] = worth[k, branch], at
+                count[k] += 1
+        return Reach(count, best, best_q, tuple("" if n else hit for n, hit in zip(count, in_the_way, strict=True)))
+
+    def map(self, heights: Sequence[float], spacing: float) -> "ReachMap":
+        """Of a cup that points down, over the tray.
+
+        Args:
+            heights: m, of the lip over the tray's floor.
+            spacing: m, of the grid.
+        """
+        half = self._tray_side / 2 - MARGIN
+        along = np.linspace(-half, half, max(2, round(2 * half / spacing) + 1))
+        share, best = np.zeros((2, len(heights), len(along), len(along)))
+        yaws = np.arange(YAWS) * (2 * np.pi / YAWS)
+        for k, height in enumerate(heights):
+            for i, x in enumerate(along):
+                for j, y in enumerate(along):
+                    found = self.poses(np.array([downwards(yaw, np.array([x, y, height])) for yaw in yaws]))
+                    share[k, i, j] = np.mean(found.branches > 0)
+                    best[k, i, j] = found.manipulability.max()
+        return ReachMap(tuple(heights), along, share, best)
+
+
+@dataclass(frozen=True)
+class ReachMap:
+    """Where over the tray a cup that points down can go.
+
+    Attributes:
+        heights: m. along: (n,) m, x as well as y, in T.
+        share: (heights, n, n) of the yaws that are reached; manipulability: m^3, the best at any of them. By height, x, y.
+    """
+
+    heights: tuple[float, ...]
+    along: Floats
+    share: Floats
+    manipulability: Floats
+
+
+def base_scores(
+    config: ArmConfig, places: Sequence[tuple[float, float]], tray_side: float, camera_altitude: float
+) -> list[tuple[float, float]]:
+    """For bases at (x, y) m, as high and turned as the config's: the mean share that is reached, and the mean manipulability.
+
+    A base in or over the tray scores nothing.
+    """
+    found = []
+    for x, y in places:
+        moved = replace(config, base=[x, y, *config.base[2:]])
+        if moved.over_tray(tray_side):
+            found.append((0.0, 0.0))
+            continue
+        reached = Reachability(moved, tray_side, camera_altitude).map((0.05, 0.25, 0.45), 0.15)
+        found.append((float(reached.share.mean()), float(reached.manipulability.mean())))
+    return found

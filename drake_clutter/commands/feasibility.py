@@ -1,0 +1,338 @@
+"""`drake-clutter feasibility`: what an arm could do in scenes, as tables, pictures and a report; resumable, in parallel."""
+
+import csv
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from drake_clutter.agents.generation import wilson_interval
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.reachability import Reachability, base_scores
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.files import InputError, output_directory, write_json, write_text
+from drake_clutter.reports.feasibility_report import write_report
+from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
+
+JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
+HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
+"""m, of the reachability map."""
+BASE_X, BASE_Y = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(), np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
+"""m, of the bases that are compared; turned so that the tray's other sides are covered, too, by symmetry."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A pose of the cup that a user asks about."""
+
+    name: str
+    X_TG: Pose
+
+
+@dataclass(frozen=True)
+class FeasibilityJob:
+    """Everything that decides what a study finds.
+
+    Attributes:
+        scenes: files. setups: arms by name.
+        targets: poses of the cup that are asked about beside the moves.
+        seed: of places and errors. world: the config.
+        catalogue_folder: a user's asset folder, or None.
+    """
+
+    scenes: tuple[Path, ...]
+    setups: dict[str, ArmConfig]
+    targets: tuple[Target, ...]
+    seed: int
+    world: ClutterConfig
+    catalogue_folder: Path | None
+
+    def fields(self) -> dict[str, Any]:
+        """As a document."""
+        return {
+            "scenes": [str(path.resolve()) for path in self.scenes],
+            "setups": {name: asdict(arm) for name, arm in self.setups.items()},
+            "targets": [asdict(target) for target in self.targets],
+            "seed": self.seed,
+            "world": asdict(self.world),
+            "catalogue_folder": str(self.catalogue_folder.resolve()) if self.catalogue_folder else None,
+        }
+
+
+def scene_files(given: Sequence[Path]) -> tuple[Path, ...]:
+    """Scene files, and those of folders, in order.
+
+    Raises:
+        InputError: a folder without any, or names that are there twice.
+    """
+    found = list[Path]()
+    for path in given:
+        files = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
+        if not files:
+            raise InputError(f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote")
+        found += files
+    if twice := [name for name, count in Counter(path.stem for path in found).items() if count > 1]:
+        raise InputError(f"scenes: {twice[0]} is there twice; allowed are files with names of their own")
+    return tuple(found)
+
+
+def setups(bases: Sequence[list[float]], trays: Sequence[list[float]], files: Sequence[Path]) -> dict[str, ArmConfig]:
+    """Arms by name: the files', and the default one at other places; the default one if nothing is given.
+
+    Args:
+        bases: X_TB as x, y, z (m) and yaw (deg). trays: X_BT likewise.
+        files: YAML with fields of `ArmConfig`.
+    """
+    found = {path.stem: load_typed(ArmConfig(), path) for path in files}
+    for base in bases:
+        found[f"base {', '.join(f'{v:g}' for v in base)}"] = replace(ArmConfig(), base=base)
+    for x, y, z, yaw in trays:
+        c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+        seen_from_tray = [-(c * x + s * y), -(c * y - s * x), -z, -yaw]
+        found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = replace(ArmConfig(), base=seen_from_tray)
+    return found or {"default": ArmConfig()}
+
+
+def read_targets(path: Path) -> tuple[Target, ...]:
+    """Poses of the cup from a YAML list of `{name, translation, quaternion}`, X_TG: z points out of the tool.
+
+    Raises:
+        InputError: the file, the entry and what is allowed.
+    """
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return tuple(
+            Target(str(entry["name"]), Pose(_floats(entry["translation"], 3), _unit(_floats(entry["quaternion"], 4))))
+            for entry in entries
+        )
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        allowed = "a YAML list of {name: TEXT, translation: [x, y, z], quaternion: [w, x, y, z]}"
+        raise InputError(f"{path}: {error}; allowed is {allowed}") from error
+
+
+def _floats(values: Any, count: int) -> Any:
+    found = tuple(float(value) for value in values)
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"{values} are not {count} numbers")
+    return found
+
+
+def _unit(quaternion: Any) -> Any:
+    norm = math.hypot(*quaternion)
+    if norm < 1e-9:
+        raise ValueError("a quaternion is zero")
+    return tuple(value / norm for value in quaternion)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of the work: of an arm the moves of a scene, or, without a scene, what it reaches; or scores of some bases."""
+
+    setup: str
+    scene: int | None = None
+    base_x: float | None = None
+
+    @property
+    def file(self) -> str:
+        """Where its result is kept."""
+        what = "reach" if self.scene is None else f"scene_{self.scene:04d}"
+        return f"{self.setup}__{what if self.base_x is None else f'bases_{self.base_x:g}'}.json"
+
+
+class Worker:
+    """Does parts of a job; for the runner."""
+
+    def __init__(self, job: FeasibilityJob) -> None:
+        self._job = job
+        self._catalogue = load_catalogue(job.catalogue_folder)
+        self._studies: dict[str, FeasibilityStudy] = {}
+
+    def __call__(self, part: Part) -> dict[str, Any]:
+        """A part's result."""
+        arm, world = self._job.setups[part.setup], self._job.world
+        if part.base_x is not None:
+            places = [(part.base_x, y) for y in BASE_Y]
+            scores = zip(places, base_scores(arm, places, world.layout.tray_side, world.camera.altitude), strict=True)
+            return {"bases": [{"x": x, "y": y, "share": share, "manipulability": best} for (x, y), (share, best) in scores]}
+        if part.scene is None:
+            return self._reach(arm)
+        return self._moves(part.setup, part.scene)
+
+    def _reach(self, arm: ArmConfig) -> dict[str, Any]:
+        world = self._job.world
+        reachability = Reachability(arm, world.layout.tray_side, world.camera.altitude)
+        found = reachability.map(HEIGHTS, SPACING)
+        targets = []
+        for target in self._job.targets:
+            X = np.eye(4)
+            X[:3, :3], X[:3, 3] = target.X_TG.rotation, target.X_TG.p
+            reach = reachability.poses(X[None])
+            q = reach.q[0].tolist() if reach.branches[0] else None
+            targets.append(
+                {
+                    "target": target.name,
+                    "branches": int(reach.branches[0]),
+                    "manipulability": float(reach.manipulability[0]),
+                    "q": q,
+                    "in_the_way": reach.in_the_way[0],
+                }
+            )
+        return {
+            "along": found.along.tolist(),
+            "heights": list(found.heights),
+            "share": found.share.tolist(),
+            "manipulability": found.manipulability.tolist(),
+            "targets": targets,
+        }
+
+    def _moves(self, setup: str, number: int) -> dict[str, Any]:
+        path = self._job.scenes[number]
+        scene = scene_at_rest(path, self._job)
+        if scene is None:
+            return {"scene": path.stem, "unstable": True, "moves": [], "noise": []}
+        if setup not in self._studies:
+            arm, planner = self._job.setups[setup], PlannerConfig(optimise=False)
+            self._studies[setup] = FeasibilityStudy(setup, arm, self._job.world, planner, self._job.seed)
+        study = self._studies[setup]
+        rows = study.moves(path.stem, number, scene)
+        noise = study.noise(path.stem, number, scene, rows)
+        return {"scene": path.stem, "unstable": False, "moves": [asdict(r) for r in rows], "noise": [asdict(r) for r in noise]}
+
+
+def scene_at_rest(path: Path, job: FeasibilityJob) -> Scene | None:
+    """The scene as it settles; None if it does not stay."""
+    file = load_scene(path, load_catalogue(job.catalogue_folder))
+    verdict = file.verdict or DrakeJudge(job.world).judge(file.scene, item_rng(job.seed))
+    return file.scene.at(verdict.settled) if verdict.stable else None
+
+
+def feasibility(
+    job: FeasibilityJob, out: Path, workers: int, progress: Callable[[Iterable[Any], int, int], Iterable[Any]]
+) -> dict[str, Any]:
+    """Does what of the study is not done yet; writes its tables (CSV), summary.json and report.html; returns the summary.
+
+    Args:
+        job: what to find out.
+        out: a folder, new, or of the same job: that is taken up where it was left.
+        workers: processes.
+        progress: wraps the parts that are done, given how many were and how many there will be.
+
+    Raises:
+        InputError: a scene file that is none, or a folder that holds something else.
+    """
+    for path in job.scenes:
+        load_scene(path, load_catalogue(job.catalogue_folder))
+    if (out / JOB_FILE).exists():
+        if json.loads((out / JOB_FILE).read_text()) != json.loads(json.dumps(job.fields())):
+            raise InputError(f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder")
+    else:
+        output_directory(out)
+        write_json(out / JOB_FILE, job.fields())
+    (out / PARTS).mkdir(exist_ok=True)
+    parts = [Part(setup, number) for setup in job.setups for number in range(len(job.scenes))]
+    parts += [Part(setup) for setup in job.setups] + [Part(next(iter(job.setups)), None, x) for x in BASE_X]
+    left = [part for part in parts if not (out / PARTS / part.file).exists()]
+    done = map_ordered(partial(Worker, job), left, workers=workers)
+    for part, found in zip(left, progress(done, len(parts) - len(left), len(parts)), strict=True):
+        write_json(out / PARTS / part.file, _without_nan(found))
+    results = {part: json.loads((out / PARTS / part.file).read_text()) for part in parts}
+    return _written(job, out, results)
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON has neither NaN nor infinity: they are null."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _written(job: FeasibilityJob, out: Path, results: dict[Part, Any]) -> dict[str, Any]:
+    moves = [row for part, found in results.items() if part.scene is not None for row in found["moves"]]
+    noise = [row for part, found in results.items() if part.scene is not None for row in found["noise"]]
+    reach = {part.setup: found for part, found in results.items() if part.scene is None and part.base_x is None}
+    bases = [row for part, found in results.items() if part.base_x is not None for row in found["bases"]]
+    targets = [{"setup": setup, **target} for setup, found in reach.items() for target in found["targets"]]
+    cells = [
+        {"setup": setup, "height": z, "x": x, "y": y, **{name: f[name][k][i][j] for name in ("share", "manipulability")}}
+        for setup, f in reach.items()
+        for k, z in enumerate(f["heights"])
+        for i, x in enumerate(f["along"])
+        for j, y in enumerate(f["along"])
+    ]
+    tables = {"moves": (moves, MoveRow), "noise": (noise, NoiseRow), "reach": (cells, None), "bases": (bases, None)}
+    for name, (rows, kind) in (tables | {"targets": (targets, None)}).items():
+        columns = [field.name for field in fields(kind)] if kind else list(rows[0]) if rows else []
+        if columns:
+            _write_csv(out / f"{name}.csv", columns, rows)
+    summary = summarise(job, moves, noise)
+    summary["unstable_scenes"] = sorted({f["scene"] for p, f in results.items() if p.scene is not None and f["unstable"]})
+    best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
+    summary["best_base"] = best
+    write_json(out / "summary.json", summary)
+    scenes = {path.stem: path for path in job.scenes}
+
+    def scene_of(name: str) -> Scene:
+        scene = scene_at_rest(scenes[name], job)
+        assert scene is not None, "only moves of stable scenes are shown"
+        return scene
+
+    write_report(out / REPORT, job.setups, moves, noise, reach, bases, targets, summary, scene_of, job.world)
+    return summary
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: row[key] for key in columns} for row in rows)
+    write_text(path, text.getvalue())
+
+
+def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """By setup: shares, reasons, and what was planned by class, rest and height; and which moves only one of two can do."""
+    setups = {}
+    for setup in job.setups:
+        rows = [row for row in moves if row["setup"] == setup]
+        planned = [row for row in rows if row["result"] == PLANNED]
+        quantiles = np.quantile([row["planning_s"] for row in rows if row["planning_s"] > 0] or [0.0], [0.5, 0.95, 0.99]).tolist()
+        setups[setup] = {
+            "moves": len(rows),
+            "planned": len(planned),
+            "planned_share": len(planned) / len(rows) if rows else None,
+            "planned_ci95": wilson_interval(len(planned), len(rows)),
+            "results": dict(Counter(row["result"] for row in rows).most_common()),
+            "motion_s_median": float(np.median([row["motion_s"] for row in planned])) if planned else None,
+            "planning_s": dict(zip(("p50", "p95", "p99"), quantiles, strict=True)),
+            "holds_with_error": {
+                f"{1000 * error:g} mm": [
+                    sum(n["result"] == "holds" for n in noise if n["setup"] == setup and n["error"] == error),
+                    sum(1 for n in noise if n["setup"] == setup and n["error"] == error),
+                ]
+                for error in sorted({n["error"] for n in noise})
+            },
+        }
+    done = {(r["setup"], r["scene"], r["pick"], r["place"]) for r in moves if r["result"] == PLANNED}
+    names, keys = list(job.setups), {(r["scene"], r["pick"], r["place"]) for r in moves}
+    paired = {
+        f"{first} and not {second}": sum((first, *key) in done and (second, *key) not in done for key in keys)
+        for first in names
+        for second in names
+        if first != second
+    }
+    return {"scenes": len(job.scenes), "setups": setups, "planned_by": paired}

@@ -1,0 +1,306 @@
+"""The page of a feasibility study: one file, pictures within, to be sent to a colleague."""
+
+import base64
+import io
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from drake_clutter.agents.generation import wilson_interval
+from drake_clutter.arm.attempts import PlannerConfig, inverse
+from drake_clutter.arm.kinematics import forward_kinematics
+from drake_clutter.arm.plan import Plan
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import write_text
+from drake_clutter.reports.arm_pictures import strip
+from drake_clutter.reports.pictures import Marks, PictureCamera
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import ArmState, Frame
+from drake_clutter.tasks.feasibility import PLANNED
+
+Rows = Sequence[Mapping[str, Any]]
+
+WORST = 3
+"""Moves that are shown of each kind: nearest to a collision, longest, and one for each reason."""
+_STYLE: dict[Any, Any] = {"font.size": 15, "axes.grid": True, "grid.alpha": 0.35, "figure.constrained_layout.use": True}
+_CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:1120px;margin:2em auto;padding:0 1em;color:#1f2630}
+h1,h2{line-height:1.2}table{border-collapse:collapse;margin:1em 0}
+td,th{border:1px solid #cdd2d9;padding:.3em .6em;text-align:left}
+img{max-width:100%;margin:.5em 0}figure{margin:1em 0}
+.case{border-top:1px solid #cdd2d9;padding:.5em 0}"""
+
+
+def write_report(
+    path: Path,
+    setups: Mapping[str, ArmConfig],
+    moves: Rows,
+    noise: Rows,
+    reach: Mapping[str, Mapping[str, Any]],
+    bases: Rows,
+    targets: Rows,
+    summary: Mapping[str, Any],
+    scene_of: Callable[[str], Scene],
+    world: ClutterConfig,
+) -> None:
+    """Writes the page; see `commands/feasibility.py` for what it is given."""
+    plt.rcParams.update(_STYLE)
+    parts = [f"<h1>Kinematic feasibility: {summary['scenes']} scenes, {len(moves)} moves</h1>", _setups_table(setups, summary)]
+    if summary["unstable_scenes"]:
+        parts.append(f"<p>Left out, because they do not stay as they are: {escape(', '.join(summary['unstable_scenes']))}.</p>")
+    if len(setups) > 1:
+        rows = "".join(f"<tr><td>{escape(pair)}</td><td>{n}</td></tr>" for pair, n in summary["planned_by"].items())
+        parts.append(f"<h2>The same moves, compared</h2><table><tr><th>planned by</th><th>moves</th></tr>{rows}</table>")
+    if moves:
+        parts += [
+            _figure("Results of all moves", _reasons(moves, list(setups))),
+            _figure("Planned, of all legal moves of a kind (bars: 95 %)", _kinds(moves, list(setups))),
+            _figure("Planned, of the moves that pick there (number of moves)", _over_tray(moves, list(setups))),
+        ]
+    for setup, found in reach.items():
+        parts.append(_figure(f"{setup}: where a cup that points down can go, in the empty cell", _reach(found)))
+    parts.append(
+        _figure("Places of the base, as high and turned as the first setup's", _bases(bases, next(iter(setups.values()))))
+    )
+    if noise:
+        parts.append(_figure("Plans made from wrong poses that hold where the objects really are (bars: 95 %)", _noise(noise)))
+    if targets:
+        parts.append(_targets_table(targets))
+    if moves:
+        parts.append("<h2>Worst cases</h2>")
+        parts += _worst(moves, setups, scene_of, world)
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>Feasibility</title><style>{_CSS}</style><body>{''.join(parts)}"
+    )
+    write_text(path, page + "</body></html>")
+
+
+def _setups_table(setups: Mapping[str, ArmConfig], summary: Mapping[str, Any]) -> str:
+    rows = ""
+    for name, arm in setups.items():
+        found = summary["setups"][name]
+        low, high = found["planned_ci95"]
+        share = "-" if found["planned_share"] is None else f"{found['planned_share']:.3f} ({low:.3f} to {high:.3f})"
+        motion = "-" if found["motion_s_median"] is None else f"{found['motion_s_median']:.2f} s"
+        base = ", ".join(f"{v:g}" for v in arm.base)
+        cells = (
+            name,
+            base,
+            f"{1000 * arm.suction.cup_diameter:g} mm, {1000 * arm.suction.extension:g} mm",
+            f"{arm.payload:g} kg",
+            f"{found['planned']} of {found['moves']}",
+            share,
+            motion,
+            f"{1000 * found['planning_s']['p50']:.0f} / {1000 * found['planning_s']['p95']:.0f} ms (p50 / p95)",
+        )
+        rows += f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
+    heads = ("setup", "base x, y, z, yaw (m, deg)", "cup, tube", "payload", "planned", "share (95 %)", "motion", "planning")
+    return f"<table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{rows}</table>"
+
+
+def _targets_table(targets: Rows) -> str:
+    rows = "".join(
+        f"<tr><td>{escape(t['setup'])}</td><td>{escape(t['target'])}</td><td>{t['branches']}</td><td>{t['manipulability']:.3f}</td>"
+        f"<td>{escape(t['in_the_way'] or ('' if t['branches'] else 'out of reach'))}</td></tr>"
+        for t in targets
+    )
+    heads = "<th>setup</th><th>pose</th><th>branches without collision</th><th>manipulability, m&sup3;</th><th>in the way</th>"
+    return f"<h2>Poses asked for</h2><table><tr>{heads}</tr>{rows}</table>"
+
+
+def _embedded(png: bytes, alt: str) -> str:
+    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def _figure(title: str, figure: Figure) -> str:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=90)
+    plt.close(figure)
+    return f"<h2>{escape(title)}</h2><figure>{_embedded(stream.getvalue(), title)}</figure>"
+
+
+def _reasons(moves: Rows, setups: Sequence[str]) -> Figure:
+    results = [result for result, _ in Counter(row["result"] for row in moves).most_common()]
+    results = [PLANNED, *(r for r in results if r != PLANNED)]
+    figure, axes = plt.subplots(figsize=(12, 1.6 + 0.55 * len(results) * max(1, len(setups) / 2)))
+    height = 0.8 / len(setups)
+    for k, setup in enumerate(setups):
+        rows = [row for row in moves if row["setup"] == setup]
+        counts = Counter(row["result"] for row in rows)
+        share = [counts[result] / max(1, len(rows)) for result in results]
+        at = np.arange(len(results)) + k * height
+        axes.barh(at, share, height, label=setup)
+        for y, value, result in zip(at, share, results, strict=True):
+            axes.text(value + 0.005, y, str(counts[result]), va="center", fontsize=12)
+    axes.set_yticks(np.arange(len(results)) + 0.4 - height / 2, results)
+    axes.invert_yaxis()
+    axes.set(xlabel="share of the legal moves", xlim=(0, 1))
+    if len(setups) > 1:
+        axes.legend()
+    return figure
+
+
+def _share_bars(axes: Any, moves: Rows, setups: Sequence[str], key: Callable[[Mapping[str, Any]], str], label: str) -> None:
+    kinds = sorted({key(row) for row in moves})
+    width = 0.8 / len(setups)
+    for k, setup in enumerate(setups):
+        found = []
+        for kind in kinds:
+            rows = [row for row in moves if row["setup"] == setup and key(row) == kind]
+            good = sum(row["result"] == PLANNED for row in rows)
+            found.append((good / max(1, len(rows)), *wilson_interval(good, len(rows))))
+        share, low, high = np.array(found).T
+        error = np.clip([share - low, high - share], 0, None)
+        axes.bar(np.arange(len(kinds)) + k * width, share, width, yerr=error, capsize=3, label=setup)
+    axes.set_xticks(np.arange(len(kinds)) + 0.4 - width / 2, kinds, rotation=40, ha="right", rotation_mode="anchor", fontsize=12)
+    axes.set(title=label, ylim=(0, 1))
+
+
+def _kinds(moves: Rows, setups: Sequence[str]) -> Figure:
+    figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
+    _share_bars(axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class")
+    _share_bars(axes[1], moves, setups, lambda row: str(row["rest"]), "axis that points up")
+    _share_bars(axes[2], moves, setups, lambda row: f"{10 * int(row['pick_top'] // 0.1):02d}+ cm", "height of its top")
+    axes[0].set_ylabel("share planned")
+    if len(setups) > 1:
+        axes[2].legend(fontsize=11)
+    return figure
+
+
+def _heat(axes: Any, values: NDArray[np.float64], extent: Sequence[float], top: float) -> Any:
+    axes.grid(visible=False)
+    return axes.imshow(values.T, origin="lower", extent=extent, vmin=0, vmax=top, cmap="viridis", aspect="equal")
+
+
+def _over_tray(moves: Rows, setups: Sequence[str]) -> Figure:
+    edges = np.linspace(-0.35, 0.35, 8)
+    figure, axes = plt.subplots(1, len(setups), figsize=(6.6 * len(setups), 5.6), squeeze=False)
+    for panel, setup in zip(axes[0], setups, strict=True):
+        rows = [row for row in moves if row["setup"] == setup]
+        x, y = np.array([row["pick_x"] for row in rows]), np.array([row["pick_y"] for row in rows])
+        good = np.array([row["result"] == PLANNED for row in rows], float)
+        count, _, _ = np.histogram2d(x, y, bins=(edges, edges))
+        planned, _, _ = np.histogram2d(x, y, bins=(edges, edges), weights=good)
+        with np.errstate(invalid="ignore"):
+            image = _heat(panel, planned / count, (-0.35, 0.35, -0.35, 0.35), 1.0)
+        for i, cx in enumerate((edges[1:] + edges[:-1]) / 2):
+            for j, cy in enumerate((edges[1:] + edges[:-1]) / 2):
+                if count[i, j]:
+                    panel.text(cx, cy, f"{count[i, j]:.0f}", ha="center", va="center", color="white", fontsize=11)
+        panel.set(title=setup, xlabel="x of the tray, m", ylabel="y, m")
+    figure.colorbar(image, ax=axes[0], label="share planned")
+    return figure
+
+
+def _reach(found: Mapping[str, Any]) -> Figure:
+    heights, along = found["heights"], found["along"]
+    half = along[-1] + (along[1] - along[0]) / 2
+    figure, axes = plt.subplots(2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True)
+    best = max(0.01, float(np.max(found["manipulability"])))
+    for k, height in enumerate(heights):
+        top = _heat(axes[0][k], np.array(found["share"][k]), (-half, half, -half, half), 1.0)
+        bottom = _heat(axes[1][k], np.array(found["manipulability"][k]), (-half, half, -half, half), best)
+        axes[0][k].set_title(f"{100 * height:g} cm above the floor", fontsize=13)
+        axes[1][k].set_xlabel("x of the tray, m")
+    for row, name in ((0, "y, m"), (1, "y, m")):
+        axes[row][0].set_ylabel(name)
+    figure.colorbar(top, ax=axes[0], label="share of 12 yaws")
+    figure.colorbar(bottom, ax=axes[1], label="manipulability, m$^3$")
+    return figure
+
+
+def _bases(bases: Rows, arm: ArmConfig) -> Figure:
+    x, y = sorted({row["x"] for row in bases}), sorted({row["y"] for row in bases})
+    figure, axes = plt.subplots(1, 2, figsize=(13, 6))
+    half_x, half_y = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    labels = {"share": "share of poses reached", "manipulability": "manipulability, m$^3$"}
+    for panel, (name, label) in zip(axes, labels.items(), strict=True):
+        at = {(row["x"], row["y"]): row[name] for row in bases}
+        values = np.array([[at[i, j] for j in y] for i in x])
+        figure.colorbar(_heat(panel, values, extent, max(0.01, float(values.max()))), ax=panel, label=label)
+        panel.plot(*arm.base[:2], "r*", markersize=18, label="first setup")
+        best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
+        panel.plot(best["x"], best["y"], "wo", markersize=12, markeredgecolor="black", label="best of the grid")
+        panel.set(xlabel="x of the base, m (the tray's middle is 0, 0)", ylabel="y, m")
+        panel.legend(fontsize=11, loc="upper left")
+    return figure
+
+
+def _noise(noise: Rows) -> Figure:
+    figure, axes = plt.subplots(figsize=(10, 5))
+    errors = sorted({row["error"] for row in noise})
+    for setup in dict.fromkeys(row["setup"] for row in noise):
+        found = []
+        for error in errors:
+            rows = [row for row in noise if row["setup"] == setup and row["error"] == error]
+            good = sum(row["result"] == "holds" for row in rows)
+            found.append((good / len(rows), *wilson_interval(good, len(rows))))
+        share, low, high = np.array(found).T
+        around = np.clip([share - low, high - share], 0, None)
+        axes.errorbar(1000 * np.array(errors), share, around, marker="o", capsize=5, label=setup)
+    axes.set(xlabel="standard deviation of x and of y, mm; yaw: half a degree for each mm", ylim=(0, 1.03))
+    axes.set_ylabel("share that holds")
+    axes.legend()
+    return figure
+
+
+def _worst(moves: Rows, setups: Mapping[str, ArmConfig], scene_of: Callable[[str], Scene], world: ClutterConfig) -> list[str]:
+    planned = [row for row in moves if row["result"] == PLANNED]
+    closest = sorted((row for row in planned if row["clearance"] is not None), key=lambda row: float(row["clearance"]))
+    long = sorted(planned, key=lambda row: -float(row["motion_s"]))
+    chosen = [("nearest to a collision", row) for row in closest[:WORST]] + [("longest", row) for row in long[:WORST]]
+    for reason in dict.fromkeys(row["result"] for row in moves if row["result"] not in (PLANNED, "no free spot")):
+        chosen.append((reason, next(row for row in moves if row["result"] == reason)))
+    camera, parts = PictureCamera(), []
+    for kind, row in chosen:
+        scene, arm = scene_of(row["scene"]), setups[row["setup"]]
+        known = row["place_x"] is not None
+        X_TO = Pose((row["place_x"], row["place_y"], row["place_z"]), scene[row["pick"]].X_TO.quaternion) if known else None
+        told = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
+        if row["result"] == PLANNED:
+            near = row["clearance"]
+            distance = "nothing within 3 cm" if near is None else f"{1000 * near:.1f} mm ({row['between']})"
+            why = f"{row['motion_s']:.2f} s, {distance}"
+        else:
+            why = ": ".join(filter(None, (row["result"], row["about"])))
+        pictures = [camera.annotated(scene, Marks(moved=row["pick"], X_T_placed=X_TO))]
+        if row["result"] == PLANNED and X_TO is not None:
+            planner = PickPlacePlanner(arm, PlannerConfig(optimise=False), scene.tray_side, world.camera.altitude)
+            plan = planner.plan(scene.objects, row["pick"], X_TO)
+            if isinstance(plan, Plan):
+                pictures.append(strip(scene, _moments(plan, scene, arm), arm))
+        images = "".join(_embedded(_png(picture), told) for picture in pictures)
+        parts.append(f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(told)}: {escape(why)}</p>{images}</div>')
+    return parts
+
+
+def _moments(plan: Plan, scene: Scene, arm: ArmConfig) -> list[Frame]:
+    """At the grasp, in the middle of the way, and at the place."""
+    carry, frames = plan.phases[1].trajectory, []
+    for time in (0.0, carry.end_time() / 2, carry.end_time()):
+        q = carry.value(time).ravel()
+        X_TO = arm.X_TB @ forward_kinematics(q) @ arm.X_FG @ inverse(plan.X_OG)
+        poses = {**scene.poses, plan.pick: Pose.of(X_TO[:3, :3], X_TO[:3, 3])}
+        frames.append(Frame(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
+    return frames
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    stream = io.BytesIO()
+    image = Image.fromarray(picture)
+    image.thumbnail((1080, 480))
+    image.save(stream, format="PNG", optimize=True)
+    return stream.getvalue()

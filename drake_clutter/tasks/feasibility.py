@@ -1,0 +1,234 @@
+"""Kinematic feasibility: which moves an arm could carry out in which cell, and if not, why.
+
+Frames: T the tray, O an object, G the cup.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.arm.attempts import PlannerConfig, inverse, matrix
+from drake_clutter.arm.kinematics import forward_kinematics, manipulability
+from drake_clutter.arm.paths import sampled
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.suction import unevenness
+from drake_clutter.catalogue import Shape
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import Move
+from drake_clutter.tasks.exploration import legal_moves
+
+PLANNED = "planned"
+"""The result of a move that has a plan; any other is a `PlanFailure`'s value."""
+NOISE = (0.002, 0.005, 0.010, 0.020, 0.040)
+"""m, standard deviations of the error of a pose along x and along y; its yaw has half a degree for each mm."""
+NOISY_MOVES = 6
+"""Planned moves per scene that are tried with wrong poses."""
+
+
+@dataclass(frozen=True)
+class MoveRow:
+    """One legal move in one scene with one arm: a row of `moves.csv`.
+
+    Attributes:
+        setup: name of the arm's config.
+        scene: name of the scene file.
+        pick, place: names of what is picked, and on what it is put.
+        object_class: of the picked object. rest: which of its axes points up: flat, side, upright, or lying for a cylinder.
+        pick_x, pick_y: m, middle of its top in T. pick_top: m, height of it. below: objects that lie under it.
+        place_x, place_y, place_z: m, p_TO where it is let go; NaN if no place is free.
+        result: `planned`, or why not. about: what is in the way, or out of reach.
+        number: that stands behind the reason (m, kg, s), or NaN.
+        planning_s: s to find out. motion_s: s from home to home.
+        attempts: grasps and branches that were looked at.
+        clearance: m, the least of the way; infinite if nothing is within 3 cm. between: what is so close.
+        manipulability: m^3, the least at the grasp and at the place.
+    """
+
+    setup: str
+    scene: str
+    pick: str
+    place: str
+    object_class: str
+    rest: str
+    pick_x: float
+    pick_y: float
+    pick_top: float
+    below: int
+    place_x: float = math.nan
+    place_y: float = math.nan
+    place_z: float = math.nan
+    result: str = PlanFailure.NO_FREE_SPOT.value
+    about: str = ""
+    number: float = math.nan
+    planning_s: float = 0.0
+    motion_s: float = math.nan
+    attempts: int = 0
+    clearance: float = math.nan
+    between: str = ""
+    manipulability: float = math.nan
+
+
+MOVE_COLUMNS = tuple(field.name for field in fields(MoveRow))
+
+
+@dataclass(frozen=True)
+class NoiseRow:
+    """A planned move, planned again from wrong poses and checked against the right ones: a row of `noise.csv`.
+
+    Attributes:
+        setup, scene, pick, place: as in `MoveRow`.
+        error: m, the standard deviation. result: `holds`, `no plan`, `no seal`, or what is hit.
+    """
+
+    setup: str
+    scene: str
+    pick: str
+    place: str
+    error: float
+    result: str
+
+
+class FeasibilityStudy:
+    """Asks an arm about every legal move of scenes; the same answers for the same seed, but for the times."""
+
+    def __init__(self, setup: str, arm: ArmConfig, world: ClutterConfig, planner: PlannerConfig, seed: int) -> None:
+        """Of one arm, called `setup`."""
+        self._setup, self._arm, self._world, self._config, self._seed = setup, arm, world, planner, seed
+        self._detector = LabelDetector(world.camera)
+        self._planner: PickPlacePlanner | None = None
+
+    def moves(self, name: str, number: int, scene: Scene) -> list[MoveRow]:
+        """Every legal move in a scene at rest.
+
+        Args:
+            name: of the scene.
+            number: of the scene: with the seed it decides where on the tray or on an object things are put.
+            scene: at rest.
+        """
+        observation = self._detector.look(scene).observation
+        return [
+            self._row(name, scene, move, choose_placement(observation, move, self._world.exploration, self._rng(number, k)))
+            for k, move in enumerate(legal_moves(observation))
+        ]
+
+    def _rng(self, *path: int) -> np.random.Generator:
+        return item_rng(self._seed, *path)
+
+    def planner(self, tray_side: float) -> PickPlacePlanner:
+        """For a tray; kept."""
+        if self._planner is None or self._planner.tray_side != tray_side:
+            self._planner = PickPlacePlanner(self._arm, self._config, tray_side, self._world.camera.altitude)
+        return self._planner
+
+    def _row(self, name: str, scene: Scene, move: Move, X_TO: Pose | None) -> MoveRow:
+        picked = scene[move.pick]
+        lower, upper = picked.bounds_T
+        x, y = (lower[:2] + upper[:2]) / 2
+        row = MoveRow(
+            self._setup,
+            name,
+            move.pick,
+            move.place,
+            picked.object_class.name,
+            rest_of(picked),
+            round(float(x), 6),
+            round(float(y), 6),
+            round(picked.top, 6),
+            len(below(picked, scene.objects)),
+        )
+        if X_TO is None:
+            return replace(row, about=move.place)
+        px, py, pz = (round(v, 6) for v in X_TO.translation)
+        row = replace(row, place_x=px, place_y=py, place_z=pz)
+        found = self.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
+        row = replace(row, planning_s=round(found.seconds, 4))
+        if isinstance(found, NoPlan):
+            return replace(row, result=found.reason.value, about=found.about, number=found.number)
+        carry = found.phases[1].trajectory
+        nearest = min((phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance)
+        return replace(
+            row,
+            result=PLANNED,
+            motion_s=round(found.duration, 4),
+            attempts=found.attempts,
+            clearance=round(nearest.distance, 6),
+            between=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
+            manipulability=float(manipulability(carry.vector_values([0.0, carry.end_time()]).T).min()),
+        )
+
+    def noise(self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]) -> list[NoiseRow]:
+        """Some of the planned moves, planned from wrong poses: do the plans hold where the objects really are?"""
+        planned = [row for row in rows if row.result == PLANNED]
+        rng, planner, found = self._rng(number, 1_000_000), self.planner(scene.tray_side), list[NoiseRow]()
+        for k in sorted(rng.permutation(len(planned))[:NOISY_MOVES].tolist()):
+            row = planned[k]
+            for error in NOISE:
+                believed = [_misjudged(o, error, rng) for o in scene.objects]
+                picked = next(o for o in believed if o.name == row.pick)
+                X_TO = Pose((row.place_x, row.place_y, row.place_z), picked.X_TO.quaternion)
+                plan = planner.plan(believed, row.pick, X_TO)
+                result = "no plan" if isinstance(plan, NoPlan) else self._holds(plan, scene, planner, error)
+                found.append(NoiseRow(self._setup, name, row.pick, row.place, error, result))
+        return found
+
+    def _holds(self, plan: Plan, scene: Scene, planner: PickPlacePlanner, error: float) -> str:
+        """Whether a plan that was made for other poses works with the right ones; else what goes wrong."""
+        q = plan.phases[1].trajectory.value(0.0).ravel()
+        X_TG = self._arm.X_TB @ forward_kinematics(q) @ self._arm.X_FG
+        picked = scene[plan.pick]
+        X_OG = inverse(matrix(picked.X_TO)) @ X_TG
+        if unevenness(picked.object_class, X_OG, self._arm.suction.cup_diameter) > self._arm.suction.unevenness:
+            return PlanFailure.NO_SEAL.value
+        around = planner.clearance_scene(scene.objects)
+        for phase in plan.phases:
+            around.put(scene.objects)
+            if phase.name == "carry":
+                around.hold(plan.pick, inverse(X_OG))
+            else:
+                around.put_one(plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place)
+                around.touch(plan.pick)
+            for at in sampled(phase.trajectory):
+                for here in around.close(at, 0.0):
+                    # What the object leaves or comes to it may graze by as much as it is misjudged.
+                    if here.pair[0] != plan.pick or here.distance < -error - 0.002:
+                        return f"hits {here.pair[1]}"
+        return "holds"
+
+
+def _misjudged(o: SceneObject, error: float, rng: np.random.Generator) -> SceneObject:
+    x, y = rng.normal(0.0, error, 2)
+    half = math.radians(rng.normal(0.0, 500 * error)) / 2
+    w, i, j, k = o.X_TO.quaternion
+    c, s = math.cos(half), math.sin(half)
+    turned = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)  # about the vertical, on the left
+    px, py, pz = o.X_TO.translation
+    return replace(o, X_TO=Pose((px + x, py + y, pz), turned))
+
+
+def rest_of(o: SceneObject) -> str:
+    """Which of an object's axes points up."""
+    if o.object_class.shape is Shape.CYLINDER:
+        return "upright" if abs(o.X_TO.rotation[2, 2]) > 0.5 else "lying"
+    up = int(np.argmax(np.abs(o.X_TO.rotation[2])))
+    return ("flat", "side", "upright")[int(np.argsort(np.argsort(o.object_class.size))[up])]
+
+
+def below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
+    """The names of the objects under one, seen from above."""
+    lower, upper = picked.bounds_T
+    found = []
+    for other in objects:
+        other_lower, other_upper = other.bounds_T
+        overlap: NDArray[np.float64] = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
+        if other is not picked and overlap.min() > 0 and other_upper[2] < lower[2] + 0.004:
+            found.append(other.name)
+    return found

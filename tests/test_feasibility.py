@@ -1,0 +1,228 @@
+"""Feasibility studies: what is asked, what is answered, and that a study goes on where it was stopped."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import resting, rng, scene_of
+from typer.testing import CliRunner
+
+from drake_clutter.arm.attempts import PlannerConfig, downwards
+from drake_clutter.arm.kinematics import jacobian, manipulability
+from drake_clutter.arm.plan import NoPlan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.reachability import Reachability, base_scores
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.cli import app
+from drake_clutter.commands import feasibility as command
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.scene import Pose
+from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.scenes.seams import Verdict
+from drake_clutter.tasks.feasibility import MOVE_COLUMNS, PLANNED, FeasibilityStudy, below, rest_of
+
+SCENE = scene_of(
+    resting("pudding_box"),
+    resting("gelatin_box", floor=0.035),
+    resting("large_marker", xy=(0.2, 0.2)),
+    resting("tomato_soup_can", xy=(-0.1, -0.2)),
+)
+
+
+def study(arm: ArmConfig | None = None) -> FeasibilityStudy:
+    return FeasibilityStudy("it", arm or ArmConfig(), ClutterConfig(), PlannerConfig(optimise=False), 0)
+
+
+def test_manipulability_in_closed_form() -> None:
+    q = rng().uniform(-np.pi, np.pi, (50, 6))
+    numeric = [abs(np.linalg.det(jacobian(row))) for row in q]
+    assert manipulability(q) == pytest.approx(numeric, abs=1e-12)
+
+
+def test_every_legal_move_has_a_row() -> None:
+    rows = study().moves("scene", 0, SCENE)
+    by_pick: dict[str, list[str]] = {}
+    for row in rows:
+        by_pick.setdefault(row.pick, []).append(row.result)
+    assert set(by_pick) == {"gelatin_box", "large_marker", "tomato_soup_can", "pudding_box"}
+    assert PLANNED in by_pick["gelatin_box"]
+    assert set(by_pick["large_marker"]) <= {"no seal", "no free spot"}
+    assert set(by_pick["pudding_box"]) <= {"carries others", "no free spot"}
+    for row in rows:
+        assert math.isfinite(row.motion_s) == (row.result == PLANNED)
+        assert math.isfinite(row.place_x) == (row.result != "no free spot")
+        assert row.below == (1 if row.pick == "gelatin_box" else 0)
+    again = study().moves("scene", 0, SCENE)
+    assert [str(replace(row, planning_s=0.0)) for row in rows] == [str(replace(row, planning_s=0.0)) for row in again]
+
+
+def test_what_points_up_and_what_lies_below() -> None:
+    assert rest_of(resting("sugar_box", Orientation.UPRIGHT_0)) == "upright"
+    assert rest_of(resting("sugar_box", Orientation.SIDE_0)) == "side"
+    assert rest_of(resting("sugar_box", Orientation.FLAT_0)) == "flat"
+    assert rest_of(resting("tomato_soup_can")) == "upright"
+    assert below(SCENE["gelatin_box"], SCENE.objects) == ["pudding_box"]
+    assert below(SCENE["tomato_soup_can"], SCENE.objects) == []
+
+
+def test_what_no_arm_can_do_is_a_reason() -> None:
+    place = Pose((0.1, 0.1, SCENE["tomato_soup_can"].X_TO.p[2] + 0.001))
+
+    def reason(arm: ArmConfig) -> NoPlan:
+        found = PickPlacePlanner(arm, PlannerConfig(), 0.70, 1.60).plan(SCENE.objects, "tomato_soup_can", place)
+        assert isinstance(found, NoPlan)
+        return found
+
+    in_tray = reason(replace(ArmConfig(), base=[-0.1, 0.0, 0.3, 0.0]))
+    assert (in_tray.reason, in_tray.about) == (PlanFailure.IN_COLLISION, "pedestal and tray")
+    assert reason(replace(ArmConfig(), base=[-5.0, 0.0, 0.3, 0.0])).reason is PlanFailure.UNREACHABLE
+    assert reason(replace(ArmConfig(), payload=1.0)).reason is PlanFailure.TOO_HEAVY
+
+
+def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
+    it = study()
+    rows = it.moves("scene", 0, SCENE)
+    found = it.noise("scene", 0, SCENE, rows)
+    planned = sum(row.result == PLANNED for row in rows)
+    assert len(found) == 5 * min(6, planned)
+    holds = [sum(row.result == "holds" for row in found if row.error == error) for error in (0.002, 0.040)]
+    assert holds[0] > holds[1]
+    assert {row.result for row in found} - {"holds", "no plan"}, "some fail, and it is said how"
+
+
+def test_the_map_agrees_with_the_poses() -> None:
+    reachability = Reachability(ArmConfig(), 0.70, 1.60)
+    found = reachability.map((0.1, 1.5), 0.3)
+    assert found.share.shape == (2, 3, 3)
+    assert (found.share[0] == 1).all()
+    assert (found.share[1] < 1).any(), "too high"
+    middle = reachability.poses(downwards(0.0, np.array([0.0, 0.0, 0.1]))[None])
+    assert middle.branches[0] > 0
+    assert middle.manipulability[0] == pytest.approx(float(manipulability(middle.q[0])))
+    away = reachability.poses(np.array([downwards(0.0, np.array([3.0, 0.0, 0.1])), downwards(0.0, np.array([0.0, 0.0, -0.3]))]))
+    assert away.branches.tolist() == [0, 0]
+    assert away.in_the_way[0] == ""
+    assert "table" in away.in_the_way[1] or "floor" in away.in_the_way[1], "through the floor"
+    near, in_tray = base_scores(ArmConfig(), [(-0.65, 0.0), (0.0, 0.0)], 0.70, 1.60)
+    assert near[0] == 1.0
+    assert in_tray == (0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    save_scene(folder / "pile.yaml", SCENE, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
+    leaning = scene_of(resting("gelatin_box"), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0), 0.028))
+    save_scene(folder / "falls.yaml", leaning)
+    return folder
+
+
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "BASE_X", [-0.8, -0.6])
+    monkeypatch.setattr(command, "BASE_Y", [0.0, 0.2])
+    monkeypatch.setattr(command, "SPACING", 0.3)
+    monkeypatch.setattr(command, "HEIGHTS", (0.05, 0.3))
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.open()))
+
+
+def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch)
+    small = tmp_path / "small_cup.yaml"
+    small.write_text("{suction: {cup_diameter: 0.015}}")
+    targets = tmp_path / "targets.yaml"
+    targets.write_text("[{name: up, translation: [0.1, 0.0, 0.2], quaternion: [0, 1, 0, 0]}]")
+    out = tmp_path / "study"
+    arguments = [
+        "feasibility",
+        str(scenes),
+        "--out",
+        str(out),
+        "--base=-0.7,0,0.3,0",
+        "--tray=0.65,0,-0.3,0",
+        "--arm",
+        str(small),
+    ]
+    told = CliRunner().invoke(app, [*arguments, "--targets", str(targets), "--json"])
+    assert told.exit_code == 0, told.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["unstable_scenes"] == ["falls"]
+    assert list(summary["setups"]) == ["small_cup", "base -0.7, 0, 0.3, 0", "tray 0.65, 0, -0.3, 0"]
+    moves = table(out / "moves.csv")
+    assert tuple(moves[0]) == MOVE_COLUMNS
+    for name, found in summary["setups"].items():
+        rows = [row for row in moves if row["setup"] == name]
+        assert found["moves"] == len(rows) > 0
+        assert found["planned"] == sum(row["result"] == PLANNED for row in rows) > 0
+    assert {row["scene"] for row in moves} == {"pile"}
+    assert len(table(out / "bases.csv")) == 4
+    assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {(name, "up") for name in summary["setups"]}
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64") >= 10
+    assert "http" not in page
+    # What is done is not done again, and what is missing is.
+    before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    (gone := next(path for path in (out / "parts").iterdir() if "scene_0001" in path.name)).unlink()
+    told = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])
+    assert told.exit_code == 0, told.output
+    after = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    assert {name for name in after if after[name] != before[name]} == {gone.name}
+    told = CliRunner().invoke(app, [*arguments, "--seed", "1"])
+    assert isinstance(told.exception, InputError)
+    assert "holds another study" in str(told.exception)
+
+
+def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
+    (one,) = command.setups([], [[0.4, 0.5, -0.3, 30.0]], []).values()
+    X_BT = np.linalg.inv(one.X_TB)
+    assert X_BT[:3, 3] == pytest.approx([0.4, 0.5, -0.3])
+    assert math.degrees(math.atan2(X_BT[1, 0], X_BT[0, 0])) == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]", "not 3 numbers"),
+        ("[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]", "quaternion is zero"),
+        ("{name: a}", "allowed is a YAML list"),
+        ("[{translation: [0, 0, 0]}]", "allowed is a YAML list"),
+    ],
+)
+def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "targets.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        command.read_targets(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{suction: {cup_diameter: 1.0}}", "suction.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
+        ("{base: [0, 0]}", "base: .* allowed is a list of 4 numbers"),
+        ("{base: [0, 0, 0, north]}", "base: 'north'; allowed is a finite number"),
+        ("{reach: 3}", "reach: is unknown"),
+    ],
+)
+def test_arms_that_are_none(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        command.setups([], [], [path])
+
+
+def test_an_arm_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "long.yaml"
+    path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
+    found: dict[str, Any] = command.setups([], [], [path])
+    assert found == {"long": replace(ArmConfig(), base=[-0.7, 0.1, 0.3, 10.0], suction=SuctionConfig(extension=0.15))}
