@@ -24,9 +24,11 @@ from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
+from drake_clutter.reports import feasibility_report
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.scenes.seams import Verdict
+from drake_clutter.tasks import feasibility as tasks_feasibility
 from drake_clutter.tasks.feasibility import MOVE_COLUMNS, PLANNED, FeasibilityStudy, below, rest_of
 
 SCENE = scene_of(
@@ -130,6 +132,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "BASE_Y", [0.0, 0.2])
     monkeypatch.setattr(command, "SPACING", 0.3)
     monkeypatch.setattr(command, "HEIGHTS", (0.05, 0.3))
+    monkeypatch.setattr(feasibility_report, "WORST", 1)
+    monkeypatch.setattr(tasks_feasibility, "NOISY_MOVES", 1)
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -171,6 +175,7 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
     assert page.count("data:image/png;base64") >= 10
     assert "http" not in page
     # What is done is not done again, and what is missing is.
+    monkeypatch.setattr(command, "write_report", lambda *_: None)
     before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
     (gone := next(path for path in (out / "parts").iterdir() if "scene_0001" in path.name)).unlink()
     told = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])

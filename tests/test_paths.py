@@ -18,8 +18,8 @@ from drake_clutter.arm.paths import (
     smooth,
     straight,
     timed,
+    torques,
 )
-from drake_clutter.arm.pick_place import torques
 from drake_clutter.arm.station import ArmConfig
 
 ARM = ArmConfig()

@@ -76,14 +76,16 @@ def test_nothing_is_hit_on_the_way(plan: Plan) -> None:
         else:
             scene.put_one(plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place)
             scene.touch(plan.pick)
-        least = math.inf
+        least = own = math.inf
         for time in np.linspace(0.0, phase.duration, 300):
             for here in scene.close(phase.trajectory.value(time).ravel(), 0.03):
                 if here.pair == (plan.pick, "floor"):
                     assert here.distance > -0.001
+                elif here.pair[1] in scene.arm_names:
+                    own = min(own, here.distance)
                 else:
                     least = min(least, here.distance)
-        assert least > PlannerConfig().clearance - 0.001
+        assert min(least, own) > PlannerConfig().clearance - 0.001
         assert least > min(phase.clearance.distance, 0.03) - 0.001
 
 

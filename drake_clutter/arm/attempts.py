@@ -135,20 +135,17 @@ class Attempts:
         X_pick = np.array([self._lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap) for yaw in yaws])
         X_place = np.array([self._at_place(X) for X in X_pick])
         q_pick, q_place = self._reach(X_pick), self._reach(X_place)
-        found = []
-        for k, yaw in enumerate(yaws):
-            for branch in range(8):
-                if not np.isfinite(q_pick[k, branch, 0]):
-                    continue
-                if not np.isfinite(q_place[k, branch, 0]):
-                    self.fail(0, PlanFailure.UNREACHABLE, "the place")
-                    continue
-                at_pick = nearest_turns(q_pick[k, branch], self._home)
-                at_place = nearest_turns(q_place[k, branch], at_pick)
-                turns = np.array([at_pick - self._home, at_place - at_pick, at_place - self._home])
-                found.append((least_time(turns).sum(), at_pick, at_place, branch, float(yaw)))
-        found.sort(key=lambda item: item[0])
-        return [item[1:] for item in found]
+        reached = np.isfinite(q_pick[..., 0])
+        if (reached & ~np.isfinite(q_place[..., 0])).any():
+            self.fail(0, PlanFailure.UNREACHABLE, "the place")
+        at_pick = nearest_turns(q_pick, self._home)
+        at_place = nearest_turns(q_place, at_pick)
+        turns = np.array([at_pick - self._home, at_place - at_pick, at_place - self._home])
+        with np.errstate(invalid="ignore"):
+            length = least_time(turns).sum(axis=0)
+        order = np.argsort(length, axis=None, kind="stable")  # what is not finite comes last
+        chosen = [divmod(int(n), 8) for n in order[: np.isfinite(length).sum()]]
+        return [(at_pick[k, branch], at_place[k, branch], branch, float(yaws[k])) for k, branch in chosen]
 
     @staticmethod
     def _lifted(X_TG: Floats, height: float) -> Floats:

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_clutter.arm.paths import Payload, dynamics_plant
+from drake_clutter.arm.paths import Payload, dynamics_plant, torques
 from drake_clutter.arm.plan import Plan
 from drake_clutter.arm.station import ArmConfig
 
@@ -77,18 +75,6 @@ def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
     q, more = np.vstack(q_parts), np.vstack(torque_parts)
     reference = PiecewisePolynomial.FirstOrderHold(t, np.column_stack([q, more[:, :6]]).T)
     return Schedule(reference, PiecewisePolynomial.FirstOrderHold(t, more[:, 6:].T), on, off, time, tuple(starts))
-
-
-def torques(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
-    """(n, 6) N m, that motions (n, 6) each, take."""
-    context, found = plant.CreateDefaultContext(), np.empty_like(q)
-    for k in range(len(q)):
-        plant.SetPositions(context, q[k])
-        plant.SetVelocities(context, v[k])
-        forces = MultibodyForces(plant)
-        plant.CalcForceElementsContribution(context, forces)
-        found[k] = plant.CalcInverseDynamics(context, a[k], forces)
-    return found
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class Phase:
     Attributes:
         name: approach, carry or retreat.
         trajectory: q (6,) rad over time, s.
-        clearance: the least along it, densely checked, of what was not allowed to touch.
+        clearance: the least along it, densely checked, from what was not allowed to touch; the arm's own parts left out.
         sure: s, that the sure way takes; the duration, unless the way was optimised.
     """
 

@@ -149,13 +149,15 @@ def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> 
         config: the cup.
     """
 
-    def share(acceleration: float) -> float:
-        return float(load_share(*carried_load(mass, p_GCm, acceleration * _DIRECTIONS), config).max()) * config.safety
+    def bears(accelerations: Floats) -> NDArray[np.bool_]:
+        share = load_share(*carried_load(mass, p_GCm, accelerations[:, None, None] * _DIRECTIONS), config)
+        return np.asarray(share.max(axis=1) * config.safety <= 1)
 
-    if share(0.0) > 1:
-        return -1.0
     low, high = 0.0, 50.0
+    if not bears(np.zeros(1))[0]:
+        return -1.0
     while high - low > 0.01:
-        middle = (low + high) / 2
-        low, high = (middle, high) if share(middle) <= 1 else (low, middle)
+        between = np.linspace(low, high, 65)
+        largest = int(np.flatnonzero(bears(between))[-1])
+        low, high = float(between[largest]), float(between[min(largest + 1, 64)])
     return low
