@@ -325,7 +325,7 @@ class Attempts:
             return found
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
-        q = shortened(Way(phase.trajectory, upright, payload.along_axis, walls, self._scene.cup_jacobian))
+        q = shortened(Way(phase.trajectory, upright, bool(held), payload.along_axis, walls, self._scene.cup_jacobian))
         if q is None:
             return phase
         path = smooth(q)

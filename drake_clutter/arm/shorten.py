@@ -29,6 +29,7 @@ UPRIGHT = 0.005
 """m, that the cup moves straight up from a grasp, and straight down to a place."""
 ENDS = 0.15
 """Share of a way at either end, where it may stay as close as it is: there the ends leave it no choice."""
+_TILT = np.array([[0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 _ORDER = 4
 _OPTIONS = SolverOptions()
 _OPTIONS.SetOption(SnoptSolver.id(), "Major optimality tolerance", 1e-3)
@@ -55,6 +56,8 @@ class Way:
     Attributes:
         sure: the way that is known, timed.
         upright: whether it begins, and ends, straight above a face.
+        level: whether the cup keeps pointing down, for the sake of what hangs on it: then wrist 2 does not turn, nor do shoulder
+            lift, elbow and wrist 1 together.
         acceleration: m/s^2, of the cup along each axis, at most.
         walls: what is near, at joint angles (6,) rad and a share of the way in 0 to 1.
         jacobian: (6, 6) of the cup at joint angles, turning first.
@@ -62,6 +65,7 @@ class Way:
 
     sure: Trajectory
     upright: tuple[bool, bool]
+    level: bool
     acceleration: float
     walls: Callable[[Floats, float], list[Wall]]
     jacobian: Callable[[Floats], Floats]
@@ -111,6 +115,8 @@ def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floa
     for k in range(CONTROL_POINTS):
         reach = 0.0 if k in (0, 1, CONTROL_POINTS - 2, CONTROL_POINTS - 1) else step
         prog.AddBoundingBoxConstraint(points[k] - reach, points[k] + reach, variables[:, k])
+        if way.level:
+            prog.AddLinearEqualityConstraint(_TILT, _TILT @ points[0], variables[:, k])
     for upright, end, inwards in ((way.upright[0], 0, 1), (way.upright[1], CONTROL_POINTS - 1, -1)):
         if upright:
             J, q = way.jacobian(points[end]), points[end]
