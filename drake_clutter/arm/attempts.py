@@ -178,16 +178,22 @@ class Attempts:
             progress: see `fail`.
             what: the way is.
         """
-        found, name, least = Clearance(math.inf), self._picked.name, self._config.clearance
+        found, least = Clearance(math.inf), self._config.clearance
         for q in way:
             for here in self._scene.close(q, REPORTED):
-                allowed = beside.get(here.pair[1], least) if here.pair[0] == name else least
+                allowed = self._needed(here, beside, least)
                 if here.distance < allowed:
                     self.fail(progress, PlanFailure.IN_COLLISION, f"{what}: {' and '.join(here.pair)}", here.distance)
                     return None
                 if allowed == least and here.distance < found.distance and here.pair[1] not in self._scene.arm_names:
                     found = here
         return found
+
+    def _needed(self, here: Clearance, beside: Mapping[str, float], least: float) -> float:
+        """m, that two parts must be apart: the cup and the object are not, nor what the object touches at an end of its way."""
+        if here.pair == ("cup", self._picked.name):
+            return self._config.lip_gap / 2
+        return beside.get(here.pair[1], least) if here.pair[0] == self._picked.name else least
 
     def _beside(self, q: Floats) -> dict[str, float]:
         """What the held object is close to, and how close it may come to that; at joint angles (6,) rad."""
@@ -292,8 +298,6 @@ class Attempts:
         self._scene.put_one(name, self._place if phase == "retreat" else self._picked.X_TO)
         if phase == "carry":
             self._scene.hold(name, inverse(X_OG))
-        else:
-            self._scene.touch(name)
 
     def _checked(
         self, phase: str, path: Trajectory, X_OG: Floats, beside: tuple[dict[str, float], dict[str, float]], progress: int
@@ -314,18 +318,18 @@ class Attempts:
     ) -> Phase:
         """The phase along a quicker way; as it is if none is found."""
         self._set_up(phase.name, X_OG)
-        held, least = self._picked.name if phase.name == "carry" else "", self._config.clearance + SPARE
+        least = self._config.clearance + SPARE
 
         def walls(q: Floats, along: float) -> list[Wall]:
             found = []
             for here, gradient in self._scene.gradients(q, NEAR):
-                needed = beside[0 if along < 0.5 else 1].get(here.pair[1], least) if here.pair[0] == held else least
+                needed = self._needed(here, beside[0 if along < 0.5 else 1], least)
                 if np.abs(gradient).max() > 1e-6:  # some of the wrist's parts are always as far apart
                     found.append(Wall(gradient, here.distance - needed))
             return found
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
-        q = shortened(Way(phase.trajectory, upright, bool(held), payload.along_axis, walls, self._scene.cup_jacobian))
+        q = shortened(Way(phase.trajectory, upright, phase.name == "carry", payload.along_axis, walls, self._scene.cup_jacobian))
         if q is None:
             return phase
         path = smooth(q)

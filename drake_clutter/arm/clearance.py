@@ -73,9 +73,6 @@ class ClearanceScene:
             found.Add(self.plant.GetCollisionGeometriesForBody(body))
         return found
 
-    def _of_arm(self, *names: str) -> GeometrySet:
-        return self._geometries(*(body for body in self._arm.bodies if body.name() in names))
-
     def _name_geometries(self) -> dict[object, str]:
         names = {}
         owners = {body.index(): name for name, body in self._bodies.items()}
@@ -115,11 +112,6 @@ class ClearanceScene:
         while self._transient:
             self._filters.RemoveDeclaration(self._transient.pop())
         self._held = None
-
-    def touch(self, name: str) -> None:
-        """From now on, until `release`, the cup may come into contact with the object."""
-        allowed = CollisionFilterDeclaration().ExcludeBetween(self._geometries(self._bodies[name]), self._of_arm("cup"))
-        self._transient.append(self._filters.ApplyTransient(allowed))
 
     def _close(self, q: Floats, within: float) -> list[SignedDistancePair]:
         self._q[self._at] = q

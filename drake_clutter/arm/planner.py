@@ -65,7 +65,6 @@ class PickPlacePlanner:
         if self.config.over_tray(self.tray_side):
             return NoPlan(PlanFailure.IN_COLLISION, "pedestal and tray")
         scene = self.clearance_scene(objects)
-        scene.touch(picked.name)
         if hit := scene.close(np.array(self.config.home), self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
             return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
