@@ -123,6 +123,7 @@ class Attempts:
         tops = sorted({round(o.top, 3) for o in others if o.top > bottom})
         self._bottoms = [bottom + self._config.rise] + [top + self._config.rise for top in tops if top > bottom]
         self._home = np.array(arm.home)
+        self._grasped_at = np.zeros(2)  # m, x and y of the cup where it holds the object in the present phase
 
     def fail(self, progress: int, reason: PlanFailure, about: str, number: float = math.nan) -> None:
         """Remembers why an attempt failed, if it came further than those before."""
@@ -190,9 +191,14 @@ class Attempts:
         return found
 
     def _needed(self, here: Clearance, beside: Mapping[str, float], least: float) -> float:
-        """m, that two parts must be apart: the cup and the object are not, nor what the object touches at an end of its way."""
+        """m, that two parts must be apart, at the joint angles that the scene was last asked about.
+
+        What the object touches at an end of its way may stay as close; and the cup is as far from the face as it is aside of the
+        grasp, at least.
+        """
         if here.pair == ("cup", self._picked.name):
-            return self._config.lip_gap / 2
+            aside = np.linalg.norm(self._scene.cup_position()[:2] - self._grasped_at)
+            return min(least, self._config.lip_gap / 2 + float(aside))
         return beside.get(here.pair[1], least) if here.pair[0] == self._picked.name else least
 
     def _beside(self, q: Floats) -> dict[str, float]:
@@ -294,6 +300,7 @@ class Attempts:
     def _set_up(self, phase: str, X_OG: Floats) -> None:
         """The scene as it is during a phase."""
         name = self._picked.name
+        self._grasped_at = ((self._X_TO_place if phase == "retreat" else self._X_TO) @ X_OG)[:2, 3]
         self._scene.release()
         self._scene.put_one(name, self._place if phase == "retreat" else self._picked.X_TO)
         if phase == "carry":

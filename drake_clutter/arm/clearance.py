@@ -156,6 +156,10 @@ class ClearanceScene:
             found.append((self._named(pair), gradient))
         return found
 
+    def cup_position(self) -> Floats:
+        """(3,) m, of the cup in T at the joint angles of the last question."""
+        return np.asarray(self._arm.cup.CalcPoseInWorld(self._context).translation())
+
     def cup_jacobian(self, q: Floats) -> Floats:
         """(6, 6) at joint angles (6,) rad: how the cup turns (first three rows) and moves, in T."""
         self._q[self._at] = q
