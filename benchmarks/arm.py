@@ -1,17 +1,18 @@
-"""The arm: planning and carrying out random legal moves in stable RG scenes, and the two ways to hold an object.
+"""The arm: random legal moves in stable RG scenes, planned and carried out; its parts; and the two ways to hold an object.
 
 python benchmarks/arm.py moves --count 1000 --workers 2 --out benchmarks/results/arm_moves.json
+python benchmarks/arm.py parts --count 20 --out benchmarks/results/arm_parts.json
 python benchmarks/arm.py holds --count 20 --out benchmarks/results/arm_holds.json
 """
 
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -21,8 +22,10 @@ from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
-from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.attempts import NEAR, REPORTED, PlannerConfig
 from drake_clutter.arm.hold import HexapodHold, JointHold
+from drake_clutter.arm.kinematics import forward_kinematics
+from drake_clutter.arm.paths import Payload, sampled, smooth, timed
 from drake_clutter.arm.plan import NoPlan, Plan
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
@@ -33,6 +36,8 @@ from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.exploration import legal_moves
+
+Result = TypeVar("Result")
 
 MOVES_PER_SCENE = 10
 PLACED_WITHIN, TURNED_WITHIN, UNDISTURBED = 0.005, math.radians(3), 0.005
@@ -49,7 +54,9 @@ class Trial:
         result: the reason why there is no plan, or what became of the plan.
         possible: whether some grasp reaches both ends without collision.
         object_class: of the picked object.
-        planning, motion, wall: s, to plan, of the planned motion, to build and simulate it.
+        sure_planning, planning: s, to plan the sure way, and with trajectory optimisation.
+        sure_motion, motion: s, of both motions. shortened: names of the phases of which the optimised way is kept.
+        wall: s, to build and simulate it.
         place_error: m. turn_error: rad. disturbed: m, of the object that was moved furthest. slip: m.
         tracking: rad.
         clearance: m, the least of the plan.
@@ -59,8 +66,11 @@ class Trial:
     result: str
     possible: bool
     object_class: str
-    planning: float
+    sure_planning: float
+    planning: float = math.nan
+    sure_motion: float = math.nan
     motion: float = math.nan
+    shortened: tuple[str, ...] = ()
     wall: float = math.nan
     place_error: float = math.nan
     turn_error: float = math.nan
@@ -113,13 +123,15 @@ class Mover:
     def __init__(self, nodes: int, seed: int) -> None:
         self._scenes, self._seed = Scenes(nodes, seed), seed
         self._detector, self._executor = LabelDetector(WORLD.camera), ArmExecutor(WORLD)
+        self._sure = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False))
 
     def __call__(self, number: int) -> list[Trial]:
         """Moves in the scene of a number."""
         scene, rng = self._scenes(number), item_rng(self._seed, number, 1)
         observation = self._detector.look(scene).observation
         moves = legal_moves(observation)
-        self._executor.planner(scene.tray_side).clearance_scene(scene.objects)  # as when moves follow each other
+        for executor in (self._executor, self._sure):
+            executor.planner(scene.tray_side).clearance_scene(scene.objects)  # as when moves follow each other
         return [self._tried(scene, moves[k], rng, observation) for k in rng.permutation(len(moves))[:MOVES_PER_SCENE]]
 
     def _tried(self, scene: Scene, move: Any, rng: np.random.Generator, observation: Any) -> Trial:
@@ -128,9 +140,10 @@ class Mover:
         if X_TO is None:
             return Trial("no free spot", False, name, 0.0)
         planner = self._executor.planner(scene.tray_side)
+        sure = self._sure.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
         plan = planner.plan(scene.objects, move.pick, X_TO)
         if isinstance(plan, NoPlan):
-            return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, plan.seconds)
+            return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, sure.seconds)
         begun = time.perf_counter()
         carried = ArmSimulation(ArmConfig(), scene, plan, camera_altitude=WORLD.camera.altitude).run()
         wall, result = time.perf_counter() - begun, judged(carried)
@@ -138,8 +151,11 @@ class Mover:
             result=result,
             possible=True,
             object_class=name,
+            sure_planning=sure.seconds,
             planning=plan.seconds,
+            sure_motion=plan.sure,
             motion=plan.duration,
+            shortened=tuple(phase.name for phase in plan.phases if phase.duration < phase.sure),
             wall=wall,
             place_error=carried.place_error,
             turn_error=carried.turn_error,
@@ -186,13 +202,78 @@ def moves(
         "planned_of_possible": share(len(planned), sum(t.possible for t in trials)),
         "carried_out_of_planned": share(sum(t.result == "carried out" for t in planned), len(planned)),
         "carried_out_unless_unstable_anyway": share(good, len(fair)),
+        "sure_planning_s": quantiles([t.sure_planning for t in planned]),
         "planning_s": quantiles([t.planning for t in planned]),
+        "sure_motion_s": quantiles([t.sure_motion for t in planned]),
         "motion_s": quantiles([t.motion for t in planned]),
+        "motion_of_sure": quantiles([t.motion / t.sure_motion for t in planned]),
+        "optimised_carry_kept": share(sum("carry" in t.shortened for t in planned), len(planned)),
+        "optimised_phases_kept": share(sum(len(t.shortened) for t in planned), 3 * len(planned)),
+        "optimised_nothing_kept": share(sum(not t.shortened for t in planned), len(planned)),
         "simulation_wall_s": quantiles([t.wall for t in planned]),
         "place_error_m": quantiles([t.place_error for t in planned if t.result == "carried out"]),
         "slip_m": quantiles([t.slip for t in planned if not math.isnan(t.slip)]),
         "tracking_rad": quantiles([t.tracking for t in planned]),
         "least_clearance_m": min((t.clearance for t in planned), default=math.nan),
+    }
+    write_json(out, fields)
+    console.print_json(data=fields)
+
+
+def parts(
+    out: Annotated[Path, typer.Option(help="Results, JSON.")],
+    count: Annotated[int, typer.Option(help="Planned moves.")] = 20,
+    seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
+) -> None:
+    """Times the parts of planning and simulating a move, one by one, on one core."""
+    detector, spent = LabelDetector(WORLD.camera), dict[str, list[float]]()
+    sure, executor, scenes = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False)), ArmExecutor(WORLD), Scenes(25, seed)
+
+    def timed_as(name: str, call: Callable[[], Result], of: int = 1) -> Result:
+        begun = time.perf_counter()
+        found = call()
+        spent.setdefault(name, []).append((time.perf_counter() - begun) / of)
+        return found
+
+    number = done = 0
+    while done < count:
+        scene, rng = scenes(number), item_rng(seed, number, 1)
+        number += 1
+        observation = detector.look(scene).observation
+        choices = legal_moves(observation)
+        move = choices[rng.integers(len(choices))]
+        X_TO = choose_placement(observation, move, WORLD.exploration, rng)
+        if X_TO is None:
+            continue
+        planner, quick = executor.planner(scene.tray_side), sure.planner(scene.tray_side)
+        timed_as("scene of distances", lambda planner=planner, scene=scene: planner.clearance_scene(scene.objects))
+        quick.clearance_scene(scene.objects)
+        plans = [
+            timed_as(name, lambda p=p, scene=scene, move=move, X_TO=X_TO: p.plan(scene.objects, move.pick, X_TO))
+            for name, p in (("sure plan", quick), ("optimised plan", planner))
+        ]
+        if not isinstance(plans[1], Plan):
+            spent["sure plan"].pop(), spent["optimised plan"].pop()
+            continue
+        done += 1
+        plan, around = plans[1], planner.clearance_scene(scene.objects)
+        q = sampled(plan.phases[1].trajectory)
+        poses = ArmConfig().X_TB @ forward_kinematics(q) @ ArmConfig().X_FG
+        timed_as("forward kinematics of a pose", lambda q=q: forward_kinematics(q), len(q))
+        timed_as(
+            "inverse kinematics of a pose, eight branches", lambda planner=planner, poses=poses: planner.reach(poses), len(q)
+        )
+        timed_as("distances at joint angles", lambda around=around, q=q: [around.close(at, REPORTED) for at in q], len(q))
+        timed_as("distances with gradients", lambda around=around, q=q: [around.gradients(at, NEAR) for at in q], len(q))
+        timed_as("timing of a path without load", lambda q=q: timed(smooth(q), ArmConfig(), Payload()))
+        simulation = timed_as(
+            "simulation, built", lambda scene=scene, plan=plan: ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6)
+        )
+        timed_as("simulation, run", simulation.run)
+    fields = {
+        "command": f"benchmarks/arm.py parts --count {count} --seed {seed}",
+        "commit": commit(),
+        "seconds": {name: quantiles(values) for name, values in spent.items()},
     }
     write_json(out, fields)
     console.print_json(data=fields)
@@ -240,6 +321,7 @@ def holds(
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False)
     app.command()(moves)
+    app.command()(parts)
     app.command()(holds)
     with told_in_one_line():
         app()

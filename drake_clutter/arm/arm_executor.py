@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 NEAR = 0.02
 """m; objects closer than that to where something is picked or put take part, with all that they touch."""
-SETTLE_TIME = 0.3
+SETTLE_TIME = 0.1
 """s, that is simulated after the arm is home."""
 UNTOUCHED = 1e-4
 """m; what moved less is not settled again."""
@@ -148,7 +148,7 @@ class ArmSimulation:
         for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
             time = root.get_time()
             wanted = set[str]()
-            if schedule.suction_on - AHEAD <= time:
+            if schedule.suction_on - AHEAD <= time <= schedule.suction_off + DWELL + LIFTED:
                 wanted |= {self._plan.pick}
             if schedule.suction_on - AHEAD <= time <= schedule.suction_on + DWELL + LIFTED:
                 wanted |= beside_pick

@@ -129,7 +129,7 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     if speed is None:
         return None
     trajectory = PathParameterizedTrajectory(path, speed)
-    if (np.abs(torques_along(trajectory, plant, _GRID)) <= MARGIN * TORQUE_LIMIT).all():
+    if (np.abs(torques_along(trajectory, plant, _GRID // 2)) <= MARGIN * TORQUE_LIMIT).all():
         return trajectory
     toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)  # rarely needed, and a quarter of the time
     speed = toppra.SolvePathParameterization()

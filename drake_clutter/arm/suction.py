@@ -154,10 +154,10 @@ def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> 
         return np.asarray(share.max(axis=1) * config.safety <= 1)
 
     low, high = 0.0, 50.0
-    if not bears(np.zeros(1))[0]:
-        return -1.0
     while high - low > 0.01:
-        between = np.linspace(low, high, 65)
-        largest = int(np.flatnonzero(bears(between))[-1])
-        low, high = float(between[largest]), float(between[min(largest + 1, 64)])
+        between = np.linspace(low, high, 129)
+        largest = int(np.argmin(np.append(bears(between), False))) - 1
+        if largest < 0:
+            return -1.0
+        low, high = float(between[largest]), float(between[min(largest + 1, 128)])
     return low
