@@ -99,6 +99,19 @@ class Grasp:
     payload: Payload
 
 
+@dataclass(frozen=True)
+class End:
+    """Where the object is picked up or let go.
+
+    Attributes:
+        at: (2,) m, of the cup there, seen from above.
+        beside: m, how close the object, while it is held, may be there to what it touches, by name.
+    """
+
+    at: Floats
+    beside: Mapping[str, float]
+
+
 class Attempts:
     """The search for one move: grasps, yaws, branches and heights, until a way is free."""
 
@@ -123,7 +136,6 @@ class Attempts:
         tops = sorted({round(o.top, 3) for o in others if o.top > bottom})
         self._bottoms = [bottom + self._config.rise] + [top + self._config.rise for top in tops if top > bottom]
         self._home = np.array(arm.home)
-        self._grasped_at = np.zeros(2)  # m, x and y of the cup where it holds the object in the present phase
 
     def fail(self, progress: int, reason: PlanFailure, about: str, number: float = math.nan) -> None:
         """Remembers why an attempt failed, if it came further than those before."""
@@ -170,19 +182,19 @@ class Attempts:
             q[k] = nearest_turns(q[k], q[k - 1])
         return None if np.abs(np.diff(q, axis=0)).max() > 0.5 else q
 
-    def _free(self, way: Floats, beside: Mapping[str, float], progress: int, what: str) -> Clearance | None:
+    def _free(self, way: Floats, end: End, progress: int, what: str) -> Clearance | None:
         """The least clearance along a way; None, and the reason is remembered, if it is less than it must be.
 
         Args:
             way: (n, 6) rad.
-            beside: m, how close the held object may come to what it touches at an end of its way, by name.
+            end: to which the way is near.
             progress: see `fail`.
             what: the way is.
         """
         found, least = Clearance(math.inf), self._config.clearance
         for q in way:
             for here in self._scene.close(q, REPORTED):
-                allowed = self._needed(here, beside, least)
+                allowed = self._needed(here, end, least)
                 if here.distance < allowed:
                     self.fail(progress, PlanFailure.IN_COLLISION, f"{what}: {' and '.join(here.pair)}", here.distance)
                     return None
@@ -190,36 +202,39 @@ class Attempts:
                     found = here
         return found
 
-    def _needed(self, here: Clearance, beside: Mapping[str, float], least: float) -> float:
+    def _needed(self, here: Clearance, end: End, least: float) -> float:
         """m, that two parts must be apart, at the joint angles that the scene was last asked about.
 
-        What the object touches at an end of its way may stay as close; and the cup is as far from the face as it is aside of the
-        grasp, at least.
+        The cup may come close to its object, and the held object to what it touches at the end of its way; but as much further
+        away as they are aside of that end, at least.
         """
         if here.pair == ("cup", self._picked.name):
-            aside = np.linalg.norm(self._scene.cup_position()[:2] - self._grasped_at)
-            return min(least, self._config.lip_gap / 2 + float(aside))
-        return beside.get(here.pair[1], least) if here.pair[0] == self._picked.name else least
-
-    def _beside(self, q: Floats) -> dict[str, float]:
-        """What the held object is close to, and how close it may come to that; at joint angles (6,) rad."""
-        name = self._picked.name
-        close = [here for here in self._scene.close(q, self._config.clearance) if here.pair[0] == name]
-        return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
+            close = self._config.lip_gap / 2
+        elif here.pair[0] == self._picked.name and here.pair[1] in end.beside:
+            close = end.beside[here.pair[1]]
+        else:
+            return least
+        return min(least, close + float(np.linalg.norm(self._scene.cup_position()[:2] - end.at)))
 
     def _poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, Floats]:
         """X_TG at the grasp and at the place, and X_OG, (4, 4) each."""
         X_pick = self._lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap)
         return X_pick, self._at_place(X_pick), inverse(self._X_TO) @ X_pick
 
-    def ends_free(self, X_OG: Floats, q_pick: Floats, q_place: Floats) -> tuple[dict[str, float], dict[str, float]] | None:
-        """What the object touches at either end, see `_beside`; None if the arm or the object is in collision there."""
+    def ends_free(self, X_OG: Floats, q_pick: Floats, q_place: Floats) -> tuple[End, End] | None:
+        """Both ends of the object's way; None if the arm or the object is in collision there."""
         self._set_up("approach", X_OG)
-        if self._free(q_pick[None], {}, 1, "at the grasp") is None:
+        pick, place = ((X_TO @ X_OG)[:2, 3] for X_TO in (self._X_TO, self._X_TO_place))
+        if self._free(q_pick[None], End(pick, {}), 1, "at the grasp") is None:
             return None
         self._set_up("carry", X_OG)
-        beside = self._beside(q_pick), self._beside(q_place)
-        return None if self._free(q_place[None], beside[1], 2, "at the place") is None else beside
+        ends = End(pick, self._beside(q_pick)), End(place, self._beside(q_place))
+        return None if self._free(q_place[None], ends[1], 2, "at the place") is None else ends
+
+    def _beside(self, q: Floats) -> dict[str, float]:
+        name = self._picked.name
+        close = [here for here in self._scene.close(q, self._config.clearance) if here.pair[0] == name]
+        return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
 
     def exist(self, grasp: Grasp) -> bool:
         """Whether some yaw and branch reach both ends without collision."""
@@ -229,8 +244,8 @@ class Attempts:
         """A plan with this grasp, yaw and branch, at the least height that is free; None if there is none."""
         self.count += 1
         X_pick, X_place, X_OG = self._poses(grasp, yaw)
-        beside = self.ends_free(X_OG, q_pick, q_place)
-        if beside is None:
+        ends = self.ends_free(X_OG, q_pick, q_place)
+        if ends is None:
             return None
         name, hangs = self._picked.name, X_pick[2, 3] - self._picked.bounds_T[0][2]
         for bottom in self._bottoms:
@@ -240,15 +255,16 @@ class Attempts:
             if up is None or down is None:
                 self.fail(3, PlanFailure.UNREACHABLE, "above the grasp" if up is None else "above the place", bottom + hangs)
                 return None
-            phases = self._phases(grasp, X_OG, up, down, branch, beside)
+            phases = self._phases(grasp, X_OG, up, down, branch, ends)
             if phases is not None:
                 x, y, z = (float(v) for v in inverse(X_OG)[:3, 3])
-                ends = self._picked.X_TO, self._place
-                return Plan(name, *ends, X_OG, self._picked.object_class.mass, (x, y, z), phases, self.count, 0.0)
+                return Plan(
+                    name, self._picked.X_TO, self._place, X_OG, self._picked.object_class.mass, (x, y, z), phases, self.count, 0.0
+                )
         return None
 
     def _phases(
-        self, grasp: Grasp, X_OG: Floats, up: Floats, down: Floats, branch: int, beside: tuple[dict[str, float], dict[str, float]]
+        self, grasp: Grasp, X_OG: Floats, up: Floats, down: Floats, branch: int, ends: tuple[End, End]
     ) -> tuple[Phase, ...] | None:
         empty = Payload()
         across = straight(up[-1], down[-1])
@@ -259,12 +275,12 @@ class Attempts:
         }
         found = {}
         for progress, (name, (choices, payload)) in enumerate(ways.items(), start=4):
-            phase = next((made for way in choices if (made := self._phase(name, way, payload, X_OG, beside, progress))), None)
+            phase = next((made for way in choices if (made := self._phase(name, way, payload, X_OG, ends, progress))), None)
             if phase is None:
                 return None
             found[name] = phase
         if self._config.optimise:
-            found = {name: self._shortened(found[name], payload, X_OG, beside) for name, (_, payload) in ways.items()}
+            found = {name: self._shortened(found[name], payload, X_OG, ends) for name, (_, payload) in ways.items()}
         return found["approach"], found["carry"], found["retreat"]
 
     def _homewards(self, start: Floats, branch: int) -> list[Floats]:
@@ -283,12 +299,12 @@ class Attempts:
         way: Floats,
         payload: Payload,
         X_OG: Floats,
-        beside: tuple[dict[str, float], dict[str, float]],
+        ends: tuple[End, End],
         progress: int,
     ) -> Phase | None:
         """A phase along a way; None if that is not free, or too much for the arm."""
         path = smooth(way)
-        clearance = self._checked(name, path, X_OG, beside, progress)
+        clearance = self._checked(name, path, X_OG, ends, progress)
         if clearance is None:
             return None
         trajectory = timed(path, self._arm, payload)
@@ -300,47 +316,43 @@ class Attempts:
     def _set_up(self, phase: str, X_OG: Floats) -> None:
         """The scene as it is during a phase."""
         name = self._picked.name
-        self._grasped_at = ((self._X_TO_place if phase == "retreat" else self._X_TO) @ X_OG)[:2, 3]
         self._scene.release()
         self._scene.put_one(name, self._place if phase == "retreat" else self._picked.X_TO)
         if phase == "carry":
             self._scene.hold(name, inverse(X_OG))
 
-    def _checked(
-        self, phase: str, path: Trajectory, X_OG: Floats, beside: tuple[dict[str, float], dict[str, float]], progress: int
-    ) -> Clearance | None:
+    def _checked(self, phase: str, path: Trajectory, X_OG: Floats, ends: tuple[End, End], progress: int) -> Clearance | None:
         """The least clearance along a path; None if it is too little."""
         self._set_up(phase, X_OG)
         points = sampled(path)
         if phase != "carry":
-            return self._free(points, {}, progress, phase)
+            return self._free(points, End(ends[int(phase == "retreat")].at, {}), progress, phase)
         half = len(points) // 2  # what it touched at the start it has left by then
-        found = [self._free(points[:half], beside[0], progress, phase)]
+        found = [self._free(points[:half], ends[0], progress, phase)]
         if found[0] is not None:
-            found.append(self._free(points[half:], beside[1], progress, phase))
+            found.append(self._free(points[half:], ends[1], progress, phase))
         return None if None in found else min((c for c in found if c), key=lambda c: c.distance)
 
-    def _shortened(
-        self, phase: Phase, payload: Payload, X_OG: Floats, beside: tuple[dict[str, float], dict[str, float]]
-    ) -> Phase:
+    def _shortened(self, phase: Phase, payload: Payload, X_OG: Floats, ends: tuple[End, End]) -> Phase:
         """The phase along a quicker way; as it is if none is found."""
         self._set_up(phase.name, X_OG)
-        least = self._config.clearance + SPARE
+        least, carried = self._config.clearance + SPARE, phase.name == "carry"
+        away = End(ends[int(phase.name == "retreat")].at, {})
 
         def walls(q: Floats, along: float) -> list[Wall]:
             found = []
             for here, gradient in self._scene.gradients(q, NEAR):
-                needed = self._needed(here, beside[0 if along < 0.5 else 1], least)
+                needed = self._needed(here, ends[int(along >= 0.5)] if carried else away, least)
                 if np.abs(gradient).max() > 1e-6:  # some of the wrist's parts are always as far apart
                     found.append(Wall(gradient, here.distance - needed))
             return found
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
-        q = shortened(Way(phase.trajectory, upright, phase.name == "carry", payload.along_axis, walls, self._scene.cup_jacobian))
+        q = shortened(Way(phase.trajectory, upright, carried, payload.along_axis, walls, self._scene.cup_jacobian))
         if q is None:
             return phase
         path = smooth(q)
-        clearance, trajectory = self._checked(phase.name, path, X_OG, beside, 0), timed(path, self._arm, payload)
+        clearance, trajectory = self._checked(phase.name, path, X_OG, ends, 0), timed(path, self._arm, payload)
         if clearance is None or trajectory is None or trajectory.end_time() >= phase.sure:
             return phase
         return Phase(phase.name, trajectory, clearance, phase.sure)
