@@ -11,7 +11,7 @@ from pydrake.multibody.optimization import Toppra
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
-from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, Trajectory
+from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.arm.epick import epick_sdf
 from drake_clutter.arm.station import ArmConfig
@@ -29,6 +29,7 @@ MARGIN = 0.97
 SPACING = 0.08
 """rad, that a joint turns at most from one point of a way to the next."""
 _ORDER = 4
+SWING = 0.1
 _GRID = 70
 """Points of a path at which the limits are imposed."""
 
@@ -128,12 +129,28 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     speed = toppra.SolvePathParameterization()
     if speed is None:
         return None
+    speed = softened(speed) if payload.mass else speed
     trajectory = PathParameterizedTrajectory(path, speed)
     if (np.abs(torques_along(trajectory, plant, _GRID // 2)) <= MARGIN * TORQUE_LIMIT).all():
         return trajectory
     toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)  # rarely needed, and a quarter of the time
     speed = toppra.SolvePathParameterization()
-    return None if speed is None else PathParameterizedTrajectory(path, speed)
+    if speed is None:
+        return None
+    return PathParameterizedTrajectory(path, softened(speed) if payload.mass else speed)
+
+
+def softened(along: Trajectory) -> Trajectory:
+    """A path's parameter over time, averaged over `SWING` s, by which it takes longer: accelerations rise and fall, and do not jump.
+
+    One that jumps makes a load swing on the elastic cup, twice as far.
+    """
+    step, half = 0.005, round(SWING / 0.01)
+    times = np.arange(-2 * half, math.ceil(along.end_time() / step) + 2 * half + 1) * step
+    values = along.vector_values(np.clip(times, 0.0, along.end_time())).ravel()
+    mean = np.convolve(values, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
+    rest = np.zeros((1, 1))
+    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(np.arange(len(mean)) * step, mean[None], rest, rest)
 
 
 def torques_along(trajectory: Trajectory, plant: MultibodyPlant, count: int) -> Floats:

@@ -25,7 +25,7 @@ STEPS = (0.8, 0.4, 0.2)
 """rad, by which a control point may move in each round."""
 LOOKED_AT = 50
 """Points of a spline at which distances are taken, and at half of them how the cup is accelerated."""
-UPRIGHT = 0.015
+UPRIGHT = 0.008
 """m, that the cup moves straight up from a grasp, and straight down to a place."""
 ENDS = 0.15
 """Share of a way at either end, where it may stay as close as it is: there the ends leave it no choice."""
