@@ -141,9 +141,9 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
 
 
 def softened(along: Trajectory) -> Trajectory:
-    """A path's parameter over time, averaged over `SWING` s, by which it takes longer: accelerations rise and fall, and do not jump.
+    """A path's parameter over time, averaged over `SWING` s, by which it takes longer.
 
-    One that jumps makes a load swing on the elastic cup, twice as far.
+    Accelerations then rise and fall; one that jumps makes a load swing on the elastic cup, twice as far.
     """
     step, half = 0.005, round(SWING / 0.01)
     times = np.arange(-2 * half, math.ceil(along.end_time() / step) + 2 * half + 1) * step
