@@ -1,5 +1,6 @@
 """From joint angles along a way to a trajectory that respects the arm's limits."""
 
+import logging
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,6 +18,7 @@ from drake_clutter.arm.epick import epick_sdf
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
 from drake_clutter.resources import shipped_path
+from drake_clutter.simulation.quiet import drake_silent_below
 
 Floats = NDArray[np.float64]
 
@@ -126,7 +128,7 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     if math.isfinite(payload.acceleration):
         limit = np.array([np.inf] * 3 + [payload.along_axis] * 3)  # of the load's centre of mass
         toppra.AddFrameAccelerationLimit(plant.GetFrameByName("load"), -limit, limit)
-    speed = toppra.SolvePathParameterization()
+    speed = _solved(toppra)
     if speed is None:
         return None
     speed = softened(speed) if payload.mass else speed
@@ -134,10 +136,15 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     if (np.abs(torques_along(trajectory, plant, _GRID // 2)) <= MARGIN * TORQUE_LIMIT).all():
         return trajectory
     toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)  # rarely needed, and a quarter of the time
-    speed = toppra.SolvePathParameterization()
+    speed = _solved(toppra)
     if speed is None:
         return None
     return PathParameterizedTrajectory(path, softened(speed) if payload.mass else speed)
+
+
+def _solved(toppra: Toppra) -> Trajectory | None:
+    with drake_silent_below(logging.CRITICAL):  # that there is no solution is an answer here, and no error
+        return toppra.SolvePathParameterization()
 
 
 def softened(along: Trajectory) -> Trajectory:

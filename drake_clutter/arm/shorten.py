@@ -82,8 +82,10 @@ def shortened(way: Way) -> Floats | None:
         points, duration = found
     q = BsplineTrajectory(_BASIS, points.T).vector_values(np.linspace(0.0, 1.0, 400)).T
     along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
-    even = np.linspace(0.0, along[-1], max(8, math.ceil(along[-1] / SPACING) + 1))
-    return np.column_stack([np.interp(even, along, column) for column in q.T])
+    # Ten times as dense at the ends as in the middle, so that straight up stays straight up.
+    u = np.linspace(0.0, 1.0, max(12, math.ceil(1.8 * along[-1] / SPACING) + 1))
+    chosen = along[-1] * (u - 0.9 * np.sin(2 * math.pi * u) / (2 * math.pi))
+    return np.column_stack([np.interp(chosen, along, column) for column in q.T])
 
 
 _BASIS = KinematicTrajectoryOptimization(6, CONTROL_POINTS, _ORDER, 1.0).basis()

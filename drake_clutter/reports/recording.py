@@ -2,8 +2,7 @@
 
 import logging
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from drake_clutter.files import write_text
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.seams import Frame
 from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
+from drake_clutter.simulation.quiet import drake_silent_below
 from drake_clutter.tasks.exploration import Step
 
 FRAMES_PER_SECOND = 40
@@ -124,7 +124,8 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
 
 def _animated(scene: Scene, frames: Sequence[Frame]) -> Meshcat:
     known = [frame.arm.q for frame in frames if frame.arm]
-    with _quiet():
+    # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
+    with drake_silent_below(logging.WARNING):
         meshcat, paths, arm_poses = _shown(scene, arm=bool(known))
     if len(frames) > 1:
         animation = MeshcatAnimation(FRAMES_PER_SECOND)
@@ -146,18 +147,6 @@ def _animated(scene: Scene, frames: Sequence[Frame]) -> Meshcat:
 def serve(scene: Scene, frames: Sequence[Frame] = ()) -> Meshcat:
     """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
     return _animated(scene, frames)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps Drake from announcing an address: nobody is to open that of a recording; that of a view is for the caller to say."""
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]

@@ -1,0 +1,17 @@
+"""Keeping Drake's log from telling users what is none of their business."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def drake_silent_below(level: int) -> Iterator[None]:
+    """Within it Drake logs nothing that is less than a level of `logging`."""
+    logger = logging.getLogger("drake")
+    before = logger.level
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
