@@ -173,7 +173,8 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
     assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {(name, "up") for name in summary["setups"]}
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64") >= 10
-    assert "http" not in page
+    assert "http:" not in page
+    assert "https:" not in page
     # What is done is not done again, and what is missing is.
     monkeypatch.setattr(command, "write_report", lambda *_: None)
     before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
