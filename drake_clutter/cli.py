@@ -14,6 +14,7 @@ from drake_clutter.cli_arm import feasibility, replay
 from drake_clutter.cli_options import (
     CatalogueOption,
     ConfigOption,
+    ExplorerOption,
     Fidelity,
     FidelityOption,
     HtmlOption,
@@ -48,14 +49,6 @@ assets_app = typer.Typer(help="Build the models of object classes.", no_args_is_
 app.add_typer(assets_app, name="assets")
 app.command()(replay)
 app.command()(feasibility)
-
-
-class ExplorerName(Enum):
-    """Agents that explore scenes."""
-
-    RANDOM = "random"
-    LARGEST_FIRST = "largest-first"
-    LARGEST_CLEAR = "largest-clear"
 
 
 class Format(Enum):
@@ -116,7 +109,7 @@ def generate(
 def explore(
     scene: SceneArgument,
     out: OutOption,
-    agent: Annotated[ExplorerName, typer.Option(help="Who chooses the moves.")] = ExplorerName.LARGEST_CLEAR,
+    agent: ExplorerOption = "student",
     fidelity: FidelityOption = Fidelity.SETTLE,
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
@@ -131,9 +124,9 @@ def explore(
     world, file = load_config(config), load(scene, catalogue)
     output_directory(out)
     limit = max_moves or world.exploration.max_moves
-    task = command.explore(command.at_rest(file.scene, world, seed), agent.value, fidelity.value, limit, seed, world, _report)
-    title = f"{agent.value} explores {scene.name}"
-    fields = command.write_episode(out, task, title, agent.value, fidelity.value, seed)
+    task = command.explore(command.at_rest(file.scene, world, seed), agent, fidelity.value, limit, seed, world, _report)
+    title = f"{agent} explores {scene.name}"
+    fields = command.write_episode(out, task, title, agent, fidelity.value, seed)
     _print_episode(fields, as_json, out)
 
 
@@ -147,9 +140,14 @@ def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
 
 @app.command()
 def evaluate(
-    scenes: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of judged scene files, as `generate` wrote them.")],
+    scenes: Annotated[Path, typer.Argument(help="A folder of judged scene files, as `generate` wrote them, or a frozen set.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON with the rows and every episode.")],
-    agents: Annotated[list[ExplorerName] | None, typer.Option("--agent", help="May be repeated; all if not given.")] = None,
+    agents: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--agent", help="As for `explore`, or full-knowledge; may be repeated.", show_default="those without learning"
+        ),
+    ] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
     count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
@@ -160,19 +158,20 @@ def evaluate(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare explorers on the stable scenes of a folder that hide something."""
+    """Compare explorers on scenes that hide something."""
+    from drake_clutter.agents.exploration import BASELINES
     from drake_clutter.commands import evaluate as command
     from drake_clutter.config import load_config
 
     world = load_config(config)
-    played = command.playable(scenes, catalogue)[:count]
-    names = [agent.value for agent in agents or ExplorerName]
+    played = command.playable(scenes, world, catalogue)[:count]
+    names = agents or list(BASELINES)
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return tracked("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray)
+    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, workers, out, progress, ray)
     if as_json:
         print(json.dumps(rows, indent=2))
         return
@@ -260,7 +259,7 @@ def demo(
     from drake_clutter.scenes.scene_file import save_scene
 
     output_directory(out)
-    agent = ExplorerName.LARGEST_CLEAR.value
+    agent = "largest-clear"
     made, task, tried = command.demo(seed, nodes, ClutterConfig(), agent, _report)
     save_scene(out / "scene.yaml", made.scene, made.verdict)
     title = f"A random scene of {nodes} nodes, explored"

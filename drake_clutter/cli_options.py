@@ -47,6 +47,14 @@ ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7,
 MaxMovesOption = Annotated[
     int | None, typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given.")
 ]
+ExplorerOption = Annotated[
+    str,
+    typer.Option(
+        "--agent",
+        help="Who chooses the moves: random, largest-first, largest-clear; student, student-14, student-rg, teacher (trained); "
+        "or the file of a checkpoint that you trained.",
+    ),
+]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
 RayOption = Annotated[
     str | None, typer.Option("--ray", metavar="ADDRESS", help="Put the workers on this Ray cluster, e.g. auto, instead of here.")

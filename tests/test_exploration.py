@@ -8,7 +8,7 @@ import pytest
 from conftest import CLASSES, resting, rng, scene_of
 
 from drake_clutter.agents.exploration import (
-    EXPLORATION_AGENTS,
+    BASELINES,
     ExplorationAgent,
     LargestClear,
     LargestFirst,
@@ -152,7 +152,7 @@ def test_a_real_episode(detector: LabelDetector, config: ClutterConfig) -> None:
     task = ExplorationTask(HIDING, SettleExecutor(config), detector, config.exploration, 4)
     agent = LargestClear()
     while task.end is None:
-        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng(1))
+        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng(1)).move
         assert move in legal_moves(task.look.observation)
         before = task.known
         task.step(move, rng(len(task.steps)))
@@ -181,7 +181,7 @@ def sweep(agent: ExplorationAgent, observation: Observation, count: int) -> list
     """The objects that an agent picks one after the other; all go to the tray."""
     tried: list[Move] = []
     for _ in range(count):
-        move = agent.choose(observation, tried, rng())
+        move = agent.choose(observation, tried, rng()).move
         assert move is not None
         assert move.place == TRAY
         tried.append(move)
@@ -203,7 +203,7 @@ def test_largest_first_goes_by_volume_and_repeats_only_after_a_sweep() -> None:
 def test_what_comes_into_view_is_picked_before_a_repeat() -> None:
     observation = imagined(("c", "cracker_box", 20), ("k", "master_chef_can", 1), ("m", "large_marker", 900))
     tried = [Move("c"), Move("k", "c"), Move("gone")]
-    assert LargestFirst().choose(observation, tried, rng()) == Move("m")
+    assert LargestFirst().choose(observation, tried, rng()).move == Move("m")
 
 
 def test_largest_clear_goes_by_pixels() -> None:
@@ -225,7 +225,7 @@ def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) ->
 def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> None:
     observation = detector.look(HIDING).observation
     covered = replace(observation, depth=np.full_like(observation.depth, 0.5))
-    move = LargestClear().choose(covered, [], rng())
+    move = LargestClear().choose(covered, [], rng()).move
     assert move is not None
     pixels = {d.name: int(d.mask.sum()) for d in observation.detections}
     assert pixels[move.pick] == max(pixels.values())
@@ -234,22 +234,22 @@ def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> 
 def test_random_is_uniform_over_the_legal_moves() -> None:
     observation = imagined(("a", "sugar_box", 1), ("b", "sugar_box", 1), ("c", "sugar_box", 1))
     generator = rng(0)
-    drawn = Counter(RandomExplorer().choose(observation, [], generator) for _ in range(1800))
+    drawn = Counter(RandomExplorer().choose(observation, [], generator).move for _ in range(1800))
     moves = legal_moves(observation)
     assert set(drawn) == set(moves)
     expected = 1800 / len(moves)
     assert sum((count - expected) ** 2 / expected for count in drawn.values()) < 26.1  # chi-squared, 8 degrees of freedom, 0.1 %
 
 
-@pytest.mark.parametrize("name", sorted(EXPLORATION_AGENTS))
+@pytest.mark.parametrize("name", sorted(BASELINES))
 def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
     observation = detector.look(HIDING).observation
 
     def choices(seed: int) -> list[Move]:
-        agent, generator = EXPLORATION_AGENTS[name](), rng(seed)
+        agent, generator = BASELINES[name](), rng(seed)
         tried: list[Move] = []
         for _ in range(8):
-            move = agent.choose(observation, tried, generator)
+            move = agent.choose(observation, tried, generator).move
             assert move is not None
             assert move in legal_moves(observation)
             tried.append(move)
@@ -257,4 +257,4 @@ def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDe
 
     assert choices(3) == choices(3)
     nothing = replace(observation, detections=())
-    assert EXPLORATION_AGENTS[name]().choose(nothing, [], rng()) is None
+    assert BASELINES[name]().choose(nothing, [], rng()).move is None

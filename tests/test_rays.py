@@ -63,12 +63,11 @@ SCENES: Mapping[str, Scene] = {"resting": RESTING, "tumbled 0": tumbled(0), "tum
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(scene: Scene, detector: LabelDetector) -> None:
     """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
-    look = detector.look(scene)
+    look, rendered = detector.look(scene), detector.camera.label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == RAYS.visible_shares(scene.objects)
     assert shares == pytest.approx(look.visible_share, abs=0.003)
     assert min(shares.values()) < 0.9 < 1.0 <= max(shares.values())
-    rendered = look.images.label
     cast = labels(scene)
     assert (cast == rendered).mean() >= 0.9999
     for index, o in enumerate(scene.objects):
@@ -87,7 +86,7 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
     look = detector.look(scene)
     observation, _ = RAYS.observe(scene)
-    rendered, cast = look.images.label, labels(scene)
+    rendered, cast = detector.camera.label(scene), labels(scene)
     assert observation.depth.dtype == look.observation.depth.dtype == np.float32
     errors = []
     for index in range(len(scene.objects)):

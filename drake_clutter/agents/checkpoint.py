@@ -2,13 +2,15 @@
 
 import json
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from drake_clutter.files import InputError, replacing, write_json
 
@@ -47,6 +49,37 @@ def load_checkpoint(path: Path) -> Checkpoint:
         ) from error
     except ValueError as error:
         raise InputError(f"{path.with_suffix('.json')}: is not JSON ({error})") from error
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
+    """Writes tensors by name, and beside them what JSON can hold, in one file and in one step."""
+    with replacing(path) as temporary:
+        held = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        save_file(held, temporary, metadata={"state": json.dumps(state)})
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
+    """Reads what `save_tensors` wrote."""
+    with safe_open(path, "pt") as file:
+        names = file.keys()
+        return {name: file.get_tensor(name) for name in names}, json.loads(file.metadata()["state"])
+
+
+def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
+    """What an optimiser remembers, as `optimizer.NUMBER.NAME`."""
+    moments = optimizer.state_dict()["state"].items()
+    return {f"optimizer.{number}.{name}": value for number, of_one in moments for name, value in of_one.items()}
+
+
+def optimizer_from(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Gives back to an optimiser what `optimizer_tensors` took; other names are left alone."""
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        part, _, rest = name.partition(".")
+        if part == "optimizer":
+            number, _, moment = rest.partition(".")
+            moments.setdefault(int(number), {})[moment] = value
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
 
 
 def git_commit() -> str:

@@ -3,26 +3,24 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.exploration import EXPLORATION_AGENTS, play
+from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
 from drake_clutter.agents.generation import mean_interval, wilson_interval
-from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
-from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, ExplorationTask
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What is to be played: an agent on a scene file that a judge has called stable. `index` seeds its chances."""
+    """What is to be played: an agent on a scene at rest. `index` seeds its chances; `scene` is what the scene is called."""
 
-    scene: Path
+    scene: str
+    start: Scene
     agent: str
     index: int
 
@@ -32,7 +30,7 @@ class EpisodeResult:
     """How an episode went.
 
     Attributes:
-        scene: the scene file's name.
+        scene: what the scene is called.
         agent: the agent's name.
         ended: why it ended.
         hidden: objects hidden at the start.
@@ -55,20 +53,21 @@ class EpisodeResult:
 class EpisodePlayer:
     """Plays episodes at a fidelity; a worker for the runner."""
 
-    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int, fidelity: str) -> None:
+    def __init__(self, config: ClutterConfig, max_moves: int, seed: int, fidelity: str) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
-        self._catalogue = load_catalogue(catalogue_folder)
         self._executor = EXECUTORS[fidelity](config, follow_falls=False)
-        self._detector = LabelDetector(config.camera)
+        self._detector = DETECTORS[fidelity](config.camera)
+        self._explorers: dict[str, ExplorerMaker] = {}
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
-        scene = load_scene(episode.scene, self._catalogue).settled_scene
-        task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
-        play(task, EXPLORATION_AGENTS[episode.agent](), item_rng(self._seed, episode.index))
+        if episode.agent not in self._explorers:
+            self._explorers[episode.agent] = make_explorers(episode.agent, self._config)
+        task = ExplorationTask(episode.start, self._executor, self._detector, self._config.exploration, self._max_moves)
+        play(task, self._explorers[episode.agent](task), item_rng(self._seed, episode.index))
         found_after = np.cumsum([len(step.newly_found) for step in task.steps], dtype=int)
         return EpisodeResult(
-            scene=episode.scene.name,
+            scene=episode.scene,
             agent=episode.agent,
             ended=(task.end or EpisodeEnd.GAVE_UP).value,
             hidden=len(task.hidden_at_start),

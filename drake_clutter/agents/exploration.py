@@ -1,21 +1,26 @@
-"""Explorers that need no learning: RE, LF and LF-clear (SPEC section 4)."""
+"""Explorers: RE, LF and LF-clear, which need no learning (SPEC section 4), and where the trained ones are found."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.scenes.seams import Detection, Move, Observation
-from drake_clutter.tasks.exploration import ExplorationTask, Step, legal_moves
+from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step, legal_moves
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 
 class ExplorationAgent(Protocol):
     """Chooses moves from what the camera has shown. One instance plays one episode at a time."""
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
-        """The next move, or None if there is none.
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+        """The next move.
 
         Args:
             observation: what is in view now.
@@ -27,20 +32,20 @@ class ExplorationAgent(Protocol):
 class RandomExplorer:
     """RE: uniform over the legal moves."""
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
         """See `ExplorationAgent.choose`."""
         moves = legal_moves(observation)
-        return moves[rng.integers(len(moves))] if moves else None
+        return Decision(moves[rng.integers(len(moves))] if moves else None)
 
 
 def _least_picked_then_largest(
     candidates: Sequence[Detection], tried: Sequence[Move], size: Callable[[Detection], float]
-) -> Move | None:
+) -> Decision:
     """The largest candidate to the tray. Those picked least often come first, so that a sweep ends before a repeat begins;
     among equals, the first by name."""
     picks = [move.pick for move in tried]
     order = sorted(candidates, key=lambda d: (picks.count(d.name), -size(d), d.name))
-    return Move(order[0].name, TRAY) if order else None
+    return Decision(Move(order[0].name, TRAY) if order else None)
 
 
 class LargestFirst:
@@ -49,7 +54,7 @@ class LargestFirst:
     Those picked least often come first, see `_least_picked_then_largest`.
     """
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
         """See `ExplorationAgent.choose`."""
         return _least_picked_then_largest(observation.detections, tried, lambda d: d.object_class.volume)
 
@@ -60,17 +65,76 @@ class LargestClear:
     Those picked least often come first. If nothing in view has a clear top, all count as candidates.
     """
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Move | None:
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
         """See `ExplorationAgent.choose`."""
         clear = [d for d in observation.detections if has_clear_top(observation, d)]
         return _least_picked_then_largest(clear or observation.detections, tried, lambda d: float(d.mask.sum()))
 
 
-EXPLORATION_AGENTS: dict[str, Callable[[], ExplorationAgent]] = {
+class FullKnowledge:
+    """The ceiling: carries out the plan of `FullKnowledgeSearch`, which knows everything; gives up where there is none."""
+
+    BUDGET = 2000
+    """Moves that may be tried for a plan."""
+
+    def __init__(self, task: ExplorationTask, search: FullKnowledgeSearch) -> None:
+        self._task, self._search = task, search
+        self._plan: list[Move] = []
+
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+        """See `ExplorationAgent.choose`. A plan that Drake did not carry out as it was meant is followed by another."""
+        in_view = {TRAY, *(d.name for d in observation.detections)}
+        if not self._plan or not {self._plan[0].pick, self._plan[0].place} <= in_view:
+            self._plan = list(self._search.solve(self._task.scene, len(tried), self.BUDGET).plan)
+        return Decision(self._plan.pop(0) if self._plan else None)
+
+
+ExplorerMaker = Callable[[ExplorationTask], ExplorationAgent]
+"""Makes the agent of an episode; a privileged one may look at all of the task."""
+
+BASELINES: dict[str, Callable[[], ExplorationAgent]] = {
     "random": RandomExplorer,
     "largest-first": LargestFirst,
     "largest-clear": LargestClear,
 }
+TRAINED = {
+    "teacher": "training/checkpoints/teacher.safetensors",
+    "student": "training/checkpoints/student.safetensors",
+    "student-rg": "training/checkpoints/student_rg.safetensors",
+    "student-14": "training/checkpoints/student_14.safetensors",
+}
+"""The shipped checkpoints, by the agent's name."""
+
+
+FULL_KNOWLEDGE = "full-knowledge"
+
+
+def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
+    """What makes an explorer for each episode.
+
+    Args:
+        name: one of `BASELINES`, of `TRAINED`, `FULL_KNOWLEDGE`, or the file of a checkpoint.
+        config: the world.
+
+    Raises:
+        InputError: no such explorer, or a file that is no checkpoint of one.
+    """
+    if name in BASELINES:
+        return lambda _: BASELINES[name]()
+    if name == FULL_KNOWLEDGE:
+        search = FullKnowledgeSearch(config)
+        return lambda task: FullKnowledge(task, search)
+    if name not in TRAINED and not name.endswith(".safetensors"):
+        raise InputError(
+            f"--agent {name}; allowed are {', '.join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])}, or a .safetensors file"
+        )
+    try:
+        path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
+    except FileNotFoundError as error:
+        raise InputError(f"--agent {name}: {error}; train it with training/train_explorer.py and clone_explorer.py") from error
+    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+
+    return LearnedExplorers(path)
 
 
 def play(
@@ -78,7 +142,7 @@ def play(
 ) -> None:
     """Lets an agent play a task to its end, or until it has no move left; `report` is called after each move."""
     while task.end is None:
-        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
-        if move is None:
+        decision = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
+        if decision.move is None:
             return
-        report(task.step(move, rng))
+        report(task.step(decision.move, rng, decision))

@@ -5,7 +5,6 @@ grammar, the optimal soft policy then draws every derivation as the random gener
 a distribution of scenes, the better the likelier, and no state is worth more because more rules are feasible there.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
@@ -17,12 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
+from drake_clutter.agents.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.agents.graph_network import RuleValues
-from drake_clutter.files import InputError, replacing
+from drake_clutter.files import InputError
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 
@@ -334,11 +332,12 @@ class SoftQLearner:
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
-        arrays = {f"network.{name}": value.detach().cpu() for name, value in self.network.state_dict().items()}
-        arrays |= {f"target.{name}": value.detach().cpu() for name, value in self._target.state_dict().items()}
-        for number, moments in self._optimizer.state_dict()["state"].items():
-            arrays |= {f"optimizer.{number}.{name}": value.detach().cpu() for name, value in moments.items()}
-        arrays |= {f"replay.{name}": torch.from_numpy(array[: self._replay.times]) for name, array in self._replay.arrays.items()}
+        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= {f"target.{name}": value for name, value in self._target.state_dict().items()}
+        tensors |= optimizer_tensors(self._optimizer)
+        tensors |= {
+            f"replay.{name}": torch.from_numpy(array[: self._replay.times]) for name, array in self._replay.arrays.items()
+        }
         state = {
             "step": self.step,
             "remembered": self._replay.times,
@@ -348,25 +347,19 @@ class SoftQLearner:
                 for environment, score in zip(self._environments, self._scores, strict=True)
             ],
         }
-        with replacing(path) as temporary:
-            save_file(arrays, temporary, metadata={"state": json.dumps(state)})
+        save_tensors(path, tensors, state)
 
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config and seed."""
-        with safe_open(path, "pt") as file:
-            state = json.loads(file.metadata()["state"])
-            arrays: dict[str, dict[str, Tensor]] = {"network": {}, "target": {}, "optimizer": {}, "replay": {}}
-            for name in file.keys():  # noqa: SIM118, it is no dict
-                part, _, rest = name.partition(".")
-                arrays[part][rest] = file.get_tensor(name)
-        self.network.load_state_dict(arrays["network"])
-        self._target.load_state_dict(arrays["target"])
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in arrays["optimizer"].items():
-            number, _, rest = name.partition(".")
-            moments.setdefault(int(number), {})[rest] = value
-        self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": moments})
-        for name, value in arrays["replay"].items():
+        tensors, state = load_tensors(path)
+        parts: dict[str, dict[str, Tensor]] = {"network": {}, "target": {}, "optimizer": {}, "replay": {}}
+        for name, value in tensors.items():
+            part, _, rest = name.partition(".")
+            parts[part][rest] = value
+        self.network.load_state_dict(parts["network"])
+        self._target.load_state_dict(parts["target"])
+        optimizer_from(self._optimizer, tensors)
+        for name, value in parts["replay"].items():
             self._replay.arrays[name][: len(value)] = value.numpy()
         self._replay.times, self.step = state["remembered"], state["step"]
         self._rng.bit_generator.state = state["rng"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from drake_clutter.agents.exploration import EXPLORATION_AGENTS, play
+from drake_clutter.agents.exploration import make_explorers, play
 from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator
 from drake_clutter.arm.arm_executor import ArmExecutor
 from drake_clutter.arm.plan import plan_fields
@@ -21,7 +21,7 @@ from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.scenes.seams import Move
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
 
 Report = Callable[[Step], None]
 
@@ -42,7 +42,7 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
 
 
 def _task(scene: Scene, config: ClutterConfig, max_moves: int, fidelity: str) -> ExplorationTask:
-    return ExplorationTask(scene, EXECUTORS[fidelity](config), LabelDetector(config.camera), config.exploration, max_moves)
+    return ExplorationTask(scene, EXECUTORS[fidelity](config), DETECTORS[fidelity](config.camera), config.exploration, max_moves)
 
 
 def explore(
@@ -52,7 +52,7 @@ def explore(
 
     Args:
         scene: at rest.
-        agent_name: one of `EXPLORATION_AGENTS`.
+        agent_name: see `make_explorers`.
         fidelity: one of `EXECUTORS`.
         max_moves: after which it ends.
         seed: of the agent's and the world's chances.
@@ -60,7 +60,7 @@ def explore(
         report: called after each move.
     """
     task = _task(scene, config, max_moves, fidelity)
-    play(task, EXPLORATION_AGENTS[agent_name](), item_rng(seed), report)
+    play(task, make_explorers(agent_name, config)(task), item_rng(seed), report)
     return task
 
 

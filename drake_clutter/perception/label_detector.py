@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from drake_clutter.config import CameraConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Detection, Observation
-from drake_clutter.simulation.camera import Images, OverheadCamera
+from drake_clutter.simulation.camera import OverheadCamera
 
 
 @dataclass(frozen=True)
@@ -14,12 +14,10 @@ class Look:
 
     Attributes:
         observation: what an explorer may know.
-        images: what the camera rendered.
         visible_share: the truth behind it, by name: of each object's unoccluded pixels, the share that is seen.
     """
 
     observation: Observation
-    images: Images
     visible_share: dict[str, float]
 
 
@@ -31,12 +29,12 @@ class LabelDetector:
 
     def look(self, scene: Scene) -> Look:
         """What the camera shows of a scene."""
-        images = self.camera.render(scene)
-        shares = self.camera.visible_shares(scene)
+        depth, label = self.camera.depth_and_label(scene)
+        shares = self.camera.visible_shares(scene, label)
         hidden = self.camera.hidden(shares)
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, o in enumerate(scene.objects)
-            if o.name not in hidden and (mask := images.label == index).any()
+            if o.name not in hidden and (mask := label == index).any()
         )
-        return Look(Observation(images.depth, detections, self.camera.config, scene.tray_side), images, shares)
+        return Look(Observation(depth, detections, self.camera.config, scene.tray_side), shares)

@@ -149,16 +149,23 @@ class OverheadCamera:
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), X)
         return Images(color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels, X))
 
+    def depth_and_label(self, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The depth image and the label image, without the colour image, which takes longer than both; see `Images`."""
+        labels = self._show(scene, scene.names)
+        depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), self._X_TC)
+        return depth.data[..., 0].copy(), self._label_image(labels, self._X_TC)
+
     def label(self, scene: Scene) -> NDArray[np.int64]:
         """The label image alone, see `Images`."""
         return self._label_image(self._show(scene, scene.names), self._X_TC)
 
-    def visible_shares(self, scene: Scene) -> dict[str, float]:
+    def visible_shares(self, scene: Scene, label: NDArray[np.int64] | None = None) -> dict[str, float]:
         """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
 
-        An object that is out of the camera's frame is not hidden: its share is 1.
+        An object that is out of the camera's frame is not hidden: its share is 1. `label` is the scene's label image, if it is
+        there already.
         """
-        seen = np.bincount(self.label(scene).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+        seen = np.bincount((self.label(scene) if label is None else label).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
         alone = np.zeros(len(scene.objects), int)
         for together in self._apart_in_image(scene):
             labels = self._show(scene, {scene.objects[i].name for i in together})

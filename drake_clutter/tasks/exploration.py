@@ -1,14 +1,16 @@
 """Scene exploration (SPEC section 4): find every hidden object by moving what is in view."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
 import numpy as np
 
 from drake_clutter.arm.arm_executor import ArmExecutor
-from drake_clutter.config import ClutterConfig, ExplorationConfig
+from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector, Look
+from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.seams import Move, MoveExecutor, MoveResult, Observation, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
@@ -26,6 +28,17 @@ EXECUTORS: dict[str, ExecutorMaker] = {"fast": FastOrDrakeExecutor, "settle": Se
 """How moves are carried out, by the name of the fidelity."""
 
 
+class Detector(Protocol):
+    """Tells what is in view."""
+
+    def look(self, scene: Scene) -> Look:
+        """What the camera shows of a scene."""
+
+
+DETECTORS: dict[str, Callable[[CameraConfig], Detector]] = {"fast": RayDetector, "settle": LabelDetector, "arm": LabelDetector}
+"""What tells what is in view, by the name of the fidelity."""
+
+
 class EpisodeEnd(Enum):
     """Why an episode is over."""
 
@@ -33,6 +46,21 @@ class EpisodeEnd(Enum):
     COLLAPSED = "collapsed"
     OUT_OF_MOVES = "out of moves"
     GAVE_UP = "gave up"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What an agent decided, and why.
+
+    Attributes:
+        move: what to do; None: there is no move.
+        picks: the probability of each pick, by name; empty if the agent has none.
+        known: the objects that it went by; empty if that is what is in view.
+    """
+
+    move: Move | None
+    picks: Mapping[str, float] = field(default_factory=dict)
+    known: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,6 +73,7 @@ class Step:
         look: what the camera showed afterwards.
         newly_found: objects detected for the first time, in the scene's order.
         reward: r_d per newly found object, plus the penalty if the scene collapsed.
+        decision: of the agent that chose the move, if one did.
     """
 
     move: Move
@@ -52,6 +81,7 @@ class Step:
     look: Look
     newly_found: tuple[str, ...]
     reward: float
+    decision: Decision | None = None
 
 
 def legal_moves(observation: Observation) -> list[Move]:
@@ -68,7 +98,7 @@ class ExplorationTask:
     """
 
     def __init__(
-        self, scene: Scene, executor: MoveExecutor, detector: LabelDetector, config: ExplorationConfig, max_moves: int
+        self, scene: Scene, executor: MoveExecutor, detector: Detector, config: ExplorationConfig, max_moves: int
     ) -> None:
         """Starts an episode on a scene at rest."""
         self._executor, self._detector, self._config, self._max_moves = executor, detector, config, max_moves
@@ -92,8 +122,8 @@ class ExplorationTask:
         """The objects that were hidden at the start and are known now."""
         return tuple(name for name in self.hidden_at_start if name in self.known)
 
-    def step(self, move: Move, rng: np.random.Generator) -> Step:
-        """Carries a move out and looks.
+    def step(self, move: Move, rng: np.random.Generator, decision: Decision | None = None) -> Step:
+        """Carries a move out and looks; `decision` is kept with it.
 
         Raises:
             KeyError: the move names an object that is not in view.
@@ -113,5 +143,5 @@ class ExplorationTask:
         newly = () if collapsed else tuple(name for name in self.scene.names if name in seen and name not in self.known)
         self.known += newly
         reward = self._config.detection_reward * len(newly) + (self._config.collapse_penalty if collapsed else 0.0)
-        self.steps.append(Step(move, outcome, self.look, newly, reward))
+        self.steps.append(Step(move, outcome, self.look, newly, reward, decision))
         return self.steps[-1]

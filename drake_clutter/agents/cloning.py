@@ -1,0 +1,129 @@
+"""Behaviour cloning of the teacher by a student that sees K_t alone (SPEC section 4), plain or by DAgger (Ross et al. 2011).
+
+Every round plays episodes, notes what the teacher would do in each state, and takes some updates on all states so far. Plain
+cloning lets the teacher play; with DAgger the student plays from the second round on, so that it also learns what to do where
+only its own mistakes lead.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from drake_clutter.agents.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
+from drake_clutter.agents.exploration_episodes import Played, play_episodes
+from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
+from drake_clutter.runner import item_rng
+from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.tasks.exploration_graph import GraphObservation
+
+
+@dataclass
+class CloningConfig:
+    """How a student learns.
+
+    Attributes:
+        rounds: in all; episodes: per round.
+        dagger: whether the student plays from the second round on.
+        updates: per round; batch: states per update.
+        learning_rate: at the beginning; it falls to 0 in a straight line.
+        width: of the network.
+    """
+
+    rounds: int = 40
+    episodes: int = 100
+    dagger: bool = True
+    updates: int = 400
+    batch: int = 128
+    learning_rate: float = 1e-3
+    width: int = 32
+
+
+class Cloning:
+    """One training, round by round.
+
+    Attributes:
+        step: rounds so far.
+        network: the student.
+        losses: of the latest round.
+    """
+
+    def __init__(
+        self, environment: ClutterExploration, teacher: ExplorerNetwork, config: CloningConfig, seed: int, device: torch.device
+    ) -> None:
+        """Begins a training; the environment shows K_t."""
+        self.config, self._environment, self._teacher, self._seed = config, environment, teacher, seed
+        torch.manual_seed(seed)
+        self.network = ExplorerNetwork(len(environment.numbers), config.width).to(device)
+        self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
+        self.step = 0
+        self.losses: dict[str, float] = {}
+        self._states: GraphObservation = {}
+        self._moves = np.zeros((0, 2), np.int64)
+
+    def advance(self) -> list[Played]:
+        """One round; returns its episodes."""
+        rng = item_rng(self._seed, 1, self.step)
+        student_plays = self.config.dagger and self.step > 0
+
+        def act(
+            environments: Sequence[ClutterExploration], observations: Sequence[GraphObservation]
+        ) -> tuple[NDArray[np.int64], list[Any]]:
+            wanted = self.wanted(environments)
+            played = decide(self.network, stacked_graphs(observations), rng)[0] if student_plays else wanted
+            return played, list(wanted)
+
+        played = play_episodes(self._environment, self.config.episodes, (self._seed, 2, self.step), act)
+        states = stacked_graphs([observation for episode in played for observation in episode.observations])
+        moves = np.array([move for episode in played for move in episode.notes])
+        self._states = {name: np.concatenate([self._states[name], new]) if self._states else new for name, new in states.items()}
+        self._moves = np.concatenate([self._moves, moves])
+        self._learn(rng)
+        self.step += 1
+        return played
+
+    def wanted(self, environments: Sequence[ClutterExploration]) -> NDArray[np.int64]:
+        """(B, 2) what the teacher would do, as nodes of the student's graphs."""
+        moves = decide(self._teacher, stacked_graphs([e.observe(privileged=True) for e in environments]), None)[0]
+        found = np.zeros_like(moves)
+        for row, environment in enumerate(environments):
+            known = environment.objects
+            names = environment.task.scene.names
+            found[row] = [known.index(names[node - 1]) + 1 if node else 0 for node in moves[row].tolist()]
+        return found
+
+    def _learn(self, rng: np.random.Generator) -> None:
+        device, total = self.network.mark.device, 0.0
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * (1 - self.step / self.config.rounds)
+        for _ in range(self.config.updates):
+            part = rng.integers(len(self._moves), size=self.config.batch)
+            found = self.network({name: array[part] for name, array in self._states.items()})
+            moves = torch.from_numpy(self._moves[part]).to(device)
+            loss = -log_probability(found, self.network.places(found, moves[:, 0]), moves).mean()
+            self._optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self._optimizer.step()
+            total += loss.item()
+        self.losses = {"cloning": total / self.config.updates}
+
+    def save(self, path: Path) -> None:
+        """Writes all that the training needs to go on as if it had never been interrupted."""
+        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= optimizer_tensors(self._optimizer)
+        arrays = {**self._states, "moves": self._moves}
+        tensors |= {f"states.{name}": torch.from_numpy(array) for name, array in arrays.items()}
+        save_tensors(path, tensors, {"step": self.step})
+
+    def load(self, path: Path) -> None:
+        """Goes on where `save` was called, in a training of the same config, seed and teacher."""
+        tensors, state = load_tensors(path)
+        self.network.load_state_dict({n.removeprefix("network."): v for n, v in tensors.items() if n.startswith("network.")})
+        optimizer_from(self._optimizer, tensors)
+        self._states = {n.removeprefix("states."): v.numpy() for n, v in tensors.items() if n.startswith("states.")}
+        self._moves = self._states.pop("moves")
+        self.step = state["step"]

@@ -1,0 +1,95 @@
+"""Trained explorers at work: the student, which knows what the camera has shown, and the teacher, which knows everything."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_clutter.agents.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import TRAY, SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.tasks.exploration import Decision, ExplorationTask
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, Knowledge, exploration_graph
+
+TEACHER, STUDENT = "teacher", "student"
+
+
+def about_explorer(numbers: dict[str, int], width: int) -> dict[str, Any]:
+    """What the inputs of an `ExplorerNetwork` stand for, for its checkpoint."""
+    return {"node_kinds": list(numbers), "features": list(FEATURES), "edge_kinds": list(EDGE_KINDS), "width": width}
+
+
+def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -> tuple[ExplorerNetwork, dict[str, int]]:
+    """The network of a checkpoint, and the numbers of the kinds of nodes.
+
+    Raises:
+        InputError: the checkpoint is of something else, or of another version of the observation.
+    """
+    about = checkpoint.about
+    allowed = (TEACHER, STUDENT) if kind is None else (kind,)
+    if about.get("kind") not in allowed:
+        raise InputError(f"{path}: is a checkpoint of a {about.get('kind')}; allowed is one of a {' or '.join(allowed)}")
+    network = about["network"]
+    numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
+    if network != about_explorer(numbers, network["width"]):
+        raise InputError(f"{path}: was trained on other features; allowed is a checkpoint of this version")
+    made = ExplorerNetwork(len(numbers), network["width"])
+    made.load_state_dict(checkpoint.weights)
+    return made.eval(), numbers
+
+
+class LearnedExplorer:
+    """Takes the likeliest move (an `ExplorationAgent`); one instance plays one episode."""
+
+    def __init__(
+        self, network: ExplorerNetwork, numbers: dict[str, int], path: Path, task: ExplorationTask | None = None
+    ) -> None:
+        """Begins an episode.
+
+        Args:
+            network, numbers: see `load_explorer`; path: of the checkpoint, for errors.
+            task: whose scene the agent knows all of; None: it knows K_t.
+        """
+        self._network, self._numbers, self._path, self._task = network, numbers, path, task
+        self._knowledge = Knowledge()
+
+    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+        """See `ExplorationAgent.choose`.
+
+        Raises:
+            InputError: an object of a class that the agent has not learned.
+        """
+        self._knowledge.see(observation)
+        shown: Sequence[SceneObject] = self._knowledge.objects if self._task is None else self._task.scene.objects
+        unknown = sorted({o.object_class.name for o in shown} - set(self._numbers))
+        if unknown:
+            raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
+        if not observation.detections:
+            return Decision(None)
+        graph = exploration_graph(shown, observation, tried, self._numbers)
+        moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
+        x, y = moves[0].tolist()
+        chances = {o.name: float(picks[0, k]) for k, o in enumerate(shown, start=1) if graph["pick"][k]}
+        return Decision(Move(shown[x - 1].name, shown[y - 1].name if y else TRAY), chances, tuple(o.name for o in shown))
+
+
+class LearnedExplorers:
+    """Makes a `LearnedExplorer` for each episode."""
+
+    def __init__(self, path: Path) -> None:
+        """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
+
+        Raises:
+            InputError: it cannot be read, or is none of an explorer.
+        """
+        self._path = path
+        checkpoint = load_checkpoint(path)
+        self._network, self._numbers = load_explorer(checkpoint, path)
+        self._privileged = checkpoint.about["kind"] == TEACHER
+
+    def __call__(self, task: ExplorationTask) -> LearnedExplorer:
+        """For an episode."""
+        return LearnedExplorer(self._network, self._numbers, self._path, task if self._privileged else None)

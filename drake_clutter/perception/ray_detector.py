@@ -1,0 +1,18 @@
+"""The perfect detector without rendering: it casts the camera's rays at the true objects, which is what training needs."""
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.perception.label_detector import Look
+from drake_clutter.scenes.scene import Scene
+
+
+class RayDetector:
+    """Detects what `LabelDetector` does (a `Detector`), of convex objects, a hundred times faster."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        self._rays = RayCaster(config)
+
+    def look(self, scene: Scene) -> Look:
+        """What the camera shows of a scene."""
+        observation, shares = self._rays.observe(scene)
+        return Look(observation, shares)

@@ -1,0 +1,150 @@
+"""Sets of stable scenes in one small file: training ground for explorers, and the frozen scenes that they are compared on.
+
+A file is JSON. It holds the rules that derive each graph, and of a frozen set also where the objects came to rest; and a hash of
+all that, so that nobody compares agents on different work without noticing.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_clutter.catalogue import Catalogue, ObjectClass
+from drake_clutter.config import LayoutConfig
+from drake_clutter.files import InputError, write_text
+from drake_clutter.grammar import Derivation, SceneGrammar
+from drake_clutter.scenes.layout import LayoutFailure, lay_out
+from drake_clutter.scenes.scene import Pose, Scene
+
+VERSION = 1
+_LAYOUT_TRIES = 100
+
+
+@dataclass(frozen=True)
+class SetScene:
+    """One stable scene of a set.
+
+    Attributes:
+        rules: by name, that derive its graph.
+        form: its canonical form, see `canonical_form`.
+        hidden: objects that were hidden.
+        solvable: what the full-knowledge search said of it; "" if it was not asked.
+        settled: X_TO of every object where it came to rest, in the order of the laid-out scene; None: only the graph counts.
+    """
+
+    rules: tuple[str, ...]
+    form: str
+    hidden: int
+    solvable: str = ""
+    settled: tuple[Pose, ...] | None = None
+
+
+@dataclass(frozen=True)
+class SceneSet:
+    """A set of scenes.
+
+    Attributes:
+        name: the file's.
+        classes: of the objects, in the grammar's order.
+        about: agent, nodes, seed, object set, commit and whatever else says how it was made.
+        scenes: the scenes.
+    """
+
+    name: str
+    classes: tuple[ObjectClass, ...]
+    about: Mapping[str, Any]
+    scenes: tuple[SetScene, ...]
+
+    @property
+    def grammar(self) -> SceneGrammar:
+        """Of its classes."""
+        return SceneGrammar(self.classes)
+
+    def derivation(self, index: int, grammar: SceneGrammar) -> Derivation:
+        """The graph of a scene, with the rules that derive it."""
+        rules = self.scenes[index].rules
+        return Derivation(grammar.replay(rules), rules)
+
+    def settled(self, index: int, grammar: SceneGrammar, layout: LayoutConfig) -> Scene:
+        """A scene of a frozen set, as it came to rest.
+
+        Raises:
+            InputError: the set has no poses.
+        """
+        poses = self.scenes[index].settled
+        if poses is None:
+            raise InputError(
+                f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py writes with --work"
+            )
+        scene = lay_anew(self.derivation(index, grammar), grammar, layout, np.random.default_rng(index))
+        return scene.at(dict(zip(scene.names, poses, strict=True)))
+
+
+def lay_anew(derivation: Derivation, grammar: SceneGrammar, layout: LayoutConfig, rng: np.random.Generator) -> Scene:
+    """A graph that has been laid out before, with its stacks in new places."""
+    for _ in range(_LAYOUT_TRIES):
+        scene = lay_out(derivation, grammar.classes, layout, rng)
+        if not isinstance(scene, LayoutFailure):
+            return scene
+    raise InputError(
+        f"a graph found no room on the tray, {_LAYOUT_TRIES} times in a row; allowed is a layout that has room for it"
+    )
+
+
+def _digest(entries: Sequence[Mapping[str, Any]]) -> str:
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+
+
+def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene]) -> None:
+    """Writes a set, one scene a line. `about` names the object set (`objects`) and what else is to be known."""
+    names = sorted({rule for scene in scenes for rule in scene.rules})
+    number = {name: k for k, name in enumerate(names)}
+    entries: list[dict[str, Any]] = []
+    for scene in scenes:
+        entry: dict[str, Any] = {"form": scene.form, "hidden": scene.hidden, "solvable": scene.solvable}
+        entry["rules"] = [number[rule] for rule in scene.rules]
+        if scene.settled is not None:
+            entry["settled"] = [[round(v, 6) for v in (*pose.translation, *pose.quaternion)] for pose in scene.settled]
+        entries.append(entry)
+    head = {"version": VERSION, **about, "rules": names, "sha256": _digest(entries)}
+    lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
+    write_text(path, f'{json.dumps(head)[:-1]}, "scenes": [\n{lines}\n]}}\n')
+
+
+def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
+    """Reads a set.
+
+    Raises:
+        InputError: it cannot be read, is of another version, was changed since it was made, or needs other objects.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        entries, names = document.pop("scenes"), document.pop("rules")
+        digest, version = document.pop("sha256"), document.pop("version")
+        objects = document["objects"]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: is no set of scenes ({error}); allowed is a file that training/make_scenes.py wrote"
+        ) from error
+    if version != VERSION:
+        raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
+    if _digest(entries) != digest:
+        raise InputError(f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made")
+    scenes = []
+    for entry in entries:
+        poses = tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
+        rules = tuple(names[k] for k in entry["rules"])
+        scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
+    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes))
+
+
+def _pose(numbers: Sequence[float]) -> Pose:
+    x, y, z, *quaternion = numbers
+    w, i, j, k = (float(v) for v in np.array(quaternion) / np.linalg.norm(quaternion))
+    return Pose((x, y, z), (w, i, j, k))

@@ -1,0 +1,139 @@
+"""`ClutterExploration-v0`: the exploration task as a gymnasium environment (SPEC section 4)."""
+
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
+from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, Knowledge, exploration_graph
+
+TRAINING_SET = "training/scenes/train_sg_star.json"
+_STABLE_TRIES = 100
+
+
+class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
+    """Find every object that is hidden.
+
+    A reset draws a graph from a set of scenes and lays it out with its stacks in new places; with `options={"scene": k}` it takes
+    the k-th scene of a frozen set as it is.
+
+    Observation: see `exploration_graph`, with room for `most_objects`; of K_t (pose and class of what has ever been in view), or,
+        if `privileged`, of all objects as they are. Node 0 is the tray. Nodes keep their numbers while an episode lasts.
+    Action: (x, y), nodes: x goes onto y. `pick` and `place` of the observation say what may be named; x onto itself or what may
+        not be named changes nothing.
+    Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`.
+    The `info` of a step has the `step` (a `tasks.exploration.Step`) and, when the episode is over, the `end`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
+
+    def __init__(
+        self,
+        scenes: SceneSet | Path | None = None,
+        *,
+        privileged: bool = False,
+        fidelity: str = "fast",
+        max_moves: int | None = None,
+        most_objects: int = 24,
+        config: ClutterConfig | None = None,
+    ) -> None:
+        """Makes an environment.
+
+        Args:
+            scenes: a set, or the file of one; None: the shipped training set.
+            privileged: whether all objects are seen, or K_t.
+            fidelity: one of `EXECUTORS`.
+            max_moves: after which an episode ends; None: the config's.
+            most_objects: that a scene may have.
+            config: the world.
+        """
+        if not isinstance(scenes, SceneSet):
+            scenes = load_scene_set(shipped_path(TRAINING_SET) if scenes is None else scenes, load_catalogue())
+        self._config, self._privileged, self.scenes = config or ClutterConfig(), privileged, scenes
+        self._max_moves = max_moves or self._config.exploration.max_moves
+        self._nodes = most_objects + 1
+        self.grammar = scenes.grammar
+        self.numbers = node_numbers([c.name for c in scenes.classes])
+        self._executor = EXECUTORS[fidelity](self._config, follow_falls=False)
+        self._detector = DETECTORS[fidelity](self._config.camera)
+        self._judge = FastJudge(self._config)
+        box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            "node_kind": box(0, len(self.numbers), (n,), np.int8),
+            "feature": box(-np.inf, np.inf, (n, len(FEATURES)), np.float32),
+            "edge": box(0, n - 1, (e, 2), np.int16),
+            "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
+            "glob": box(0, np.inf, (len(GLOBALS),), np.float32),
+            "pick": box(0, 1, (n,), np.int8),
+            "place": box(0, 1, (n,), np.int8),
+        }
+        self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
+        self.action_space: gymnasium.Space[Any] = gymnasium.spaces.MultiDiscrete([n, n])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[GraphObservation, dict[str, Any]]:
+        """A scene at rest, and the first look at it."""
+        super().reset(seed=seed)
+        if options is not None and "scene" in options:
+            scene = self.scenes.settled(options["scene"], self.grammar, self._config.layout)
+        else:
+            scene = self._laid_out()
+        self.begin(scene)
+        return self.observe(), {}
+
+    def _laid_out(self) -> Scene:
+        for _ in range(_STABLE_TRIES):
+            index = int(self.np_random.integers(len(self.scenes.scenes)))
+            scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config.layout, self.np_random)
+            if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
+                return scene
+        raise ValueError(
+            f"{self.scenes.name}: of {_STABLE_TRIES} scenes none stands, with at most {self._nodes - 1} objects"
+        )
+
+    def begin(self, scene: Scene) -> None:
+        """Starts an episode on a scene at rest."""
+        self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
+        self.knowledge = Knowledge()
+        self.knowledge.see(self.task.look.observation)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects that nodes 1, 2, ... stand for."""
+        shown = self.task.scene if self._privileged else self.knowledge
+        return tuple(o.name for o in shown.objects)
+
+    def observe(self, *, privileged: bool | None = None) -> GraphObservation:
+        """The observation; or the other one, for a teacher that watches a student."""
+        shown = self.task.scene if (self._privileged if privileged is None else privileged) else self.knowledge
+        tried = [step.move for step in self.task.steps]
+        return exploration_graph(shown.objects, self.task.look.observation, tried, self.numbers, self._nodes)
+
+    def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Carries a move out."""
+        x, y = (int(v) for v in action)
+        names, in_view = self.objects, {d.name for d in self.task.look.observation.detections}
+        if x == y or not 0 < x <= len(names) or y > len(names) or not {names[x - 1], *names[y - 1 : y]} <= in_view:
+            return self.observe(), 0.0, False, False, {}
+        step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
+        if step.outcome.result is not MoveResult.COLLAPSED:
+            self.knowledge.see(self.task.look.observation)
+        end = self.task.end
+        over = end in (EpisodeEnd.ALL_FOUND, EpisodeEnd.COLLAPSED)
+        info: dict[str, Any] = {"step": step}
+        if end is not None:
+            info["end"] = end
+        return self.observe(), step.reward, over, end is EpisodeEnd.OUT_OF_MOVES, info
+
+
+def node_numbers(classes: list[str]) -> dict[str, int]:
+    """The kinds of nodes of `exploration_graph`, by name: the tray's, then the classes'."""
+    return {name: number for number, name in enumerate((TRAY, *classes), start=1)}

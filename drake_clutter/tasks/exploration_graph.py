@@ -1,0 +1,149 @@
+"""The graph that an explorer's network sees: objects with pose and class, and how they lie to each other.
+
+The same arrays hold the privileged graph of all objects as they are, and the graph of K_t as it was seen: what differs is which
+objects are given. Everything in it follows from their poses and classes, and from what is in view.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.scenes.scene import TRAY, SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+
+GraphObservation = dict[str, NDArray[Any]]
+
+FEATURES = (
+    *("x", "y", "z"),
+    *("qw", "qx", "qy", "qz"),
+    *("extent_x", "extent_y", "extent_z"),
+    *("in_view", "seen_share", "covered", "unexplained_height", "times_picked"),
+)
+"""Of a node: position and extents of its axis-aligned box in `_LENGTH`; quaternion; whether it is in view; of its box seen from
+above, the share that is seen; whether another object of the graph is above it; how far below it, in `_LENGTH`, the next object of
+the graph or the tray is, so that something else must carry it; how often it was picked, in `_MANY_PICKS`."""
+EDGE_KINDS = ("carries", "is_below", "is_beside", "is_apart_from", "tray_carries", "tray_is_below")
+"""Of the edge from the lower to the upper of two objects, or from the tray to an object: the upper rests on the lower, is above
+it without touching it, is beside it, or is further away."""
+GLOBALS = ("moves_made",)
+"""Of the graph, in `_MANY_MOVES`."""
+
+_LENGTH, _MANY_PICKS, _MANY_MOVES = 0.35, 3.0, 20.0
+_OVERLAP = 0.003
+"""m, by which two outlines overlap at least, seen from above, for one object to be above the other."""
+_TOUCHING = 0.006
+"""m between two heights that count as the same."""
+_BESIDE = 0.03
+"""m between the outlines of objects that are beside each other."""
+_ANGLE = np.radians(np.arange(0, 180, 30))
+_DIRECTIONS = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
+"""(D, 2) in which outlines are compared; boxes as the grammar lays them have their sides across some of them."""
+
+
+def _overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
+    """(n, n) m, by which two outlines overlap seen from above; negative: the gap between them."""
+    along = np.array([[(p := o.corners_T[:, :2] @ _DIRECTIONS.T).min(axis=0), p.max(axis=0)] for o in objects])
+    lower, upper = along[:, 0], along[:, 1]
+    overlap = np.minimum(upper[:, None], upper[None]) - np.maximum(lower[:, None], lower[None])
+    return np.asarray(overlap.min(axis=2))
+
+
+def exploration_graph(
+    objects: Sequence[SceneObject],
+    observation: Observation,
+    tried: Sequence[Move],
+    numbers: Mapping[str, int],
+    nodes: int = 0,
+) -> GraphObservation:
+    """The graph as arrays; node 0 is the tray, node k the k-th object.
+
+    Args:
+        objects: n of them.
+        observation: what is in view; those in view must be among the objects.
+        tried: the episode's moves so far.
+        numbers: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
+        nodes: N, that there is room for; 0: as many as there are.
+
+    Returns:
+        node_kind (N,), 0 is padding; feature (N, `FEATURES`); edge (N (N - 1) / 2, 2) lower and upper; edge_kind, number in
+        `EDGE_KINDS` from 1 on, 0 is padding; glob (`GLOBALS`,); pick (N,) and place (N,), what a move may name.
+    """
+    count, room = len(objects), nodes or len(objects) + 1
+    seen = {detection.name: detection for detection in observation.detections}
+    kind, feature = np.zeros(room, np.int8), np.zeros((room, len(FEATURES)), np.float32)
+    pick = np.zeros(room, np.int8)
+    kind[0] = numbers[TRAY]
+    edge, edge_kind = np.zeros((room * (room - 1) // 2, 2), np.int16), np.zeros(room * (room - 1) // 2, np.int8)
+    if count:
+        bounds = np.array([o.bounds_T for o in objects])
+        low, high = bounds[:, 0, 2], bounds[:, 1, 2]
+        overlap = _overlaps(objects)
+        above = (overlap > _OVERLAP) & (low[None] > high[:, None] - _TOUCHING)  # [lower, upper]
+        np.fill_diagonal(above, False)
+        floor = np.where(above, high[:, None], 0.0).max(axis=0)
+        camera = observation.camera
+        for k, o in enumerate(objects):
+            extent = bounds[k, 1] - bounds[k, 0]
+            detection = seen.get(o.name)
+            share = 0.0
+            if detection is not None:
+                pixel = (camera.altitude - high[k]) / camera.focal_length
+                share = min(1.0, np.count_nonzero(detection.mask) * pixel**2 / float(extent[0] * extent[1]))
+            picks = sum(move.pick == o.name for move in tried)
+            kind[k + 1] = numbers[o.object_class.name]
+            sign = (
+                1 if next((q for q in o.X_TO.quaternion if abs(q) > 1e-9), 1) > 0 else -1
+            )  # of a rotation's two, always the same
+            feature[k + 1] = (
+                *(o.X_TO.p / _LENGTH),
+                *(sign * q for q in o.X_TO.quaternion),
+                *(extent / _LENGTH),
+                detection is not None,
+                share,
+                above[k].any(),
+                max(0.0, low[k] - floor[k] - _TOUCHING) / _LENGTH,
+                picks / _MANY_PICKS,
+            )
+            pick[k + 1] = detection is not None
+        # From the lower to the upper; of equally low ones, in an order that does not depend on theirs.
+        order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], low))
+        a, b = np.triu_indices(count, 1)
+        lower, upper = order[a], order[b]
+        over, gap = above[lower, upper], -overlap[lower, upper]
+        rests = over & (np.abs(low[upper] - high[lower]) < _TOUCHING)
+        pairs = len(a)
+        edge[:pairs, 0], edge[:pairs, 1] = lower + 1, upper + 1
+        edge_kind[:pairs] = np.where(rests, 1, np.where(over, 2, np.where(gap < _BESIDE, 3, 4)))
+        edge[pairs : pairs + count, 1] = np.arange(1, count + 1)
+        edge_kind[pairs : pairs + count] = np.where(low < _TOUCHING, 5, 6)
+    place = pick.copy()
+    place[0] = 1
+    glob = np.array([len(tried) / _MANY_MOVES], np.float32)
+    return {
+        "node_kind": kind,
+        "feature": feature,
+        "edge": edge,
+        "edge_kind": edge_kind,
+        "glob": glob,
+        "pick": pick,
+        "place": place,
+    }
+
+
+class Knowledge:
+    """K_t of an episode: what has ever been in view, each object as it was last seen."""
+
+    def __init__(self) -> None:
+        self._objects: dict[str, SceneObject] = {}
+
+    def see(self, observation: Observation) -> None:
+        """Takes in what is in view."""
+        for d in observation.detections:
+            self._objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
+
+    @property
+    def objects(self) -> tuple[SceneObject, ...]:
+        """In the order in which they were found."""
+        return tuple(self._objects.values())

@@ -1,0 +1,123 @@
+"""Makes a set of stable scenes for explorers, drawn by a generation agent, in one small file.
+
+    python training/make_scenes.py --agent sg-star --seed 100 --out training/scenes/train_sg_star.json
+    python training/make_scenes.py --count 300 --seed 9000 --work runs/sg_star_25 --out training/scenes/sg_star_25.json
+
+With --work, Drake judges the scenes, they stay in that folder (so that a run that was stopped goes on), and the set is a frozen
+one: it holds where the objects came to rest. Without, the fast judge decides, with the margin that generators learn with, and the
+set holds graphs, to be laid out anew. No graph is taken twice, nor one of the sets given as --not-in, up to symmetry.
+"""
+
+import itertools
+import json
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import track
+
+from drake_clutter.agents.checkpoint import git_commit
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError, told_in_one_line
+from drake_clutter.grammar import canonical_form
+from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set
+from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.tasks.generation import GenerationTask
+
+MORE = 1.1
+"""Times as many scenes are drawn as are still missing."""
+
+
+def judged_by_drake(folder: Path) -> Iterator[SetScene]:
+    """The stable scenes of a folder that hide something."""
+    catalogue = load_catalogue()
+    solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
+    for path, answer in zip(sorted((folder / SCENES).iterdir()), solvable, strict=True):
+        file = load_scene(path, catalogue)
+        assert file.verdict is not None
+        assert file.scene.graph is not None
+        if file.verdict.stable and file.verdict.hidden:
+            settled = tuple(file.verdict.settled[name] for name in file.scene.names)
+            form = canonical_form(file.scene.graph, catalogue.classes)
+            yield SetScene(file.scene.derivation, form, len(file.verdict.hidden), answer, settled)
+
+
+class FastMaker:
+    """Draws scene after scene of a job; a worker for the runner."""
+
+    def __init__(self, job: GenerationJob) -> None:
+        self._job, self._generator = job, SceneGenerator(job)
+        self._judge, self._classes = FastJudge(job.config, margin=GenerationTask().margin), load_catalogue().classes
+
+    def __call__(self, index: int) -> SetScene | None:
+        """The scene of an index, if it stands, comes apart and hides something."""
+        rng = item_rng(self._job.seed, index)
+        scene, _ = self._generator.lay_out(rng)
+        verdict = self._judge.judge(scene, rng)
+        if isinstance(verdict, CannotJudge) or not verdict.hidden or self._judge.comes_apart(scene) is not True:
+            return None
+        assert scene.graph is not None
+        return SetScene(scene.derivation, canonical_form(scene.graph, self._classes), len(verdict.hidden))
+
+
+def without_repeats(scenes: Iterable[SetScene | None], taken: set[str]) -> Iterator[SetScene]:
+    """Those whose form is not taken, each form once."""
+    taken = set(taken)
+    for scene in scenes:
+        if scene is not None and scene.form not in taken:
+            taken.add(scene.form)
+            yield scene
+
+
+def main(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="JSON to write.")],
+    agent: Annotated[str, typer.Option(help="As for `drake-clutter generate`.")] = "sg-star",
+    nodes: Annotated[int, typer.Option(min=3)] = 25,
+    objects: str = "ycb7",
+    count: Annotated[int, typer.Option(min=1, help="Stable scenes to collect.")] = 3000,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    temperature: Annotated[float | None, typer.Option(help="Of a trained agent.")] = None,
+    work: Annotated[Path | None, typer.Option(metavar="DIR", help="Have Drake judge, and keep the scenes here.")] = None,
+    not_in: Annotated[list[Path] | None, typer.Option(metavar="FILE", help="A set to leave out; may be repeated.")] = None,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+) -> None:
+    """Makes a set."""
+    console = Console(stderr=True)
+    taken = {scene.form for path in not_in or [] for scene in load_scene_set(path, load_catalogue()).scenes}
+    job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
+    about: dict[str, Any] = {"objects": objects, "agent": agent, "nodes": nodes, "seed": seed, "temperature": temperature}
+    about |= {
+        "judge": "fast" if work is None else "drake",
+        "without": [path.name for path in not_in or []],
+        "commit": git_commit(),
+    }
+    found, drawn = list[SetScene](), 0
+    if work is None:
+        made = map_ordered(partial(FastMaker, job), itertools.count(), workers=workers)
+        fitting = itertools.islice(without_repeats(made, taken), count)
+        found = list(track(fitting, out.stem, total=count, console=console))
+        made.close()
+    while work is not None and len(found) < count:
+        drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
+        generate(job, drawn, work, workers, lambda scenes, done, total: track(scenes, out.stem, total, done, console=console))
+        found = list(without_repeats(judged_by_drake(work), taken))
+        if drawn > 100 and not found:
+            raise InputError(
+                f"--agent {agent}: none of {drawn} scenes is stable and hides something; allowed is one of which some are"
+            )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_scene_set(out, about, found[:count])
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)

@@ -1,0 +1,80 @@
+"""Trains the privileged teacher of the explorers by actor-critic learning.
+
+    python training/train_explorer.py --config training/configs/teacher.yaml --out runs/teacher
+
+A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
+from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
+from drake_clutter.agents.learned_explorer import TEACHER, about_explorer
+from drake_clutter.agents.message_passing import one_thread_per_operation
+from drake_clutter.agents.training_run import TrainingRun, device_of
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.files import told_in_one_line
+from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.tasks.clutter_exploration import ClutterExploration
+
+CHECKPOINT = "explorer.safetensors"
+
+
+@dataclass
+class TrainExplorer:
+    """A training.
+
+    Attributes:
+        scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
+        seed: same seed, same weights (on the same kind of machine).
+        max_moves: of an episode; most_objects: of a scene.
+        evaluate_every: moves; evaluation_episodes: that are then played with the likeliest moves.
+        learning, world: see there.
+    """
+
+    scenes: str = "training/scenes/train_sg_star.json"
+    catalogue: str = ""
+    seed: int = 0
+    max_moves: int = 20
+    most_objects: int = 24
+    evaluate_every: int = 15_000
+    evaluation_episodes: int = 200
+    learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    world: ClutterConfig = field(default_factory=ClutterConfig)
+
+
+def main(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainExplorer.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+) -> None:
+    """Trains, evaluates as it goes, and writes explorer.safetensors."""
+    given = load_typed(TrainExplorer(), config, settings or [])
+    one_thread_per_operation()
+    scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
+    environment = ClutterExploration(
+        scenes, privileged=True, max_moves=given.max_moves, most_objects=given.most_objects, config=given.world
+    )
+    learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
+    run = TrainingRun(out, given, learner, given.learning.steps)
+    while learner.step < given.learning.steps:
+        before = learner.step
+        learner.advance()
+        over = learner.step >= given.learning.steps
+        if over or learner.step // given.evaluate_every > before // given.evaluate_every:
+            episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
+            run.report(figures(episodes), learner.losses)
+            run.save()
+    about = {"kind": TEACHER, "network": about_explorer(environment.numbers, given.learning.width)}
+    run.finish(CHECKPOINT, learner.network, about)
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
