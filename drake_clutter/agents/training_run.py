@@ -75,7 +75,9 @@ class TrainingRun:
                 self._writer.add_scalar(f"{folder}/{name}", value, step)
         left = (self._steps - step) / rate / 60 if rate else float("nan")
         told = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
-        self._console.print(f"{step:>7} of {self._steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left", highlight=False)
+        self._console.print(
+            f"{step:>7} of {self._steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left", highlight=False, soft_wrap=True
+        )
 
     def save(self) -> None:
         """Writes the state."""

@@ -69,10 +69,10 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.numbers), (n,), np.int8),
-            "feature": box(-np.inf, np.inf, (n, len(FEATURES)), np.float32),
+            "feature": box(-10, 10, (n, len(FEATURES)), np.float32),
             "edge": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
-            "glob": box(0, np.inf, (len(GLOBALS),), np.float32),
+            "glob": box(0, 10, (len(GLOBALS),), np.float32),
             "pick": box(0, 1, (n,), np.int8),
             "place": box(0, 1, (n,), np.int8),
         }
@@ -95,9 +95,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config.layout, self.np_random)
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
                 return scene
-        raise ValueError(
-            f"{self.scenes.name}: of {_STABLE_TRIES} scenes none stands, with at most {self._nodes - 1} objects"
-        )
+        raise ValueError(f"{self.scenes.name}: of {_STABLE_TRIES} scenes none stands, with at most {self._nodes - 1} objects")
 
     def begin(self, scene: Scene) -> None:
         """Starts an episode on a scene at rest."""

@@ -1,0 +1,233 @@
+"""The exploration environment, and learning in it."""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from conftest import CATALOGUE, random_scene, training_script
+from gymnasium.utils.env_checker import check_env
+
+from drake_clutter.agents.actor_critic import advantage
+from drake_clutter.agents.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.agents.cloning import Cloning, CloningConfig
+from drake_clutter.agents.exploration import make_explorers, play
+from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
+from drake_clutter.agents.explorer_network import ExplorerNetwork
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import TRAY, Pose
+from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
+from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.tasks.exploration import EpisodeEnd
+
+ROOT = Path(__file__).parents[1]
+
+
+def entry(seed: int) -> SetScene:
+    scene = random_scene(seed, 16, 20)
+    return SetScene(scene.derivation, str(seed), 1, "", tuple(scene.poses.values()))
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes by RG that hide seven, three and two objects, and stand."""
+    path = tmp_path_factory.mktemp("scenes") / "few.json"
+    save_scene_set(path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def scenes(file: Path) -> SceneSet:
+    return load_scene_set(file, CATALOGUE)
+
+
+def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:
+    x = int(draw.choice(np.flatnonzero(observation["pick"])))
+    y = int(draw.choice([node for node in np.flatnonzero(observation["place"]) if node != x]))
+    return x, y
+
+
+def test_it_is_a_gymnasium_environment(file: Path) -> None:
+    environment = gymnasium.make("drake_clutter.tasks:ClutterExploration-v0", scenes=file, max_moves=4)
+    check_env(environment.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> None:
+    environment, draw = ClutterExploration(scenes, privileged=privileged, max_moves=6), np.random.default_rng(0)
+    ends = set()
+    for seed in range(12):
+        observation, _ = environment.reset(seed=seed)
+        total, moves, known = 0.0, 0, environment.objects
+        while environment.task.end is None:
+            in_view = {d.name for d in environment.task.look.observation.detections}
+            assert {known[node - 1] for node in np.flatnonzero(observation["pick"])} == in_view
+            assert observation["place"][0] == 1
+            shown = environment.task.scene.names if privileged else tuple(sorted(environment.task.known))
+            assert (known if privileged else tuple(sorted(known))) == shown
+            observation, reward, over, out_of_moves, info = environment.step(random_move(observation, draw))
+            total, moves = total + float(reward), moves + 1
+            assert environment.objects[: len(known)] == known
+            known = environment.objects
+            assert (over or out_of_moves) == ("end" in info)
+        ends.add(environment.task.end)
+        collapsed = environment.task.end is EpisodeEnd.COLLAPSED
+        assert total == len(environment.task.found) - collapsed
+    assert len(ends) > 1
+
+
+def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
+    environment = ClutterExploration(scenes, privileged=True)
+    observation, _ = environment.reset(options={"scene": 0})
+    hidden = next(k for k in range(1, len(environment.objects) + 1) if not observation["pick"][k])
+    seen = next(k for k in range(1, len(environment.objects) + 1) if observation["pick"][k])
+    for move in ((0, seen), (seen, seen), (hidden, 0), (seen, hidden), (seen, 24), (24, 0)):
+        again, reward, over, out_of_moves, _ = environment.step(move)
+        assert (reward, over, out_of_moves) == (0.0, False, False)
+        assert all(np.array_equal(again[name], observation[name]) for name in observation)
+    assert environment.task.steps == []
+
+
+def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -> None:
+    environment = ClutterExploration(scenes)
+    starts: list[dict[str, Pose]] = []
+    for options in (None, None, {"scene": 1}, {"scene": 1}):
+        environment.reset(seed=len(starts), options=options)
+        starts.append(environment.task.start.poses)
+    assert starts[0] != starts[1]
+    assert starts[2] == starts[3]
+    assert [p.p for p in starts[2].values()] == [pytest.approx(p.p, abs=1e-6) for p in random_scene(10, 16, 20).poses.values()]
+
+
+def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
+    with pytest.raises(ValueError, match="none stands, with at most 2 objects"):
+        ClutterExploration(scenes, most_objects=2).reset(seed=0)
+
+
+# --- Learning ---
+
+
+def test_episodes_are_the_same_for_the_same_seed(scenes: SceneSet) -> None:
+    environment = ClutterExploration(scenes, max_moves=5)
+    torch.manual_seed(0)
+    network = ExplorerNetwork(len(environment.numbers), 8)
+
+    def played(side_by_side: int, seed: int) -> list[Played]:
+        return play_episodes(environment, 7, (seed, 1), acting(network, None), side_by_side)
+
+    one, other = played(3, 5), played(7, 5)
+    assert [[m.tolist() for m in e.moves] for e in one] == [[m.tolist() for m in e.moves] for e in other]
+    assert [e.rewards for e in one] == [e.rewards for e in other] != [e.rewards for e in played(7, 6)]
+    told = figures(one)
+    assert told["success"] == sum(e.end is EpisodeEnd.ALL_FOUND for e in one) / 7
+    assert told["score"] == pytest.approx(np.mean([sum(e.rewards) for e in one]))
+
+
+def test_the_advantage_is_the_weighted_sum_of_what_comes() -> None:
+    values, rewards, discount, trace = [1.0, -0.5, 2.0], [0.0, 3.0, -1.0], 0.9, 0.8
+    episode = Played(moves=[np.zeros(2, int)] * 3, rewards=rewards, notes=[(0.0, value) for value in values])
+    errors = [rewards[k] + discount * (*values, 0.0)[k + 1] - values[k] for k in range(3)]
+    expected = [sum((discount * trace) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)]
+    assert advantage(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneSet) -> None:
+    """The same object, by its node in either graph."""
+    environment = ClutterExploration(scenes, max_moves=5)
+    torch.manual_seed(1)
+    teacher = ExplorerNetwork(len(environment.numbers), 8)
+    cloning = Cloning(environment, teacher, CloningConfig(width=8), 0, torch.device("cpu"))
+    for seed in range(5):
+        environment.reset(seed=seed)
+        ((x, y),) = cloning.wanted([environment]).tolist()
+        told = ClutterExploration(scenes, privileged=True, max_moves=5)
+        told.begin(environment.task.scene)
+        ((a, b),) = acting(teacher, None)([told], [told.observe()])[0].tolist()
+        named = [TRAY if node == 0 else names[node - 1] for names, node in ((told.objects, a), (told.objects, b))]
+        assert [environment.objects[x - 1], TRAY if y == 0 else environment.objects[y - 1]] == named
+
+
+TEACHER_SETTINGS = ["learning.steps=120", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=20"]
+TEACHER_SETTINGS += ["evaluation_episodes=4"]
+STUDENT_SETTINGS = ["learning.rounds=6", "learning.episodes=5", "learning.width=8", "learning.updates=4", "max_moves=4"]
+STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
+
+
+@pytest.mark.parametrize("script", ["train_explorer", "clone_explorer"])
+def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Path, tmp_path: Path) -> None:
+    settings = [f"scenes={file}", *(TEACHER_SETTINGS if script == "train_explorer" else STUDENT_SETTINGS)]
+    if script == "clone_explorer":
+        numbers = ClutterExploration(file).numbers
+        torch.manual_seed(3)
+        save_checkpoint(
+            tmp_path / "t.safetensors",
+            ExplorerNetwork(len(numbers), 8),
+            {"kind": TEACHER, "network": about_explorer(numbers, 8)},
+        )
+        settings += [f"teacher={tmp_path / 't.safetensors'}"]
+    options = [argument for setting in settings for argument in ("--set", setting)]
+    command = [sys.executable, str(ROOT / "training" / f"{script}.py"), "--out", str(tmp_path / "killed"), *options]
+    killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    train = training_script(script)
+    train.main(tmp_path / "whole", settings=settings)
+    while not (tmp_path / "killed" / "state.safetensors").exists():
+        assert killed.poll() is None
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    (tmp_path / "killed" / "explorer.safetensors").unlink(missing_ok=True)  # if the kill came too late
+    train.main(tmp_path / "killed", settings=settings)
+    whole, again = (load_checkpoint(tmp_path / name / "explorer.safetensors") for name in ("whole", "killed"))
+    assert all(torch.equal(whole.weights[name], again.weights[name]) for name in whole.weights)
+    histories = [json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")]
+    assert [row["score"] for row in histories[0]] == [row["score"] for row in histories[1]]
+    # What was written plays.
+    environment = ClutterExploration(file, max_moves=4)
+    environment.reset(options={"scene": 0})
+    agent = make_explorers(str(tmp_path / "whole" / "explorer.safetensors"), ClutterConfig())(environment.task)
+    play(environment.task, agent, np.random.default_rng(0))
+    decision = environment.task.steps[0].decision
+    assert decision is not None
+    assert sum(decision.picks.values()) == pytest.approx(1, abs=1e-5)
+    assert set(decision.picks) == {d.name for d in environment.task.first_look.observation.detections}
+    everything = set(environment.task.start.names)
+    assert (set(decision.known) == everything) == (script == "train_explorer")
+
+
+def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--agent nobody; allowed are random, .*full-knowledge"):
+        make_explorers("nobody", ClutterConfig())
+    path = tmp_path / "s.safetensors"
+    numbers = ClutterExploration(file).numbers
+    about = {"kind": STUDENT, "network": about_explorer(numbers, 8)}
+    save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"kind": "generator"})
+    with pytest.raises(
+        InputError, match=r"s\.safetensors: is a checkpoint of a generator; allowed is one of a teacher or student"
+    ):
+        make_explorers(str(path), ClutterConfig())
+    save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"network": {**about_explorer(numbers, 8), "features": []}})
+    with pytest.raises(InputError, match="was trained on other features"):
+        make_explorers(str(path), ClutterConfig())
+    save_checkpoint(path, ExplorerNetwork(2, 8), {"kind": STUDENT, "network": about_explorer({TRAY: 1, "sugar_box": 2}, 8)})
+    environment = ClutterExploration(file)
+    environment.reset(options={"scene": 0})
+    agent = make_explorers(str(path), ClutterConfig())(environment.task)
+    with pytest.raises(InputError, match="was not trained with"):
+        play(environment.task, agent, np.random.default_rng(0))
+
+
+def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig) -> None:
+    environment = ClutterExploration(scenes, max_moves=20)
+    environment.reset(options={"scene": 1})
+    play(environment.task, make_explorers("full-knowledge", config)(environment.task), np.random.default_rng(0))
+    assert environment.task.hidden_at_start
+    assert environment.task.end is EpisodeEnd.ALL_FOUND
+    assert replace(environment.task.steps[-1], decision=None).newly_found

@@ -1,0 +1,141 @@
+"""The graph that explorers see, and the network that looks at it."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import CLASSES, random_scene, resting, rng, scene_of
+
+from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.seams import Move
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GraphObservation, Knowledge, exploration_graph
+
+NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
+RAYS = RayCaster(ClutterConfig().camera)
+# A marker below a cracker box, which carries a can; a pudding box close by, another one far away.
+SCENE = scene_of(
+    resting("large_marker", xy=(0.0, 0.0)),
+    resting("cracker_box", xy=(0.0, 0.0), floor=0.018),
+    resting("tomato_soup_can", xy=(0.05, 0.0), floor=0.078),
+    resting("pudding_box", Orientation.FLAT_90, xy=(0.18, 0.0), name="close"),
+    resting("pudding_box", xy=(-0.25, -0.25), name="far"),
+)
+
+
+def graph_of(scene: Scene, tried: tuple[Move, ...] = (), nodes: int = 0) -> GraphObservation:
+    return exploration_graph(scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, nodes)
+
+
+def feature(graph: GraphObservation, node: int, name: str) -> float:
+    return float(graph["feature"][node, FEATURES.index(name)])
+
+
+def edges(graph: GraphObservation, names: tuple[str, ...]) -> dict[tuple[str, str], str]:
+    """Kinds by lower and upper."""
+    named = (TRAY, *names)
+    joined = zip(graph["edge"].tolist(), graph["edge_kind"].tolist(), strict=True)
+    return {(named[a], named[b]): EDGE_KINDS[kind - 1] for (a, b), kind in joined if kind}
+
+
+def test_how_objects_lie_to_each_other() -> None:
+    found = edges(graph_of(SCENE), SCENE.names)
+    assert len(found) == 5 + 10
+    assert found["large_marker", "cracker_box"] == "carries"
+    assert found["cracker_box", "tomato_soup_can"] == "carries"
+    assert found["large_marker", "tomato_soup_can"] == "is_below"
+    assert {found[pair] for pair in found if set(pair) == {"cracker_box", "close"}} == {"is_beside"}
+    assert {found[pair] for pair in found if set(pair) == {"close", "far"}} == {"is_apart_from"}
+    assert {upper for (lower, upper), kind in found.items() if kind == "tray_carries"} == {"large_marker", "close", "far"}
+    assert {upper for (lower, upper), kind in found.items() if kind == "tray_is_below"} == {"cracker_box", "tomato_soup_can"}
+
+
+def test_what_is_known_of_each_object() -> None:
+    graph = graph_of(SCENE, (Move("far"), Move("far"), Move("close")), nodes=9)
+    assert graph["node_kind"].tolist() == [NUMBERS[TRAY], *(NUMBERS[o.object_class.name] for o in SCENE.objects), 0, 0, 0]
+    assert [feature(graph, k, "in_view") for k in range(1, 6)] == [0, 1, 1, 1, 1]
+    assert [feature(graph, k, "covered") for k in range(1, 6)] == [1, 1, 0, 0, 0]
+    assert [feature(graph, k, "times_picked") for k in range(1, 6)] == pytest.approx([0, 0, 0, 1 / 3, 2 / 3])
+    assert [feature(graph, k, "unexplained_height") for k in range(1, 6)] == [0.0] * 5
+    assert feature(graph, 2, "extent_x") == pytest.approx(0.230 / 0.35)
+    assert feature(graph, 4, "seen_share") == pytest.approx(1, abs=0.05)
+    assert feature(graph, 2, "seen_share") < 0.95
+    assert graph["pick"].tolist() == [0, 0, 1, 1, 1, 1, 0, 0, 0]
+    assert graph["place"].tolist() == [1, 0, 1, 1, 1, 1, 0, 0, 0]
+    assert graph["glob"] == pytest.approx([3 / 20])
+
+
+def test_something_must_carry_a_box_that_floats() -> None:
+    """K_t lacks the marker, which has never been in view: the box above it lies 18 mm over the tray."""
+    observation = RAYS.observe(SCENE)[0]
+    knowledge = Knowledge()
+    knowledge.see(observation)
+    known = knowledge.objects
+    assert [o.name for o in known] == ["cracker_box", "tomato_soup_can", "close", "far"]
+    graph = exploration_graph(known, observation, (), NUMBERS)
+    heights = [feature(graph, k, "unexplained_height") for k in range(1, 5)]
+    assert heights == pytest.approx([(0.018 - 0.006) / 0.35, 0, 0, 0], abs=1e-6)
+
+
+def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
+    covered = SCENE.at({"large_marker": resting("large_marker", xy=(0.0, 0.3)).X_TO})
+    knowledge = Knowledge()
+    knowledge.see(RAYS.observe(covered)[0])
+    knowledge.see(RAYS.observe(SCENE)[0])
+    assert knowledge.objects[0].name == "large_marker"
+    assert {o.name: o.X_TO for o in knowledge.objects}["large_marker"] == covered["large_marker"].X_TO
+    graph = exploration_graph(knowledge.objects, RAYS.observe(SCENE)[0], (), NUMBERS)
+    assert graph["pick"].tolist() == [0, 0, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
+    scene = random_scene(seed)
+    order = rng(seed).permutation(len(scene.objects))
+    shuffled = Scene(tuple(scene.objects[k] for k in order), scene.tray_side)
+    torch.manual_seed(seed)
+    network = ExplorerNetwork(len(NUMBERS)).double()
+    one, other = (network(stacked_graphs([graph_of(s)])) for s in (scene, shuffled))
+    assert torch.allclose(one.value, other.value)
+    nodes = torch.from_numpy(np.concatenate([[0], order + 1]))
+    assert torch.allclose(one.pick[:, nodes], other.pick)
+    picked = int(one.pick.argmax())
+    there = int((nodes == picked).nonzero())
+    places = network.places(one, torch.tensor([picked])), network.places(other, torch.tensor([there]))
+    assert torch.allclose(places[0][:, nodes], places[1])
+
+
+def test_a_batch_is_each_graph_by_itself() -> None:
+    """Also beside larger ones, with padding."""
+    graphs = [graph_of(random_scene(seed, 8, 25)) for seed in range(6)]
+    torch.manual_seed(0)
+    network = ExplorerNetwork(len(NUMBERS)).double()
+    together = network(stacked_graphs(graphs))
+    picked = together.pick.argmax(dim=1)
+    places = network.places(together, picked)
+    for k, graph in enumerate(graphs):
+        alone, count = network(stacked_graphs([graph])), len(graph["node_kind"])
+        assert torch.allclose(alone.pick[0], together.pick[k, :count])
+        assert torch.allclose(alone.value[0], together.value[k])
+        assert torch.allclose(network.places(alone, picked[k : k + 1])[0], places[k, :count])
+        assert (together.pick[k, count:] == -torch.inf).all()
+
+
+def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
+    torch.manual_seed(1)
+    network, graph = ExplorerNetwork(len(NUMBERS)), graph_of(SCENE)
+    count = 4000
+    moves, chance, _, picks = decide(network, stacked_graphs([graph] * count), rng())
+    assert picks[0].sum() == pytest.approx(1, abs=1e-5)
+    assert (graph["pick"][moves[:, 0]] == 1).all()
+    assert (graph["place"][moves[:, 1]] == 1).all()
+    assert (moves[:, 0] != moves[:, 1]).all()
+    drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
+    assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
+    found = network(stacked_graphs([graph] * 50))
+    again = log_probability(found, network.places(found, torch.from_numpy(moves[:50, 0])), torch.from_numpy(moves[:50]))
+    assert again.detach().numpy() == pytest.approx(chance[:50], abs=1e-5)
+    (likeliest,) = decide(network, stacked_graphs([graph]), None)[0].tolist()
+    assert likeliest[0] == picks[0].argmax()

@@ -1,0 +1,73 @@
+"""Sets of scenes in one file."""
+
+from pathlib import Path
+
+import pytest
+from conftest import CATALOGUE, GRAMMARS, random_scene, rng
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.grammar import Derivation, canonical_form
+from drake_clutter.scenes.scene_set import SetScene, lay_anew, load_scene_set, save_scene_set
+
+LAYOUT = ClutterConfig().layout
+SCENES = [random_scene(seed) for seed in (1, 2, 3)]
+
+
+def entry(number: int, *, frozen: bool) -> SetScene:
+    scene = SCENES[number]
+    assert scene.graph is not None
+    poses = tuple(pose.moved((0.001, 0.0, 0.0)) for pose in scene.poses.values()) if frozen else None
+    return SetScene(scene.derivation, canonical_form(scene.graph, CATALOGUE.classes), number, "solvable", poses)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
+    written = [entry(number, frozen=frozen) for number in range(3)]
+    save_scene_set(tmp_path / "set.json", {"objects": "ycb7", "seed": 5}, written)
+    held = load_scene_set(tmp_path / "set.json", CATALOGUE)
+    assert held.name == "set.json"
+    assert held.about == {"objects": "ycb7", "seed": 5}
+    assert [(s.rules, s.form, s.hidden, s.solvable) for s in held.scenes] == [
+        (s.rules, s.form, s.hidden, s.solvable) for s in written
+    ]
+    for number, scene in enumerate(SCENES):
+        assert scene.graph is not None
+        derivation = held.derivation(number, held.grammar)
+        assert dict(derivation.graph.nx.edges) == dict(scene.graph.nx.edges)
+        if frozen:
+            settled = held.settled(number, held.grammar, LAYOUT)
+            assert settled.names == scene.names
+            for pose, laid_out in zip(settled.poses.values(), scene.poses.values(), strict=True):
+                assert pose.p - laid_out.p == pytest.approx([0.001, 0, 0], abs=1e-6)
+                assert pose.rotation == pytest.approx(laid_out.rotation, abs=1e-5)
+        else:
+            with pytest.raises(InputError, match=r"set\.json: holds graphs without poses"):
+                held.settled(number, held.grammar, LAYOUT)
+
+
+def test_laid_anew_it_is_the_same_scene_elsewhere() -> None:
+    grammar, first = GRAMMARS["ycb7"], SCENES[0]
+    derivation = Derivation(grammar.replay(first.derivation), first.derivation)
+    scenes = [lay_anew(derivation, grammar, LAYOUT, rng(seed)) for seed in (1, 1, 2)]
+    for scene in scenes:
+        assert scene.names == first.names
+        assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx([o.X_TO.p[2] for o in first.objects])
+    assert scenes[0].poses == scenes[1].poses != scenes[2].poses
+
+
+def test_a_changed_set_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "set.json"
+    save_scene_set(path, {"objects": "ycb7"}, [entry(0, frozen=False)])
+    whole = path.read_text()
+    path.write_text(whole.replace('"hidden":0', '"hidden":9'))
+    with pytest.raises(InputError, match=r"set\.json: sha256"):
+        load_scene_set(path, CATALOGUE)
+    path.write_text(whole.replace('"version": 1', '"version": 7'))
+    with pytest.raises(InputError, match=r"set\.json: version: 7; allowed is 1"):
+        load_scene_set(path, CATALOGUE)
+    path.write_text(whole[:-20])
+    with pytest.raises(InputError, match=r"set\.json: is no set of scenes"):
+        load_scene_set(path, CATALOGUE)
+    with pytest.raises(InputError, match=r"none\.json: cannot be read"):
+        load_scene_set(tmp_path / "none.json", CATALOGUE)

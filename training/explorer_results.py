@@ -1,0 +1,169 @@
+"""Tables II and III: every explorer on every frozen set of scenes, moves settled by Drake; and how much was found over the moves.
+
+    python training/explorer_results.py runs/table2 --workers 2
+
+Episodes stay in the folder, a file for each set and agent; a run that was stopped goes on with what is missing.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.checkpoint import git_commit
+from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
+from drake_clutter.agents.exploration import FULL_KNOWLEDGE, make_explorers
+from drake_clutter.agents.generation import mean_interval, wilson_interval
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.tasks.exploration import EpisodeEnd
+
+HERE = Path(__file__).parent
+SCENES, RESULTS = HERE / "scenes", HERE / "results"
+LIMITS = (10, 20)
+AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "teacher", FULL_KNOWLEDGE)
+SEVEN = ("sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "paper_hardness", "rg_25")
+FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
+ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", agent) for agent in FOURTEEN]
+
+
+def played(scenes: SceneSet, agent: str, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
+    """The episodes of an agent on a set, from the file if they are there."""
+    if path.exists():
+        held = json.loads(path.read_text())
+        if held["set"] != dict(scenes.about) or (held["seed"], held["fidelity"]) != (seed, fidelity):
+            raise InputError(f"{path}: holds episodes of another set, seed or fidelity; give the same ones or another folder")
+        return [EpisodeResult(**{**row, "found_after": tuple(row["found_after"])}) for row in held["episodes"]]
+    config, grammar = ClutterConfig(), scenes.grammar
+    starts = [scenes.settled(k, grammar, config.layout) for k in range(len(scenes.scenes))]
+    make_explorers(agent, config)  # says what is wrong before anything is played
+    episodes = [Episode(f"{scenes.name} {k}", start, agent, k) for k, start in enumerate(starts)]
+    results = map_ordered(partial(EpisodePlayer, config, max(LIMITS), seed, fidelity), episodes, workers=workers)
+    shown = track(results, f"{path.stem}", total=len(episodes), console=Console(stderr=True))
+    found = list(shown)
+    fields = {"set": dict(scenes.about), "seed": seed, "fidelity": fidelity, "commit": git_commit()}
+    write_json(path, fields | {"episodes": [asdict(result) for result in found]})
+    return found
+
+
+def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | None) -> dict[str, Any]:
+    """The figures of an agent on scenes; `ceiling`: how someone who knows everything fared on the same."""
+    row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
+    for limit in LIMITS:
+        won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
+        found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
+        row[f"within_{limit}"] = {
+            "success": sum(won) / len(won),
+            "success_ci95": wilson_interval(sum(won), len(won)),
+            "found": float(np.mean(found)),
+            "found_ci95": mean_interval(found),
+            "found_of_hidden": sum(found) / sum(r.hidden for r in results),
+            "collapsed": sum(r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results) / len(results),
+        }
+    won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
+    row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
+    row["not_carried_out"] = sum(r.no_free_spot for r in results) / max(1, sum(r.moves for r in results))
+    if ceiling is not None:
+        pairs = [
+            (r.moves, c.moves) for r, c in zip(results, ceiling, strict=True) if r.ended == c.ended == EpisodeEnd.ALL_FOUND.value
+        ]
+        row["moves_to_ceiling"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
+        row["both_succeeded"] = len(pairs)
+    return row
+
+
+def table_of(rows: Sequence[dict[str, Any]]) -> Table:
+    """For the screen."""
+    table = Table(
+        "set", "agent", "episodes", "hidden", *(f"{what} in {n}" for n in LIMITS for what in ("success", "found", "of hidden"))
+    )
+    for column in ("collapsed", "moves", "to ceiling"):
+        table.add_column(column)
+    for row in rows:
+        numbers = []
+        for limit in LIMITS:
+            part = row[f"within_{limit}"]
+            low, high = part["success_ci95"]
+            numbers += [
+                f"{part['success']:.2f} ({low:.2f} to {high:.2f})",
+                f"{part['found']:.2f}",
+                f"{part['found_of_hidden']:.2f}",
+            ]
+        last = [f"{row[f'within_{LIMITS[-1]}']['collapsed']:.2f}"]
+        last += ["" if row.get(key) is None else f"{row[key]:.2f}" for key in ("moves_of_successes", "moves_to_ceiling")]
+        table.add_row(row["set"], row["agent"], str(row["episodes"]), f"{row['hidden']:.2f}", *numbers, *last)
+    return table
+
+
+def draw_curves(found: dict[str, Sequence[EpisodeResult]], title: str, path: Path) -> None:
+    """Share of what was hidden that was found, over the moves, for each agent."""
+    plt.rcParams.update({"font.size": 20, "lines.linewidth": 3})
+    figure, axes = plt.subplots(figsize=(12, 7), layout="constrained")
+    moves = np.arange(max(LIMITS) + 1)
+    for agent, results in found.items():
+        hidden = sum(r.hidden for r in results)
+        shares = []
+        for limit in moves:
+            shares.append(sum(r.found_after[:limit][-1] for r in results if r.found_after[:limit]) / hidden)
+        axes.plot(moves, shares, label=agent, linestyle="--" if agent == FULL_KNOWLEDGE else "-")
+    axes.set(xlabel="moves", ylabel="found, of the hidden objects", ylim=(0, 1.02), xlim=(0, max(LIMITS)), title=title)
+    axes.set_xticks(range(0, max(LIMITS) + 1, 2))
+    axes.grid(alpha=0.4)
+    axes.legend()
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")],
+    workers: int = 1,
+    seed: Annotated[int, typer.Option(help="Of the episodes' chances.")] = 2000,
+    fidelity: Annotated[str, typer.Option(help="fast or settle; the published tables are settle.")] = "settle",
+    only: Annotated[str | None, typer.Option(help="Of sets whose name contains this.")] = None,
+    agents: Annotated[list[str] | None, typer.Option("--agent", help="These instead of the tables'; may be repeated.")] = None,
+    out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table2.json",
+    curves: Annotated[Path | None, typer.Option(metavar="FILE", help="PNG to write, of the last set.")] = None,
+) -> None:
+    """Measures what is missing and prints the table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    catalogue, rows = load_catalogue(), list[dict[str, Any]]()
+    names = [name for name in dict.fromkeys(name for name, _ in ROWS) if (only is None or only in name)]
+    for name in names:
+        scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
+        chosen = agents or [agent for of, agent in ROWS if of == name]
+        found = {
+            agent: played(scenes, agent, fidelity, seed, workers, folder / f"{name}_{Path(agent).stem}.json")
+            for agent in sorted(chosen, key=lambda agent: agent != FULL_KNOWLEDGE)
+        }
+        solvable = [k for k, scene in enumerate(scenes.scenes) if scene.solvable == "solvable"]
+        for agent in chosen:
+            ceiling = found.get(FULL_KNOWLEDGE)
+            row = {"set": name, "agent": agent, **row_of(found[agent], ceiling)}
+            part = [found[agent][k] for k in solvable]
+            row["solvable"] = row_of(part, [ceiling[k] for k in solvable] if ceiling else None) if part else None
+            rows.append(row)
+        if curves is not None:
+            draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {len(scenes.scenes)} scenes, {fidelity}", curves)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, {"seed": seed, "fidelity": fidelity, "commit": git_commit(), "rows": rows})
+    Console(width=180).print(table_of(rows))
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
