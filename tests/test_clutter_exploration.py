@@ -25,8 +25,9 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
+from drake_clutter.scenes.seams import Move
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration import EpisodeEnd, legal_moves
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,8 +51,8 @@ def scenes(file: Path) -> SceneSet:
 
 
 def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:
-    x = int(draw.choice(np.flatnonzero(observation["pick"])))
-    y = int(draw.choice([node for node in np.flatnonzero(observation["place"]) if node != x]))
+    moves = np.argwhere(observation["allowed"])
+    x, y = moves[draw.integers(len(moves))].tolist()
     return x, y
 
 
@@ -66,15 +67,17 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> No
     ends = set()
     for seed in range(12):
         observation, _ = environment.reset(seed=seed)
-        total, moves, known = 0.0, 0, environment.objects
+        total, known = 0.0, environment.objects
         while environment.task.end is None:
-            in_view = {d.name for d in environment.task.look.observation.detections}
-            assert {known[node - 1] for node in np.flatnonzero(observation["pick"])} == in_view
-            assert observation["place"][0] == 1
+            names = (TRAY, *known)
+            moves = [Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()]
+            legal = set(legal_moves(environment.task.look.observation))
+            assert len(moves) == len(set(moves))
+            assert set(moves) == legal - set(environment.task.failed)
             shown = environment.task.scene.names if privileged else tuple(sorted(environment.task.known))
             assert (known if privileged else tuple(sorted(known))) == shown
             observation, reward, over, out_of_moves, info = environment.step(random_move(observation, draw))
-            total, moves = total + float(reward), moves + 1
+            total += float(reward)
             assert environment.objects[: len(known)] == known
             known = environment.objects
             assert (over or out_of_moves) == ("end" in info)
@@ -87,8 +90,8 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> No
 def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
     environment = ClutterExploration(scenes, privileged=True)
     observation, _ = environment.reset(options={"scene": 0})
-    hidden = next(k for k in range(1, len(environment.objects) + 1) if not observation["pick"][k])
-    seen = next(k for k in range(1, len(environment.objects) + 1) if observation["pick"][k])
+    hidden = next(k for k in range(1, len(environment.objects) + 1) if not observation["allowed"][k].any())
+    seen = next(k for k in range(1, len(environment.objects) + 1) if observation["allowed"][k].any())
     for move in ((0, seen), (seen, seen), (hidden, 0), (seen, hidden), (seen, 24), (24, 0)):
         again, reward, over, out_of_moves, _ = environment.step(move)
         assert (reward, over, out_of_moves) == (0.0, False, False)

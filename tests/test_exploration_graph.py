@@ -1,5 +1,7 @@
 """The graph that explorers see, and the network that looks at it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -25,8 +27,8 @@ SCENE = scene_of(
 )
 
 
-def graph_of(scene: Scene, tried: tuple[Move, ...] = (), nodes: int = 0) -> GraphObservation:
-    return exploration_graph(scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, nodes)
+def graph_of(scene: Scene, tried: Sequence[Move] = (), failed: Sequence[Move] = (), nodes: int = 0) -> GraphObservation:
+    return exploration_graph(scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, failed, nodes)
 
 
 def feature(graph: GraphObservation, node: int, name: str) -> float:
@@ -62,9 +64,24 @@ def test_what_is_known_of_each_object() -> None:
     assert feature(graph, 2, "extent_x") == pytest.approx(0.230 / 0.35)
     assert feature(graph, 4, "seen_share") == pytest.approx(1, abs=0.05)
     assert feature(graph, 2, "seen_share") < 0.95
-    assert graph["pick"].tolist() == [0, 0, 1, 1, 1, 1, 0, 0, 0]
-    assert graph["place"].tolist() == [1, 0, 1, 1, 1, 1, 0, 0, 0]
+    allowed = np.zeros((9, 9), int)
+    allowed[2:6, [0, 2, 3, 4, 5]] = 1
+    np.fill_diagonal(allowed, 0)
+    assert np.array_equal(graph["allowed"], allowed)
     assert graph["glob"] == pytest.approx([3 / 20])
+
+
+def test_what_has_failed_is_not_tried_again() -> None:
+    onto_all = [Move("far", name) for name in (TRAY, "cracker_box", "tomato_soup_can", "close")]
+    graph = graph_of(SCENE, failed=[Move("close"), *onto_all])
+    free = graph_of(SCENE)["allowed"]
+    assert free[4, 0] == free[5, 2] == 1
+    free[4, 0], free[5] = 0, 0
+    assert np.array_equal(graph["allowed"], free)
+    torch.manual_seed(0)
+    moves, _, _, picks = decide(ExplorerNetwork(len(NUMBERS)), stacked_graphs([graph] * 500), rng())
+    assert picks[0, 5] == 0
+    assert (free[moves[:, 0], moves[:, 1]] == 1).all()
 
 
 def test_something_must_carry_a_box_that_floats() -> None:
@@ -87,7 +104,7 @@ def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
     assert knowledge.objects[0].name == "large_marker"
     assert {o.name: o.X_TO for o in knowledge.objects}["large_marker"] == covered["large_marker"].X_TO
     graph = exploration_graph(knowledge.objects, RAYS.observe(SCENE)[0], (), NUMBERS)
-    assert graph["pick"].tolist() == [0, 0, 1, 1, 1, 1]
+    assert graph["allowed"].any(axis=1).tolist() == [False, False, True, True, True, True]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -129,9 +146,7 @@ def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
     count = 4000
     moves, chance, _, picks = decide(network, stacked_graphs([graph] * count), rng())
     assert picks[0].sum() == pytest.approx(1, abs=1e-5)
-    assert (graph["pick"][moves[:, 0]] == 1).all()
-    assert (graph["place"][moves[:, 1]] == 1).all()
-    assert (moves[:, 0] != moves[:, 1]).all()
+    assert (graph["allowed"][moves[:, 0], moves[:, 1]] == 1).all()
     drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
     assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
     found = network(stacked_graphs([graph] * 50))

@@ -1,6 +1,6 @@
 """Explorers: RE, LF and LF-clear, which need no learning (SPEC section 4), and where the trained ones are found."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -19,20 +19,25 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 class ExplorationAgent(Protocol):
     """Chooses moves from what the camera has shown. One instance plays one episode at a time."""
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """The next move.
 
         Args:
             observation: what is in view now.
             tried: the episode's earlier moves.
             rng: decides what chance decides.
+            failed: those of them that could not be carried out since the scene last changed.
         """
 
 
 class RandomExplorer:
     """RE: uniform over the legal moves."""
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """See `ExplorationAgent.choose`."""
         moves = legal_moves(observation)
         return Decision(moves[rng.integers(len(moves))] if moves else None)
@@ -54,7 +59,9 @@ class LargestFirst:
     Those picked least often come first, see `_least_picked_then_largest`.
     """
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """See `ExplorationAgent.choose`."""
         return _least_picked_then_largest(observation.detections, tried, lambda d: d.object_class.volume)
 
@@ -65,7 +72,9 @@ class LargestClear:
     Those picked least often come first. If nothing in view has a clear top, all count as candidates.
     """
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """See `ExplorationAgent.choose`."""
         clear = [d for d in observation.detections if has_clear_top(observation, d)]
         return _least_picked_then_largest(clear or observation.detections, tried, lambda d: float(d.mask.sum()))
@@ -81,7 +90,9 @@ class FullKnowledge:
         self._task, self._search = task, search
         self._plan: list[Move] = []
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """See `ExplorationAgent.choose`. A plan that Drake did not carry out as it was meant is followed by another."""
         in_view = {TRAY, *(d.name for d in observation.detections)}
         if not self._plan or not {self._plan[0].pick, self._plan[0].place} <= in_view:
@@ -142,7 +153,7 @@ def play(
 ) -> None:
     """Lets an agent play a task to its end, or until it has no move left; `report` is called after each move."""
     while task.end is None:
-        decision = agent.choose(task.look.observation, [step.move for step in task.steps], rng)
+        decision = agent.choose(task.look.observation, [step.move for step in task.steps], rng, task.failed)
         if decision.move is None:
             return
         report(task.step(decision.move, rng, decision))

@@ -66,15 +66,14 @@ def play_episodes(
         for number, move, note in zip(list(running), moves, notes, strict=True):
             twin, before = running[number]
             episode = played[number]
-            observation, reward, over, out_of_moves, _ = twin.step(move)
+            observation, reward, over, out_of_moves, info = twin.step(move)
             episode.observations.append(before)
             episode.moves.append(move)
             episode.rewards.append(float(reward))
             episode.notes.append(note)
             running[number] = twin, observation
             if over or out_of_moves:
-                assert twin.task.end is not None
-                episode.end, episode.hidden, episode.found = twin.task.end, len(twin.task.hidden_at_start), len(twin.task.found)
+                episode.end, episode.hidden, episode.found = info["end"], len(twin.task.hidden_at_start), len(twin.task.found)
                 del running[number]
 
 

@@ -21,15 +21,20 @@ from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS,
 def stacked_graphs(observations: Sequence[GraphObservation]) -> GraphObservation:
     """A batch: the arrays of `exploration_graph` with a first axis of graphs, padded to the largest."""
     nodes = max(len(observation["node_kind"]) for observation in observations)
-    rooms = {"node_kind": nodes, "feature": nodes, "pick": nodes, "place": nodes, "glob": len(GLOBALS)}
-    rooms |= {"edge": nodes * (nodes - 1) // 2, "edge_kind": nodes * (nodes - 1) // 2}
-    batch = {}
-    for name, room in rooms.items():
-        first = observations[0][name]
-        array = np.zeros((len(observations), room, *first.shape[1:]), first.dtype)
-        for k, observation in enumerate(observations):
-            array[k, : len(observation[name])] = observation[name]
-        batch[name] = array
+    edges = nodes * (nodes - 1) // 2
+    shapes = {
+        "node_kind": (nodes,),
+        "feature": (nodes, len(FEATURES)),
+        "edge": (edges, 2),
+        "edge_kind": (edges,),
+        "glob": (len(GLOBALS),),
+        "allowed": (nodes, nodes),
+    }
+    batch = {name: np.zeros((len(observations), *shape), observations[0][name].dtype) for name, shape in shapes.items()}
+    for k, observation in enumerate(observations):
+        for name in shapes:
+            corner = tuple(slice(size) for size in observation[name].shape)
+            batch[name][k][corner] = observation[name]
     return batch
 
 
@@ -83,24 +88,18 @@ class ExplorerNetwork(nn.Module):
         """What to pick, and what is to be expected."""
         batch, number = self.batch(observation)
         node, glob = self.network(batch)
-        allowed = torch.from_numpy(observation["pick"]).to(node.device) > 0
-        pick = _log_softmax(self.pick(node).squeeze(1), batch.links.graph, number, allowed)
-        return Evaluated(pick, self.value(glob).squeeze(1), (node, glob, batch, number, _placeable(observation, node.device)))
+        allowed = torch.from_numpy(observation["allowed"]).to(node.device) > 0
+        pick = _log_softmax(self.pick(node).squeeze(1), batch.links.graph, number, allowed.any(dim=2))
+        return Evaluated(pick, self.value(glob).squeeze(1), (node, glob, batch, number, allowed))
 
     def places(self, found: Evaluated, picked: Tensor) -> Tensor:
         """(B, N) log-probability of each node as the place, once (B,) nodes are picked; -inf where it cannot be."""
         node, glob, batch, number, allowed = found.embedded
-        rows = torch.arange(len(glob), device=node.device)
         marked = (number == picked[batch.links.graph])[:, None] * self.mark
         edge = leaky_relu(self.network.edge.weight)
         node, _ = self.after_pick(node + marked, glob, edge, batch.links)
-        allowed = allowed.clone()
-        allowed[rows, picked] = False
-        return _log_softmax(self.place(node).squeeze(1), batch.links.graph, number, allowed)
-
-
-def _placeable(observation: Mapping[str, NDArray[Any]], device: torch.device) -> Tensor:
-    return torch.from_numpy(observation["place"]).to(device) > 0
+        rows = torch.arange(len(glob), device=node.device)
+        return _log_softmax(self.place(node).squeeze(1), batch.links.graph, number, allowed[rows, picked])
 
 
 def _log_softmax(score: Tensor, graph: Tensor, number: Tensor, allowed: Tensor) -> Tensor:

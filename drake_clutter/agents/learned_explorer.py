@@ -1,6 +1,6 @@
 """Trained explorers at work: the student, which knows what the camera has shown, and the teacher, which knows everything."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,9 @@ class LearnedExplorer:
         self._network, self._numbers, self._path, self._task = network, numbers, path, task
         self._knowledge = Knowledge()
 
-    def choose(self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator) -> Decision:
+    def choose(
+        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    ) -> Decision:
         """See `ExplorationAgent.choose`.
 
         Raises:
@@ -67,12 +69,12 @@ class LearnedExplorer:
         unknown = sorted({o.object_class.name for o in shown} - set(self._numbers))
         if unknown:
             raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
-        if not observation.detections:
+        graph = exploration_graph(shown, observation, tried, self._numbers, failed)
+        if not graph["allowed"].any():
             return Decision(None)
-        graph = exploration_graph(shown, observation, tried, self._numbers)
         moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
         x, y = moves[0].tolist()
-        chances = {o.name: float(picks[0, k]) for k, o in enumerate(shown, start=1) if graph["pick"][k]}
+        chances = {o.name: float(picks[0, k]) for k, o in enumerate(shown, start=1) if graph["allowed"][k].any()}
         return Decision(Move(shown[x - 1].name, shown[y - 1].name if y else TRAY), chances, tuple(o.name for o in shown))
 
 

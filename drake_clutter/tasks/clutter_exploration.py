@@ -28,9 +28,9 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
 
     Observation: see `exploration_graph`, with room for `most_objects`; of K_t (pose and class of what has ever been in view), or,
         if `privileged`, of all objects as they are. Node 0 is the tray. Nodes keep their numbers while an episode lasts.
-    Action: (x, y), nodes: x goes onto y. `pick` and `place` of the observation say what may be named; x onto itself or what may
-        not be named changes nothing.
-    Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`.
+    Action: (x, y), nodes: x goes onto y. `allowed` of the observation says which moves may be made; any other changes nothing.
+    Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`, or when
+        no move is left that has not failed.
     The `info` of a step has the `step` (a `tasks.exploration.Step`) and, when the episode is over, the `end`.
     """
 
@@ -73,8 +73,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             "edge": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
             "glob": box(0, 10, (len(GLOBALS),), np.float32),
-            "pick": box(0, 1, (n,), np.int8),
-            "place": box(0, 1, (n,), np.int8),
+            "allowed": box(0, 1, (n, n), np.int8),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.MultiDiscrete([n, n])
@@ -113,23 +112,27 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         """The observation; or the other one, for a teacher that watches a student."""
         shown = self.task.scene if (self._privileged if privileged is None else privileged) else self.knowledge
         tried = [step.move for step in self.task.steps]
-        return exploration_graph(shown.objects, self.task.look.observation, tried, self.numbers, self._nodes)
+        return exploration_graph(
+            shown.objects, self.task.look.observation, tried, self.numbers, self.task.failed, nodes=self._nodes
+        )
 
     def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out."""
         x, y = (int(v) for v in action)
-        names, in_view = self.objects, {d.name for d in self.task.look.observation.detections}
-        if x == y or not 0 < x <= len(names) or y > len(names) or not {names[x - 1], *names[y - 1 : y]} <= in_view:
-            return self.observe(), 0.0, False, False, {}
+        names, before = self.objects, self.observe()
+        if not before["allowed"][x, y]:
+            return before, 0.0, False, False, {}
         step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
         if step.outcome.result is not MoveResult.COLLAPSED:
             self.knowledge.see(self.task.look.observation)
-        end = self.task.end
+        observation, end = self.observe(), self.task.end
+        if end is None and not observation["allowed"].any():
+            end = EpisodeEnd.GAVE_UP
         over = end in (EpisodeEnd.ALL_FOUND, EpisodeEnd.COLLAPSED)
         info: dict[str, Any] = {"step": step}
         if end is not None:
             info["end"] = end
-        return self.observe(), step.reward, over, end is EpisodeEnd.OUT_OF_MOVES, info
+        return observation, step.reward, over, end is not None and not over, info
 
 
 def node_numbers(classes: list[str]) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import takewhile
 from typing import Protocol
 
 import numpy as np
@@ -116,6 +117,12 @@ class ExplorationTask:
         if len(self.known) == len(self.scene.objects):
             return EpisodeEnd.ALL_FOUND
         return EpisodeEnd.OUT_OF_MOVES if len(self.steps) >= self._max_moves else None
+
+    @property
+    def failed(self) -> tuple[Move, ...]:
+        """Moves that could not be carried out since the scene last changed: nothing is gained by trying them again."""
+        latest = takewhile(lambda step: not step.outcome.result.carried_out, reversed(self.steps))
+        return tuple(step.move for step in latest)
 
     @property
     def found(self) -> tuple[str, ...]:

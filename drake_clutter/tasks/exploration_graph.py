@@ -4,7 +4,7 @@ The same arrays hold the privileged graph of all objects as they are, and the gr
 objects are given. Everything in it follows from their poses and classes, and from what is in view.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,7 @@ def exploration_graph(
     observation: Observation,
     tried: Sequence[Move],
     numbers: Mapping[str, int],
+    failed: Collection[Move] = (),
     nodes: int = 0,
 ) -> GraphObservation:
     """The graph as arrays; node 0 is the tray, node k the k-th object.
@@ -64,16 +65,18 @@ def exploration_graph(
         observation: what is in view; those in view must be among the objects.
         tried: the episode's moves so far.
         numbers: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
+        failed: moves that could not be carried out since the scene last changed.
         nodes: N, that there is room for; 0: as many as there are.
 
     Returns:
         node_kind (N,), 0 is padding; feature (N, `FEATURES`); edge (N (N - 1) / 2, 2) lower and upper; edge_kind, number in
-        `EDGE_KINDS` from 1 on, 0 is padding; glob (`GLOBALS`,); pick (N,) and place (N,), what a move may name.
+        `EDGE_KINDS` from 1 on, 0 is padding; glob (`GLOBALS`,); allowed (N, N), which moves may be made: to pick a row's
+        node and put it onto a column's. It follows from what is in view, and from what has failed.
     """
     count, room = len(objects), nodes or len(objects) + 1
     seen = {detection.name: detection for detection in observation.detections}
     kind, feature = np.zeros(room, np.int8), np.zeros((room, len(FEATURES)), np.float32)
-    pick = np.zeros(room, np.int8)
+    allowed = np.zeros((room, room), np.int8)
     kind[0] = numbers[TRAY]
     edge, edge_kind = np.zeros((room * (room - 1) // 2, 2), np.int16), np.zeros(room * (room - 1) // 2, np.int8)
     if count:
@@ -106,7 +109,6 @@ def exploration_graph(
                 max(0.0, low[k] - floor[k] - _TOUCHING) / _LENGTH,
                 picks / _MANY_PICKS,
             )
-            pick[k + 1] = detection is not None
         # From the lower to the upper; of equally low ones, in an order that does not depend on theirs.
         order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], low))
         a, b = np.triu_indices(count, 1)
@@ -118,8 +120,12 @@ def exploration_graph(
         edge_kind[:pairs] = np.where(rests, 1, np.where(over, 2, np.where(gap < _BESIDE, 3, 4)))
         edge[pairs : pairs + count, 1] = np.arange(1, count + 1)
         edge_kind[pairs : pairs + count] = np.where(low < _TOUCHING, 5, 6)
-    place = pick.copy()
-    place[0] = 1
+        in_view = np.flatnonzero(feature[:, FEATURES.index("in_view")])
+        allowed[in_view[:, None], in_view] = allowed[in_view, 0] = 1
+        np.fill_diagonal(allowed, 0)
+        node = {TRAY: 0} | {o.name: k for k, o in enumerate(objects, start=1)}
+        for move in failed:
+            allowed[node[move.pick], node[move.place]] = 0
     glob = np.array([len(tried) / _MANY_MOVES], np.float32)
     return {
         "node_kind": kind,
@@ -127,8 +133,7 @@ def exploration_graph(
         "edge": edge,
         "edge_kind": edge_kind,
         "glob": glob,
-        "pick": pick,
-        "place": place,
+        "allowed": allowed,
     }
 
 
