@@ -168,6 +168,16 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
         rows = [row for row in moves if row["setup"] == name]
         assert found["moves"] == len(rows) > 0
         assert found["planned"] == sum(row["result"] == PLANNED for row in rows) > 0
+        for group in ("object_class", "rest"):
+            assert found["groups"][group] == {
+                value: {
+                    "moves": sum(row[group] == value for row in rows),
+                    "planned": sum(row[group] == value and row["result"] == PLANNED for row in rows),
+                }
+                for value in {row[group] for row in rows}
+            }
+        for parts in found["groups"].values():
+            assert sum(part["moves"] for part in parts.values()) == len(rows)
     assert {row["scene"] for row in moves} == {"pile"}
     assert len(table(out / "bases.csv")) == 4
     assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {(name, "up") for name in summary["setups"]}

@@ -153,6 +153,8 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
                 "instability": str(instability) if instability else None,
                 "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
+                "picks": dict(step.decision.picks) if step.decision else {},
+                "known": list(step.decision.known) if step.decision else [],
                 "visible_share": step.look.visible_share,
                 "reward": step.reward,
             }

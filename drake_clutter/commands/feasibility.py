@@ -19,7 +19,7 @@ from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.reachability import Reachability, base_scores
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.config import ClutterConfig, LayoutConfig, load_typed
 from drake_clutter.files import InputError, output_directory, write_json, write_text
 from drake_clutter.reports.feasibility_report import write_report
 from drake_clutter.runner import item_rng, map_ordered
@@ -32,7 +32,7 @@ JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
 HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
 """m, of the reachability map."""
 BASE_X, BASE_Y = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(), np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
-"""m, of the bases that are compared; turned so that the tray's other sides are covered, too, by symmetry."""
+"""m, of the bases that are compared, on one side of the tray: the tray is square, so the other sides are like it."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,6 @@ class Worker:
 
     def __init__(self, job: FeasibilityJob) -> None:
         self._job = job
-        self._catalogue = load_catalogue(job.catalogue_folder)
         self._studies: dict[str, FeasibilityStudy] = {}
 
     def __call__(self, part: Part) -> dict[str, Any]:
@@ -304,8 +303,26 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
     write_text(path, text.getvalue())
 
 
+GROUPS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "object_class": lambda row: row["object_class"],
+    "rest": lambda row: row["rest"],
+    "objects_below": lambda row: str(row["below"]),
+    "top_height_cm": lambda row: f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}",
+    "pick_from": lambda row: (
+        _third(row["pick_x"], "near", "middle", "far") + " " + _third(row["pick_y"], "right", "middle", "left")
+    ),
+}
+"""What the moves of a summary are grouped by; near: to the arm."""
+
+
+def _third(place: float, *names: str) -> str:
+    """Of the tray, as wide as it is by default."""
+    third = LayoutConfig().tray_side / 6
+    return names[(place > -third) + (place > third)]
+
+
 def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """By setup: shares, reasons, and what was planned by class, rest and height; and which moves only one of two can do."""
+    """By setup: shares, reasons, what was planned of each of `GROUPS`; and which moves only one of two can do."""
     setups = {}
     for setup in job.setups:
         rows = [row for row in moves if row["setup"] == setup]
@@ -317,6 +334,13 @@ def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Seque
             "planned_share": len(planned) / len(rows) if rows else None,
             "planned_ci95": wilson_interval(len(planned), len(rows)),
             "results": dict(Counter(row["result"] for row in rows).most_common()),
+            "groups": {
+                group: {
+                    value: {"moves": count, "planned": sum(name(row) == value for row in planned)}
+                    for value, count in sorted(Counter(map(name, rows)).items())
+                }
+                for group, name in GROUPS.items()
+            },
             "motion_s_median": float(np.median([row["motion_s"] for row in planned])) if planned else None,
             "planning_s": dict(zip(("p50", "p95", "p99"), quantiles, strict=True)),
             "holds_with_error": {

@@ -18,7 +18,7 @@ from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
 from drake_clutter.reports.recording import episode_frames, write_recording
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.scenes.seams import Instability, Move, MoveResult
-from drake_clutter.tasks.exploration import Step
+from drake_clutter.tasks.exploration import Decision, Step
 
 _TEMPLATE = Path(__file__).with_name("episode_page.html")
 _IMAGES = "images"
@@ -147,6 +147,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
     return (
         f'<article><div class="head"><h3>{number}. {escape(words)}</h3>{badge}</div><p>{" ".join(notes)}</p>'
         f'<div class="pair">{figures}</div>'
+        f"{_beliefs(step.decision, scene, step.newly_found)}"
         f"<h4>Visible share of each object, before &rarr; after (hidden below {threshold:.0%})</h4>"
         f"{_shares(look.visible_share, step.look.visible_share, threshold, step.newly_found)}</article>"
     )
@@ -159,6 +160,24 @@ def _place(scene: Scene, step: Step) -> Pose | None:
     return (
         None if step.move.place == TRAY else Pose(scene[step.move.place].X_TO.translation, scene[step.move.pick].X_TO.quaternion)
     )
+
+
+def _beliefs(decision: Decision | None, scene: Scene, found: Sequence[str]) -> str:
+    """What the agent went by: how likely it was to pick each object, the likeliest first, and what it knew."""
+    if decision is None or not decision.picks:
+        return ""
+    likeliest = sorted(decision.picks.items(), key=lambda item: -item[1])
+    bars = [
+        f'<div class="bar"><span>{escape(humanised(name))}</span>'
+        f'<span class="track"><b style="width:{_percent(chance)}"></b></span><span>{chance:.0%}</span></div>'
+        for name, chance in likeliest
+    ]
+    unlikely = [bar for bar, (_, chance) in zip(bars, likeliest, strict=True) if chance < _NOTICEABLE]
+    html = f'<div class="bars">{"".join(bar for bar in bars if bar not in unlikely)}</div>'
+    if unlikely:
+        html += f'<details><summary>{len(unlikely)} less likely</summary><div class="bars">{"".join(unlikely)}</div></details>'
+    what = f"it knew {len(decision.known)} of {len(scene.objects)} objects, and found {len(found)} more by this move"
+    return f"<h4>The agent's choice of what to pick; {what}</h4>{html}"
 
 
 def _shares(before: Mapping[str, float], after: Mapping[str, float], threshold: float, found: Sequence[str]) -> str:
