@@ -41,7 +41,9 @@ class SettleExecutor:
         X_TO = choose_placement(observation, move, self._config.exploration, rng)
         if X_TO is None:
             return Outcome(MoveResult.NO_FREE_SPOT, scene)
-        settle_config = self._config.settle
+        # What is let go sinks by the height of release; else it would never count as calm.
+        sinks = self._config.settle.calm_displacement + self._config.exploration.release_height
+        settle_config = replace(self._config.settle, calm_displacement=sinks)
         (released,) = jittered([replace(scene[move.pick], X_TO=X_TO)], settle_config.jitter, rng)
         moved = scene.at({move.pick: released.X_TO})
 
