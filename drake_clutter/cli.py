@@ -109,7 +109,7 @@ def generate(
 def explore(
     scene: SceneArgument,
     out: OutOption,
-    agent: ExplorerOption = "student",
+    agent: ExplorerOption = "largest-clear",
     fidelity: FidelityOption = Fidelity.SETTLE,
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,

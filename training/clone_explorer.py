@@ -34,7 +34,7 @@ class CloneExplorer:
         teacher: its checkpoint.
         scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
         seed: same seed, same weights (on the same kind of machine).
-        max_moves: of an episode; most_objects: of a scene.
+        fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
         evaluate_every: rounds; evaluation_episodes: that are then played with the likeliest moves.
         learning, world: see there.
     """
@@ -43,6 +43,7 @@ class CloneExplorer:
     scenes: str = "training/scenes/train_sg_star.json"
     catalogue: str = ""
     seed: int = 0
+    fidelity: str = "equilibrium"
     max_moves: int = 20
     most_objects: int = 24
     evaluate_every: int = 5
@@ -62,7 +63,8 @@ def main(
     one_thread_per_operation()
     chosen = device_of(device)
     scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    environment = ClutterExploration(scenes, max_moves=given.max_moves, most_objects=given.most_objects, config=given.world)
+    room = {"max_moves": given.max_moves, "most_objects": given.most_objects}
+    environment = ClutterExploration(scenes, fidelity=given.fidelity, config=given.world, **room)
     teacher, numbers = load_explorer(load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER)
     if numbers != environment.numbers:
         raise InputError(f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}")

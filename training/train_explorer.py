@@ -32,7 +32,7 @@ class TrainExplorer:
     Attributes:
         scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
         seed: same seed, same weights (on the same kind of machine).
-        max_moves: of an episode; most_objects: of a scene.
+        fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
         evaluate_every: moves; evaluation_episodes: that are then played with the likeliest moves.
         learning, world: see there.
     """
@@ -40,6 +40,7 @@ class TrainExplorer:
     scenes: str = "training/scenes/train_sg_star.json"
     catalogue: str = ""
     seed: int = 0
+    fidelity: str = "equilibrium"
     max_moves: int = 20
     most_objects: int = 24
     evaluate_every: int = 15_000
@@ -58,9 +59,8 @@ def main(
     given = load_typed(TrainExplorer(), config, settings or [])
     one_thread_per_operation()
     scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    environment = ClutterExploration(
-        scenes, privileged=True, max_moves=given.max_moves, most_objects=given.most_objects, config=given.world
-    )
+    room = {"max_moves": given.max_moves, "most_objects": given.most_objects}
+    environment = ClutterExploration(scenes, privileged=True, fidelity=given.fidelity, config=given.world, **room)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
     run = TrainingRun(out, given, learner, given.learning.steps)
     while learner.step < given.learning.steps:

@@ -9,6 +9,7 @@ import numpy as np
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
@@ -63,6 +64,8 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         self._nodes = most_objects + 1
         self.grammar = scenes.grammar
         self.numbers = node_numbers([c.name for c in scenes.classes])
+        if fidelity not in EXECUTORS:
+            raise InputError(f"fidelity: {fidelity!r}; allowed are {', '.join(EXECUTORS)}")
         self._executor = EXECUTORS[fidelity](self._config, follow_falls=False)
         self._detector = DETECTORS[fidelity](self._config.camera)
         self._judge = FastJudge(self._config)

@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_clutter.arm.arm_executor import ArmExecutor
 from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
+from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.perception.label_detector import LabelDetector, Look
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.scene import TRAY, Scene
@@ -25,8 +26,18 @@ class ExecutorMaker(Protocol):
         """`follow_falls`: whether to simulate what a collapse, which ends the episode, does to the whole scene."""
 
 
-EXECUTORS: dict[str, ExecutorMaker] = {"fast": FastOrDrakeExecutor, "settle": SettleExecutor, "arm": ArmExecutor}
-"""How moves are carried out, by the name of the fidelity."""
+def _equilibrium(config: ClutterConfig, *, follow_falls: bool = True) -> MoveExecutor:
+    return FastExecutor(config)
+
+
+EXECUTORS: dict[str, ExecutorMaker] = {
+    "equilibrium": _equilibrium,
+    "fast": FastOrDrakeExecutor,
+    "settle": SettleExecutor,
+    "arm": ArmExecutor,
+}
+"""How moves are carried out, by the name of the fidelity. `equilibrium` is `fast` without Drake: what the fast judge cannot judge
+cannot be done. It is for training, where asking Drake about one move in a hundred would take half the time."""
 
 
 class Detector(Protocol):
@@ -36,7 +47,12 @@ class Detector(Protocol):
         """What the camera shows of a scene."""
 
 
-DETECTORS: dict[str, Callable[[CameraConfig], Detector]] = {"fast": RayDetector, "settle": LabelDetector, "arm": LabelDetector}
+DETECTORS: dict[str, Callable[[CameraConfig], Detector]] = {
+    "equilibrium": RayDetector,
+    "fast": RayDetector,
+    "settle": LabelDetector,
+    "arm": LabelDetector,
+}
 """What tells what is in view, by the name of the fidelity."""
 
 
