@@ -23,7 +23,6 @@ from rich.progress import track
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
 from drake_clutter.arm.attempts import NEAR, REPORTED, PlannerConfig
-from drake_clutter.arm.hold import HexapodHold, JointHold
 from drake_clutter.arm.kinematics import forward_kinematics
 from drake_clutter.arm.paths import Payload, sampled, smooth, timed
 from drake_clutter.arm.plan import NoPlan, Plan
@@ -296,16 +295,16 @@ def holds(
             found = executor.plan(scene, observation, choices[rng.integers(len(choices))], rng)
             if isinstance(found, Plan):
                 plans.append((scene, found))
-        for hold in (JointHold, HexapodHold):
+        for hold, jointed in (("JointHold", True), ("HexapodHold", False)):
             results, walls = list[Carried](), list[float]()
-            for scene, plan in track(plans, f"{kind}, {hold.__name__}", console=console):
+            for scene, plan in track(plans, f"{kind}, {hold}", console=console):
                 begun = time.perf_counter()
-                results.append(ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6, hold=hold).run())
+                results.append(ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6, jointed=jointed).run())
                 walls.append(time.perf_counter() - begun)
             rows.append(
                 {
                     "scenes": kind,
-                    "hold": hold.__name__,
+                    "hold": hold,
                     "moves": count,
                     "results": Counter(judged(c) for c in results),
                     "slip_m": quantiles([c.slip for c in results if not math.isnan(c.slip)]),

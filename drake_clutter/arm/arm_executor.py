@@ -1,7 +1,7 @@
 """Moves by the arm: planned, simulated through the whole trajectory, and judged by what happened."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,9 +12,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
 from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.clutter_station import ClutterStation, Vacuum
-from drake_clutter.arm.hold import HexapodHold, HoldMaker
-from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor
+from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
+from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, Schedule
 from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
@@ -77,8 +76,11 @@ class Carried:
 
 
 def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], set[str]]:
-    """The names of what picking, and of what placing may disturb: the stacks that are taken from, put on, or come close to."""
-    picked = next(o for o in objects if o.name == plan.pick)
+    """The names of what picking, and of what placing may disturb: the stacks that are taken from, put on, or come close to.
+
+    The picked one is among both.
+    """
+    picked = min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - plan.X_TO_pick.p)))
     placed = replace(picked, X_TO=plan.X_TO_place)
     groups = touching_groups(objects, TOUCHING_MARGIN)
 
@@ -86,14 +88,22 @@ def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], 
         close = [g for g in groups if any(o.name != end.name and len(touching_groups([end, o], NEAR)) == 1 for o in g)]
         return {o.name for g in close for o in g}
 
-    return near(picked), near(placed)
+    return near(picked) | {picked.name}, near(placed) | {picked.name}
+
+
+def taking_part(schedule: Schedule, beside_pick: Set[str], beside_place: Set[str], time: float) -> set[str]:
+    """The names of what may move at a time since a plan was begun, s; see `disturbed_by`."""
+    on, off = schedule.suction_on - AHEAD, schedule.suction_off - AHEAD
+    wanted = set[str]()
+    if on <= time <= schedule.suction_on + DWELL + LIFTED:
+        wanted |= beside_pick
+    if off <= time <= schedule.suction_off + DWELL + LIFTED:
+        wanted |= beside_place
+    return wanted
 
 
 class ArmSimulation:
     """One plan among objects, in Drake. What takes no part at a time is locked then."""
-
-    AT_REST = 0.002
-    """m/s."""
 
     def __init__(
         self,
@@ -103,9 +113,9 @@ class ArmSimulation:
         *,
         camera_altitude: float,
         time_step: float = 0.005,
-        hold: HoldMaker = HexapodHold,
+        jointed: bool = False,
     ) -> None:
-        """Builds the diagram."""
+        """Builds the diagram; `jointed`: the cup holds by a joint, see `JointHold`."""
         self.config, self._objects, self._plan, self._time_step = config, scene.objects, plan, time_step
         builder = DiagramBuilder()
         classes = [(o.name, o.object_class) for o in scene.objects]
@@ -113,11 +123,10 @@ class ArmSimulation:
             ClutterStation(
                 config,
                 classes,
-                plan.pick,
                 tray_side=scene.tray_side,
                 camera_altitude=camera_altitude,
                 time_step=time_step,
-                hold=hold,
+                jointed=plan.pick if jointed else "",
             )
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=config)
@@ -140,28 +149,15 @@ class ArmSimulation:
         station.set_scene(root, np.array(self.config.home), self._objects)
         self.simulator.set_monitor(self.vacuum)
         beside_pick, beside_place = disturbed_by(self._objects, self._plan)
-        motion, tracking, free = list[Frame](), 0.0, set[str]()
-        station.lock_all_but(root, free)
+        motion, tracking, freedom = list[Frame](), 0.0, Freedom(station, self.vacuum)
+        freedom.begin(root)
         self.simulator.Initialize()
         schedule = self.executor.schedule(self.executor.GetMyContextFromRoot(root))
         assert schedule is not None, "the executor begins with the plan that it is given"
         for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
             time = root.get_time()
-            wanted = set[str]()
-            if schedule.suction_on - AHEAD <= time <= schedule.suction_off + DWELL + LIFTED:
-                wanted |= {self._plan.pick}
-            if schedule.suction_on - AHEAD <= time <= schedule.suction_on + DWELL + LIFTED:
-                wanted |= beside_pick
-            if schedule.suction_off - AHEAD <= time <= schedule.suction_off + DWELL + LIFTED:
-                wanted |= beside_place
-            # What still moves stays free.
-            speeds = station.scene.speeds(context)
-            wanted |= {name for name in free if speeds[name] > self.AT_REST}
-            if not math.isnan(self.vacuum.dropped) or not (self.vacuum.sealed or time < schedule.suction_on + LOOK):
-                wanted = set(speeds)  # what falls may hit anything
-            if wanted != free:
-                station.lock_all_but(root, wanted)
-                free = wanted
+            wanted = taking_part(schedule, beside_pick, beside_place, time)
+            freedom.update(root, wanted, must_hold=time >= schedule.suction_on + LOOK)
             self.simulator.AdvanceTo(k * LOOK + self._time_step / 2)
             now = desired.Eval(self.executor.GetMyContextFromRoot(root))[:6]
             tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))

@@ -14,10 +14,10 @@ from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
-from drake_clutter.arm.hold import HexapodHold, HoldMaker, JointHold
+from drake_clutter.arm.hold import HexapodHold, Hold, JointHold
 from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.station import ArmConfig, add_arm, joint_numbers
-from drake_clutter.arm.suction import load_share, unevenness
+from drake_clutter.arm.suction import load_share, surface_under_lip, unevenness
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import ArmState
@@ -27,39 +27,50 @@ Floats = NDArray[np.float64]
 
 LETS_GO_AFTER = 0.02
 """s of overload: the time in which air gets in."""
+SUCKED_FROM = 0.005
+"""m between lip and surface, at most, for the vacuum to take hold."""
 STIFFNESS, DAMPING = 1e5, 2e3
 """N m/rad and N m s/rad of the joints' position control, as stiff as an industrial arm's."""
 
 
 class ClutterStation(Diagram):
-    """The arm among objects, of which one can be picked.
+    """The arm among objects.
 
     Input ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m.
-    Output ports: state, of the whole plant; query, of the geometry.
+    Output ports: state, of the whole plant; body_poses, of all its bodies; query, of the geometry.
     """
 
     def __init__(
         self,
         config: ArmConfig,
         objects: Sequence[tuple[str, ObjectClass]],
-        pick: str,
         *,
         tray_side: float,
         camera_altitude: float,
         time_step: float,
-        hold: HoldMaker = HexapodHold,
+        jointed: str = "",
+        visuals: bool = False,
     ) -> None:
-        """Builds it; objects are (name, class), `pick` the name of the one that the cup can take; `hold` how."""
+        """Builds it.
+
+        Args:
+            config: the arm.
+            objects: name and class of each.
+            tray_side, camera_altitude: m.
+            time_step: s.
+            jointed: the name of the one object that the cup can take, by a `JointHold`; none: it takes any, by a `HexapodHold`.
+            visuals: whether cameras are to see it.
+        """
         super().__init__()
-        self.config, self.pick, self.classes, self.time_step = config, pick, dict(objects), time_step
+        self.config, self.classes, self.time_step = config, dict(objects), time_step
+        self._jointed = jointed
         builder = DiagramBuilder()
-        jointed = pick if hold is JointHold else ""
-        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=False, jointed=jointed)
+        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=visuals, jointed=jointed)
         self.plant = plant = self.scene.plant
         self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True)
         for name in JOINTS:
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
-        self.hold = hold(plant, self.arm, self.scene.bodies[pick])
+        self.hold: Hold = JointHold(plant, self.arm, self.scene.bodies[jointed]) if jointed else HexapodHold(plant, self.arm)
         plant.Finalize()
         bodies = self.scene.bodies.items()
         lockable = [(n, b) for n, b in bodies if n != jointed]
@@ -70,8 +81,14 @@ class ClutterStation(Diagram):
         for name, port in ports:
             builder.ExportInput(port(self.arm.robot), name)
         builder.ExportOutput(plant.get_state_output_port(), "state")
+        builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self.scene.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
+
+    @property
+    def takeable(self) -> tuple[str, ...]:
+        """The objects that the cup can take."""
+        return (self._jointed,) if self._jointed else tuple(self.classes)
 
     def plant_context(self, root: Context) -> Context:
         """Of the plant, in the context of the diagram that holds the station."""
@@ -86,7 +103,7 @@ class ClutterStation(Diagram):
         self.plant.SetVelocities(context, np.zeros(self.plant.num_velocities()))
         self.hold.reset(context)
         for o in objects:
-            if o.name == self.pick and isinstance(self.hold, JointHold):
+            if isinstance(self.hold, JointHold) and o.name == self._jointed:
                 self.hold.put(context, rigid_transform(o.X_TO))
             else:
                 self.plant.SetFreeBodyPose(context, self.scene.bodies[o.name], rigid_transform(o.X_TO))
@@ -139,51 +156,97 @@ class Vacuum:
     Attributes:
         station: whose cup.
         wanted: says, of the root context, whether the vacuum is to be on.
-        held: whether the object hangs on the cup; sealed: whether it ever did; dropped: when it came off by its load, s.
-        largest_share: of what the cup can bear, so far.
-        overloaded: steps in a row.
+        held: the name of the object that hangs on the cup, or "".
+        sealed: whether one did since the vacuum was last switched on; dropped: when it came off by its load since then, s.
+        largest_share: of what the cup can bear, since then.
         slip: m, between cup and object from when it was taken to when it was let go.
     """
 
     station: ClutterStation
     wanted: Callable[[Context], bool]
-    held: bool = False
+    held: str = ""
     sealed: bool = False
     dropped: float = math.nan
     largest_share: float = 0.0
-    overloaded: int = 0
     slip: float = math.nan
+    _on: bool = False
+    _overloaded: int = 0  # steps in a row
 
     def __call__(self, root: Context) -> EventStatus:
         """The monitor."""
         station = self.station
         context = station.plant_context(root)
         wanted = self.wanted(root)
+        if wanted and not self._on:
+            self.sealed, self.dropped, self.largest_share, self.slip, self._overloaded = False, math.nan, 0.0, math.nan, 0
+        self._on = wanted
         if wanted and not self.held and math.isnan(self.dropped):
-            X_OG = self._grasp(context)
-            config = station.config.suction
-            if unevenness(station.classes[station.pick], X_OG, config.cup_diameter) <= config.unevenness:
-                station.hold.attach(context)
-                self._X_OG = X_OG
-                self.held = self.sealed = True
+            self._take(context)
         elif self.held and not wanted:
             self._release(context)
         elif self.held:
             share = float(load_share(*station.hold.load(context), station.config.suction))
             self.largest_share = max(self.largest_share, share)
-            self.overloaded = self.overloaded + 1 if share > 1 else 0
-            if self.overloaded * station.time_step > LETS_GO_AFTER:
+            self._overloaded = self._overloaded + 1 if share > 1 else 0
+            if self._overloaded * station.time_step > LETS_GO_AFTER:
                 self.dropped = root.get_time()
                 self._release(context)
         return EventStatus.DidNothing()
 
-    def _grasp(self, context: Context) -> Floats:
+    def _grasp(self, context: Context, name: str) -> Floats:
         """X_OG, (4, 4)."""
         X_TG = self.station.arm.cup.CalcPoseInWorld(context)
-        X_TO = self.station.scene.bodies[self.station.pick].EvalPoseInWorld(context)
+        X_TO = self.station.scene.bodies[name].EvalPoseInWorld(context)
         return np.asarray((X_TO.inverse() @ X_TG).GetAsMatrix4())
 
+    def _take(self, context: Context) -> None:
+        """Takes the object that is first under the lip, if it is close enough and the lip seals on it."""
+        station, suction = self.station, self.station.config.suction
+        grasps = {name: self._grasp(context, name) for name in station.takeable}
+        below = {n: surface_under_lip(station.classes[n], X_OG, suction.cup_diameter).min() for n, X_OG in grasps.items()}
+        first = min(below, key=lambda name: below[name])
+        uneven = unevenness(station.classes[first], grasps[first], suction.cup_diameter)
+        if below[first] <= SUCKED_FROM and uneven <= suction.unevenness:
+            station.hold.attach(context, station.scene.bodies[first])
+            self.held, self.sealed, self._X_OG = first, True, grasps[first]
+
     def _release(self, context: Context) -> None:
-        self.slip = float(np.linalg.norm(self._grasp(context)[:3, 3] - self._X_OG[:3, 3]))
+        self.slip = float(np.linalg.norm(self._grasp(context, self.held)[:3, 3] - self._X_OG[:3, 3]))
         self.station.hold.release(context)
-        self.held = False
+        self.held = ""
+
+
+class Freedom:
+    """Which objects may move, look by look: the others are locked, which makes the simulation ten times cheaper.
+
+    Attributes:
+        free: names of those that may.
+    """
+
+    AT_REST = 0.002
+    """m/s."""
+
+    def __init__(self, station: ClutterStation, vacuum: Vacuum) -> None:
+        self._station, self._vacuum = station, vacuum
+        self.free = set[str]()
+
+    def begin(self, root: Context) -> None:
+        """Locks all."""
+        self._station.lock_all_but(root, self.free)
+
+    def update(self, root: Context, wanted: Set[str], *, must_hold: bool) -> None:
+        """Frees what is wanted, what is held, and what still moves.
+
+        Args:
+            root: of the simulation.
+            wanted: names.
+            must_hold: whether the cup is holding something, if all went well; if it does not, what falls may hit anything.
+        """
+        speeds = self._station.scene.speeds(self._station.plant_context(root))
+        moving = {name for name in self.free if speeds[name] > self.AT_REST}
+        lost = not math.isnan(self._vacuum.dropped) or (must_hold and not self._vacuum.sealed)
+        held = {self._vacuum.held} - {""}
+        free = set(speeds) if lost else {*wanted, *moving, *held}
+        if free != self.free:
+            self._station.lock_all_but(root, free)
+            self.free = free

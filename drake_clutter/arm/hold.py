@@ -5,7 +5,6 @@ a Stewart platform, whose feet are set when it is switched on. docs/arm.md compa
 """
 
 import math
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -22,13 +21,13 @@ Floats = NDArray[np.float64]
 
 
 class Hold(Protocol):
-    """Fixes one object, `body`, to the cup of an arm, or does not; made before the plant is finalized."""
+    """Fixes an object to the cup of an arm, or does not; made before the plant is finalized."""
 
     def reset(self, context: Context) -> None:
         """To be called once on every new context of the plant: nothing is held."""
 
-    def attach(self, context: Context) -> None:
-        """Holds the object where it is."""
+    def attach(self, context: Context, body: RigidBody) -> None:
+        """Holds an object where it is."""
 
     def release(self, context: Context) -> None:
         """Lets it go."""
@@ -47,7 +46,7 @@ def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Flo
 
 
 class JointHold:
-    """A floating joint between cup and object, locked while it holds; it takes the place of the object's joint to the world."""
+    """A floating joint between cup and one object, locked while it holds; it replaces the object's joint to the world."""
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
         self._plant, self._arm = plant, arm
@@ -61,8 +60,8 @@ class JointHold:
         """Puts the object at a pose."""
         self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
 
-    def attach(self, context: Context) -> None:
-        """See `Hold`."""
+    def attach(self, context: Context, body: RigidBody) -> None:
+        """See `Hold`; it is the one object that it was made for."""
         velocities, start = self._plant.GetVelocities(context), self._joint.velocity_start()
         velocities[start : start + 6] = 0.0
         self._plant.SetVelocities(context, velocities)
@@ -88,22 +87,24 @@ _LEGS = [(_UPPER[k], _LOWER[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
 
 
 class HexapodHold:
-    """Six distance constraints between cup and object, from points above the lip to points around it."""
+    """Six distance constraints between cup and object, from points above the lip to points around it; one set for all objects."""
 
-    def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
-        self._plant, self._arm, self._body = plant, arm, body
+    def __init__(self, plant: MultibodyPlant, arm: Arm) -> None:
+        self._plant, self._arm = plant, arm
         self._cup = plant.GetBodyByName("cup", arm.tool)
-        self._legs = [plant.AddDistanceConstraint(self._cup, top, body, foot, 1.0) for top, foot in _LEGS]
+        # Between whatever bodies there are, as long as nothing is held.
+        other = plant.GetBodyByName("body", arm.tool)
+        self._legs = [plant.AddDistanceConstraint(self._cup, top, other, foot, 1.0) for top, foot in _LEGS]
 
     def reset(self, context: Context) -> None:
         """See `Hold`."""
         self.release(context)
 
-    def attach(self, context: Context) -> None:
+    def attach(self, context: Context, body: RigidBody) -> None:
         """See `Hold`."""
-        X_OG = self._body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
+        X_OG = body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
         for leg, (top, foot) in zip(self._legs, _LEGS, strict=True):
-            ends = self._cup.index(), top, self._body.index(), X_OG @ foot
+            ends = self._cup.index(), top, body.index(), X_OG @ foot
             params = DistanceConstraintParams(*ends, float(np.linalg.norm(top - foot)), _LEG_STIFFNESS, _LEG_DAMPING)
             self._plant.SetDistanceConstraintParams(context, leg, params)
             self._plant.SetConstraintActiveStatus(context, leg, True)
@@ -116,6 +117,3 @@ class HexapodHold:
     def load(self, context: Context) -> tuple[Floats, Floats]:
         """See `Hold`."""
         return _load_of_cup(self._plant, self._arm, context)
-
-
-HoldMaker = Callable[[MultibodyPlant, Arm, RigidBody], Hold]

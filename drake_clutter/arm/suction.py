@@ -75,10 +75,8 @@ def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
     return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
 
 
-def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
-    """How far, in m, the surface under the lip leaves a plane across the cup; infinite if the lip is partly in the air.
-
-    Tilt, curvature, edges and gaps all show as this one number.
+def surface_under_lip(object_class: ObjectClass, X_OG: Floats, diameter: float) -> Floats:
+    """How far below the lip an object's surface is, along the cup's axis, at points around the lip, m; infinite in the air.
 
     Args:
         object_class: what the cup is on.
@@ -98,6 +96,15 @@ def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> floa
         leaves = np.where(steep > 1e-9, crossing, np.inf).min(axis=1)
         beside = (outside[:, np.abs(steep) <= 1e-9] > 0).any(axis=1)
         depth = np.where((enters <= leaves) & ~beside, np.minimum(depth, enters), depth)
+    return depth - _STANDOFF
+
+
+def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
+    """How far, in m, the surface under the lip leaves a plane across the cup; infinite if the lip is partly in the air.
+
+    Tilt, curvature, edges and gaps all show as this one number. Arguments: see `surface_under_lip`.
+    """
+    depth = surface_under_lip(object_class, X_OG, diameter)
     return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
 
 
