@@ -247,23 +247,34 @@ def solve(
 
 
 @app.command()
+def run(
+    scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of Scenario.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    out: OutOption = Path("out/run"),
+    as_json: JsonOption = False,
+) -> None:
+    """Play the closed loop: camera images in, arm motion out, until nothing is hidden; writes episode.json and a page."""
+    from drake_clutter.commands import run as command
+    from drake_clutter.config import load_typed
+    from drake_clutter.systems.scenario import Scenario
+
+    given = load_typed(Scenario(), scenario, settings or [])
+    output_directory(out)
+    _print_episode(command.run(given, out, _report), as_json, out)
+
+
+@app.command()
 def demo(
     out: OutOption,
     seed: SeedOption = 0,
     nodes: NodesOption = 25,
     as_json: JsonOption = False,
 ) -> None:
-    """Generate random scenes and search them until everything hidden in one is found; write a page to watch."""
-    from drake_clutter.commands import explore as command
-    from drake_clutter.config import ClutterConfig
-    from drake_clutter.scenes.scene_file import save_scene
+    """SG* makes a scene, and the arm searches it until everything is found; write a page to watch."""
+    from drake_clutter.commands import run as command
 
     output_directory(out)
-    agent = "largest-clear"
-    made, task, tried = command.demo(seed, nodes, ClutterConfig(), agent, _report)
-    save_scene(out / "scene.yaml", made.scene, made.verdict)
-    title = f"A random scene of {nodes} nodes, explored"
-    _print_episode(command.write_episode(out, task, title, agent, Fidelity.SETTLE.value, seed, scenes_tried=tried), as_json, out)
+    _print_episode(command.demo(seed, nodes, out, _report), as_json, out)
 
 
 @app.command()

@@ -65,7 +65,13 @@ class LearnedExplorer:
             InputError: an object of a class that the agent has not learned.
         """
         self._knowledge.see(observation)
-        shown: Sequence[SceneObject] = self._knowledge.objects if self._task is None else self._task.scene.objects
+        shown = self._knowledge.objects if self._task is None else self._task.scene.objects
+        return self.decide(shown, observation, tried, failed)
+
+    def decide(
+        self, shown: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], failed: Collection[Move]
+    ) -> Decision:
+        """The same for given objects: what is remembered is the caller's business."""
         unknown = sorted({o.object_class.name for o in shown} - set(self._numbers))
         if unknown:
             raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
@@ -79,7 +85,11 @@ class LearnedExplorer:
 
 
 class LearnedExplorers:
-    """Makes a `LearnedExplorer` for each episode."""
+    """Makes a `LearnedExplorer` for each episode.
+
+    Attributes:
+        privileged: whether it knows everything.
+    """
 
     def __init__(self, path: Path) -> None:
         """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
@@ -90,8 +100,12 @@ class LearnedExplorers:
         self._path = path
         checkpoint = load_checkpoint(path)
         self._network, self._numbers = load_explorer(checkpoint, path)
-        self._privileged = checkpoint.about["kind"] == TEACHER
+        self.privileged = checkpoint.about["kind"] == TEACHER
 
     def __call__(self, task: ExplorationTask) -> LearnedExplorer:
         """For an episode."""
-        return LearnedExplorer(self._network, self._numbers, self._path, task if self._privileged else None)
+        return LearnedExplorer(self._network, self._numbers, self._path, task if self.privileged else None)
+
+    def student(self) -> LearnedExplorer:
+        """One that knows what it is shown."""
+        return LearnedExplorer(self._network, self._numbers, self._path)

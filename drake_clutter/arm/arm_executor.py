@@ -75,12 +75,17 @@ class Carried:
         return f"{1000 * self.place_error:.1f} mm and {math.degrees(self.turn_error):.1f} deg from where it was to be"
 
 
+def nearest(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
+    """The object whose origin is nearest to that of a pose: what is really there, whatever the planner takes it for."""
+    return min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - X_TO.p)))
+
+
 def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], set[str]]:
     """The names of what picking, and of what placing may disturb: the stacks that are taken from, put on, or come close to.
 
     The picked one is among both.
     """
-    picked = min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - plan.X_TO_pick.p)))
+    picked = nearest(objects, plan.X_TO_pick)
     placed = replace(picked, X_TO=plan.X_TO_place)
     groups = touching_groups(objects, TOUCHING_MARGIN)
 
@@ -152,7 +157,7 @@ class ArmSimulation:
         motion, tracking, freedom = list[Frame](), 0.0, Freedom(station, self.vacuum)
         freedom.begin(root)
         self.simulator.Initialize()
-        schedule = self.executor.schedule(self.executor.GetMyContextFromRoot(root))
+        schedule = self.executor.running(self.executor.GetMyContextFromRoot(root)).schedule
         assert schedule is not None, "the executor begins with the plan that it is given"
         for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
             time = root.get_time()

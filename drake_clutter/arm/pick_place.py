@@ -78,14 +78,20 @@ def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
 
 
 @dataclass(frozen=True)
-class _Running:
-    """What is being carried out: the plan, its schedule, and when it began, s."""
+class Running:
+    """What is being carried out, or was last.
+
+    Attributes:
+        plan, schedule: of it; None before the first.
+        begun: s. count: of the plans begun so far.
+    """
 
     plan: Plan | None = None
     schedule: Schedule | None = None
     begun: float = 0.0
+    count: int = 0
 
-    def __deepcopy__(self, memo: object) -> "_Running":
+    def __deepcopy__(self, memo: object) -> "Running":
         """Itself, as of `Plan`."""
         return self
 
@@ -94,7 +100,8 @@ class PickPlaceExecutor(LeafSystem):
     """Runs one plan after the other.
 
     Input port: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended.
-    Output ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m; suction (1,), 1 for on; status, abstract, the phase.
+    Output ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m; suction (1,), 1 for on; status, abstract, the phase;
+        finished (1,), how many plans have ended.
     """
 
     def __init__(self, *, config: ArmConfig) -> None:
@@ -102,13 +109,15 @@ class PickPlaceExecutor(LeafSystem):
         super().__init__()
         self._config = config
         self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(_Running()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(Running()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
-        self.DeclareVectorOutputPort("desired_state", 12, self._calc_desired_state)
-        self.DeclareVectorOutputPort("feed_forward", 6, self._calc_feed_forward)
-        self.DeclareVectorOutputPort("suction", 1, self._calc_suction)
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status)
+        of = {self.all_state_ticket(), self.time_ticket()}
+        self.DeclareVectorOutputPort("desired_state", 12, self._calc_desired_state, of)
+        self.DeclareVectorOutputPort("feed_forward", 6, self._calc_feed_forward, of)
+        self.DeclareVectorOutputPort("suction", 1, self._calc_suction, of)
+        self.DeclareVectorOutputPort("finished", 1, self._calc_finished, of)
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status, of)
 
     @staticmethod
     def AddToBuilder(builder: DiagramBuilder, *, config: ArmConfig) -> "PickPlaceExecutor":
@@ -118,21 +127,21 @@ class PickPlaceExecutor(LeafSystem):
         return system
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        running: _Running = context.get_abstract_state(self._state).get_value()
+        running = self.running(context)
         plan = self._plan_port.Eval(context) if self._plan_port.HasValue(context) else None
         over = running.schedule is None or context.get_time() >= running.begun + running.schedule.end
         if plan is not None and plan is not running.plan and over:
-            begun = _Running(plan, scheduled(plan, self._config), context.get_time())
+            begun = Running(plan, scheduled(plan, self._config), context.get_time(), running.count + 1)
             state.get_mutable_abstract_state(int(self._state)).set_value(begun)
         return EventStatus.Succeeded()
 
-    def schedule(self, context: Context) -> Schedule | None:
-        """Of the plan that is being carried out, or was last."""
-        running: _Running = context.get_abstract_state(self._state).get_value()
-        return running.schedule
+    def running(self, context: Context) -> Running:
+        """What is being carried out, or was last."""
+        running: Running = context.get_abstract_state(self._state).get_value()
+        return running
 
     def _now(self, context: Context) -> tuple[Schedule | None, float]:
-        running: _Running = context.get_abstract_state(self._state).get_value()
+        running = self.running(context)
         if running.schedule is None:
             return None, 0.0
         return running.schedule, min(context.get_time() - running.begun, running.schedule.end)
@@ -153,6 +162,11 @@ class PickPlaceExecutor(LeafSystem):
     def _calc_suction(self, context: Context, output: BasicVector) -> None:
         schedule, time = self._now(context)
         output.SetFromVector([float(schedule is not None and schedule.suction_on <= time < schedule.suction_off)])
+
+    def _calc_finished(self, context: Context, output: BasicVector) -> None:
+        schedule, time = self._now(context)
+        ended = schedule is not None and time >= schedule.end
+        output.SetFromVector([self.running(context).count - (schedule is not None and not ended)])
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         schedule, time = self._now(context)

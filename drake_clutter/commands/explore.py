@@ -1,4 +1,4 @@
-"""`drake-clutter explore`, `move`, `demo`: moves in a scene, with `episode.json` and a page to watch."""
+"""`drake-clutter explore`, `move`: moves in a scene, with `episode.json` and a page to watch."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import Any
 import yaml
 
 from drake_clutter.agents.exploration import make_explorers, play
-from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator
 from drake_clutter.arm.arm_executor import ArmExecutor
 from drake_clutter.arm.plan import plan_fields
 from drake_clutter.arm.station import ArmConfig
@@ -24,9 +23,6 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
 
 Report = Callable[[Step], None]
-
-DEMO_TRIES = 10
-"""Scenes that the demo explores at most."""
 
 
 def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
@@ -175,38 +171,18 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
 
 
 def write_episode(
-    out: Path, task: ExplorationTask, title: str, agent: str, fidelity: str, seed: int, **more: int
+    out: Path, task: ExplorationTask, title: str, agent: str, fidelity: str, seed: int, *, arm: ArmConfig | None = None
 ) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
 
     At fidelity `arm` also `trajectory.h5`, see `arm/trajectory_file.py`.
     """
-    fields = {**more, **episode_fields(task, agent, fidelity, seed)}
+    fields = episode_fields(task, agent, fidelity, seed)
     save_scene(out / "after.yaml", task.scene)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
     if fidelity == "arm":
-        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], ArmConfig())
+        write_trajectories(
+            out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], arm or ArmConfig()
+        )
     write_json(out / "episode.json", fields)
     return fields
-
-
-def demo(
-    seed: int, nodes: int, config: ClutterConfig, agent_name: str, report: Report
-) -> tuple[GeneratedScene, ExplorationTask, int]:
-    """Random scenes of a seed that hide at least two objects, explored one after the other until everything is found in one.
-
-    Returns:
-        The last scene, its episode, and how many scenes were explored.
-    """
-    generate = SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
-    tried = index = 0
-    while True:
-        made = generate(index)
-        index += 1
-        if len(made.verdict.hidden) < 2:
-            continue
-        tried += 1
-        start = made.scene.at(made.verdict.settled)
-        task = explore(start, agent_name, "settle", config.exploration.max_moves, seed, config, report)
-        if task.end is EpisodeEnd.ALL_FOUND or tried == DEMO_TRIES:
-            return made, task, tried

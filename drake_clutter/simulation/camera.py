@@ -28,9 +28,9 @@ from drake_clutter.config import CameraConfig
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
 
-_RENDERER = "vtk"
+RENDERER = "vtk"
 # Two lamps beside the camera; the second keeps what turns away from the first from going black.
-_ENGINE = RenderEngineVtkParams(
+ENGINE = RenderEngineVtkParams(
     backend="EGL",
     lights=[
         LightParameter(type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4),
@@ -55,6 +55,31 @@ class Images:
     label: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class Intrinsics:
+    """The overhead camera for Drake: what it renders with, and where it is.
+
+    Attributes:
+        color, depth, label: cameras.
+        X_TC: its pose; C: z down along the optical axis, x along the tray's x.
+    """
+
+    color: ColorRenderCamera
+    depth: DepthRenderCamera
+    label: ColorRenderCamera
+    X_TC: RigidTransform
+
+    @staticmethod
+    def of(config: CameraConfig) -> "Intrinsics":
+        """Of a config."""
+        info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
+        anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
+        over_tray = RenderCameraCore(RENDERER, info, _clipping_over_tray(config.altitude), RigidTransform())
+        X_TC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.0, 0.0, config.altitude])
+        depth = DepthRenderCamera(anywhere, DepthRange(0.1, 10.0))
+        return Intrinsics(ColorRenderCamera(anywhere, False), depth, ColorRenderCamera(over_tray, False), X_TC)
+
+
 def _clipping_over_tray(altitude: float) -> ClippingRange:
     """Tight about whatever stands on the tray.
 
@@ -70,19 +95,14 @@ class OverheadCamera:
     Camera frame C: origin at the config's altitude over the tray's centre, z down along the optical axis, x along the tray's x.
     """
 
-    def __init__(self, config: CameraConfig, engine: RenderEngineVtkParams = _ENGINE) -> None:
+    def __init__(self, config: CameraConfig, engine: RenderEngineVtkParams = ENGINE) -> None:
         """Makes a camera; `engine` sets light, background and shadows."""
         self.config = config
         self._engine = engine
         self._counts: Counter[ObjectClass] = Counter()
         self._tray_side = 0.0
-        info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
-        anywhere = RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
-        over_tray = RenderCameraCore(_RENDERER, info, _clipping_over_tray(config.altitude), RigidTransform())
-        self._color_camera = ColorRenderCamera(anywhere, False)
-        self._depth_camera = DepthRenderCamera(anywhere, DepthRange(0.1, 10.0))
-        self._label_camera = ColorRenderCamera(over_tray, False)
-        self._X_TC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.0, 0.0, config.altitude])
+        eye = Intrinsics.of(config)
+        self._color_camera, self._depth_camera, self._label_camera, self._X_TC = eye.color, eye.depth, eye.label, eye.X_TC
         # Behind the camera.
         self._X_T_parked = RigidTransform([0.0, 0.0, config.altitude + 5.0])
 
@@ -91,7 +111,7 @@ class OverheadCamera:
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, tray_side, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
-        self._scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(self._engine))
+        self._scene_plant.scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(self._engine))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._counts, self._tray_side = counts, tray_side

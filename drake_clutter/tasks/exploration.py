@@ -157,7 +157,10 @@ class ExplorationTask:
             raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
         if move.place == move.pick:
             raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
-        outcome = self._executor.execute(self.scene, self.look.observation, move, rng)
+        return self.note(move, self._executor.execute(self.scene, self.look.observation, move, rng), decision)
+
+    def note(self, move: Move, outcome: Outcome, decision: Decision | None = None) -> Step:
+        """Takes in what a move has led to, and looks."""
         collapsed = outcome.result is MoveResult.COLLAPSED
         self.scene = outcome.scene
         if outcome.result.carried_out:

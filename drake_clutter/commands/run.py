@@ -1,0 +1,75 @@
+"""`drake-clutter run` and `demo`: the closed loop, from images to the arm's motion, with a page to watch."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.commands.explore import Report, at_rest, write_episode
+from drake_clutter.config import config_yaml
+from drake_clutter.files import InputError, write_json, write_text
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_file import load_scene, save_scene
+from drake_clutter.systems.closed_loop import ClosedLoop, Timing
+from drake_clutter.systems.scenario import Scenario, policy_of
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+
+DEMO_TRIES = 5
+"""Scenes that the demo explores at most."""
+SCENE_TRIES = 50
+"""Scenes that a generator may make until one is stable and hides something."""
+
+
+def scene_of(scenario: Scenario, first: int = 0) -> tuple[Scene, int]:
+    """The scenario's scene at rest, and the index under which the generator made it; from `first` on.
+
+    Raises:
+        InputError: a scene file that cannot be used, or a generator that makes no stable scene that hides something.
+    """
+    if scenario.scene:
+        file = load_scene(Path(scenario.scene), load_catalogue())
+        return (file.settled_scene if file.verdict else at_rest(file.scene, scenario.world, scenario.seed)), 0
+    job = GenerationJob(scenario.generator, scenario.objects, None, scenario.nodes, scenario.seed, scenario.world)
+    generate = SceneGenerator(job)
+    for index in range(first, first + SCENE_TRIES):
+        made = generate(index)
+        if made.verdict.hidden:
+            return made.scene.at(made.verdict.settled), index
+    raise InputError(f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable and hides something")
+
+
+def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
+    """Plays a scenario on a scene at rest."""
+    choose, options = policy_of(scenario.agent, scenario.world), {"max_moves": scenario.max_moves, "seed": scenario.seed}
+    loop = ClosedLoop(scene, choose, world=scenario.world, arm=scenario.arm, **options)
+    timing = loop.run(report, record=True)
+    return loop.task, timing
+
+
+def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int) -> dict[str, Any]:
+    """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
+    write_text(out / "scenario.yaml", config_yaml(scenario))
+    save_scene(out / "scene.yaml", task.start)
+    fields = write_episode(out, task, title, scenario.agent, "arm", scenario.seed, arm=scenario.arm)
+    fields |= {"ended": timing.end or fields["ended"], "timing": asdict(timing), **more}
+    write_json(out / "episode.json", fields)
+    return fields
+
+
+def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
+    """Plays a scenario; see `write`."""
+    scene, _ = scene_of(scenario)
+    task, timing = play(scenario, scene, report)
+    return write(out, scenario, task, timing, f"{scenario.agent} and the arm search {Path(scenario.scene).name or 'a scene'}")
+
+
+def demo(seed: int, nodes: int, out: Path, report: Report) -> dict[str, Any]:
+    """SG* makes scenes, and the arm searches them with the student, until everything is found in one; see `write`."""
+    scenario, index = Scenario(nodes=nodes, seed=seed), -1
+    for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
+        scene, index = scene_of(scenario, index + 1)
+        task, timing = play(scenario, scene, report)
+        if task.end is EpisodeEnd.ALL_FOUND:
+            break
+    return write(out, scenario, task, timing, f"SG* hides, the arm searches: seed {seed}, scene {index}", scenes_tried=tried)

@@ -1,0 +1,218 @@
+"""The closed loop: station, camera, perception, agent, planner and executor in one Diagram, and a referee who knows the truth."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import MakeRenderEngineVtk
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.sensors import RgbdSensor
+
+from drake_clutter.arm.arm_executor import LOOK, disturbed_by, nearest, taking_part, worst_fall
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
+from drake_clutter.arm.pick_place import PickPlaceExecutor
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Scene, SceneObject
+from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
+from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
+from drake_clutter.simulation.plant import pose_of
+from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
+from drake_clutter.systems.move_planner import Answer, MovePlanner
+from drake_clutter.systems.scene_perception import ScenePerception
+from drake_clutter.tasks.exploration import ExplorationTask, Step
+
+TIME_STEP = 0.005
+"""s, of the simulation."""
+PATIENCE = 1.0
+"""s, after a plan's end, for which what has fallen is followed."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long an episode took.
+
+    Attributes:
+        robot: s simulated. wall: s.
+        planning: s, of all plans.
+        end: why the agent ended by itself, or "".
+    """
+
+    robot: float
+    wall: float
+    planning: float
+    end: str
+
+
+class LabelPerception:
+    """The perfect detector in the loop: classes, poses and masks are the truth, depth is what the camera in the cell renders."""
+
+    def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
+        """For the objects of a scene."""
+        self._scene, self._detector = scene, LabelDetector(world.camera)
+        self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
+
+    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
+        """See `Perceive`."""
+        poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
+        told = self._detector.look(self._scene.at(poses)).observation
+        return Observation(depth, told.detections, told.camera, told.tray_side)
+
+
+class _Elsewhere:
+    """In place of an executor: moves are carried out in the diagram."""
+
+    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+        raise NotImplementedError("the arm of the diagram carries moves out")
+
+
+class ClosedLoop:
+    """One scene and everything that searches it.
+
+    Attributes:
+        diagram: all of it.
+        task: the referee's book: what was found, how every move went, and why the episode ended.
+    """
+
+    def __init__(
+        self, scene: Scene, choose: Choose, *, max_moves: int, seed: int, world: ClutterConfig, arm: ArmConfig | None = None
+    ) -> None:
+        """Builds the diagram around a scene at rest.
+
+        Args:
+            scene: the objects.
+            choose: the explorer's policy.
+            max_moves: after which the episode ends.
+            seed: of all chances.
+            world, arm: configs.
+        """
+        self._arm, self._world, self._start = arm or ArmConfig(), world, scene
+        builder, camera, eye = DiagramBuilder(), world.camera, Intrinsics.of(world.camera)
+        self.station: ClutterStation = builder.AddSystem(
+            ClutterStation(
+                self._arm,
+                [(o.name, o.object_class) for o in scene.objects],
+                tray_side=scene.tray_side,
+                camera_altitude=camera.altitude,
+                time_step=TIME_STEP,
+                visuals=True,
+            )
+        )
+        self.station.set_name("clutter_station")
+        scene_graph = self.station.scene.scene_graph
+        scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
+        sensor = builder.AddSystem(RgbdSensor(scene_graph.world_frame_id(), eye.X_TC, eye.color, eye.depth))
+        sensor.set_name("overhead_camera")
+        perceive = LabelPerception(scene, self.station, world)
+        perception = ScenePerception.AddToBuilder(builder, perceive=perceive, width=camera.width, height=camera.height)
+        self.agent = ExplorationAgent.AddToBuilder(builder, choose=choose, max_moves=max_moves, seed=seed)
+        self._ways = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, camera.altitude)
+        self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed)
+        self.executor = PickPlaceExecutor.AddToBuilder(builder, config=self._arm)
+        for source, target, ports in (
+            (self.station, sensor, {"query": "geometry_query"}),
+            (sensor, perception, {"depth_image_32f": "depth_image", "color_image": "color_image"}),
+            (self.station, perception, {"body_poses": "body_poses"}),
+            (perception, self.agent, {"observation": "observation"}),
+            (planner, self.agent, {"answer": "answer"}),
+            (self.executor, self.agent, {"finished": "finished"}),
+            (self.agent, planner, {"request": "request"}),
+            (planner, self.executor, {"plan": "plan"}),
+            (self.executor, self.station, {"desired_state": "desired_state", "feed_forward": "feed_forward"}),
+        ):
+            for output, input_ in ports.items():
+                builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
+        self.diagram = builder.Build()
+        self.diagram.set_name("closed_loop")
+        self.simulator = Simulator(self.diagram)
+        self.vacuum = Vacuum(self.station, self._suction)
+        self.task = ExplorationTask(scene, _Elsewhere(), LabelDetector(camera), world.exploration, max_moves)
+        self._planning = 0.0
+
+    def _suction(self, root: Context) -> bool:
+        context = self.executor.GetMyContextFromRoot(root)
+        return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
+
+    def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
+        X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
+        if X_TO is None:
+            return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
+        found = self._ways.plan(request.known, request.move.pick, X_TO)
+        self._planning += found.seconds
+        return found
+
+    def _agent_state(self, root: Context) -> AgentState:
+        state: AgentState = self.agent.GetOutputPort("state").Eval(self.agent.GetMyContextFromRoot(root))
+        return state
+
+    def run(self, report: Callable[[Step], None] = lambda _: None, *, record: bool = False) -> Timing:
+        """Simulates until all is found, the pile has collapsed, or the agent has ended; `report` is called after each move."""
+        begun_at = time.perf_counter()
+        root = self.simulator.get_mutable_context()
+        self.station.set_scene(root, np.array(self._arm.home), self._start.objects)
+        self.simulator.set_monitor(self.vacuum)
+        freedom = Freedom(self.station, self.vacuum)
+        freedom.begin(root)
+        self.simulator.Initialize()
+        plan: Plan | None = None
+        beside, motion, answers, k = (set[str](), set[str]()), list[Frame](), dict[int, Answer](), 0
+        state = self._agent_state(root)
+        while self.task.end is None and state.phase is not Phase.DONE:
+            now = root.get_time()
+            running = self.executor.running(self.executor.GetMyContextFromRoot(root))
+            if running.plan is not plan and running.plan is not None:
+                plan, beside = running.plan, disturbed_by(self._objects(root), running.plan)
+            wanted, must_hold = set[str](), False
+            if running.schedule is not None:
+                elapsed = now - running.begun
+                wanted = taking_part(running.schedule, *beside, elapsed)
+                must_hold = running.schedule.suction_on + LOOK <= elapsed < running.schedule.end + PATIENCE
+            freedom.update(root, wanted, must_hold=must_hold)
+            k += 1
+            self.simulator.AdvanceTo(k * LOOK + TIME_STEP / 2)
+            if record and running.schedule is not None and now - running.begun < running.schedule.end:
+                context = self.station.plant_context(root)
+                arm = self.station.arm_state(context, self._suction(root))
+                motion.append(Frame(root.get_time() - running.begun, self.station.scene.poses(context), arm))
+            answer: Answer = self._planner.GetOutputPort("answer").Eval(self._planner.GetMyContextFromRoot(root))
+            answers[answer.number] = answer
+            before, state = state, self._agent_state(root)
+            looked_again = state.phase is Phase.DONE or state.request is not before.request
+            if looked_again and before.request is not None:
+                report(self._judged(root, before.request, answers[before.request.number], tuple(motion)))
+                motion.clear()
+        end = state.finish.value if state.finish else ""
+        return Timing(root.get_time(), time.perf_counter() - begun_at, self._planning, end)
+
+    def _objects(self, root: Context) -> tuple[SceneObject, ...]:
+        return self._start.at(self.station.scene.poses(self.station.plant_context(root))).objects
+
+    def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Step:
+        """How a move went, by the truth, once the agent has looked again."""
+        move, before, plan = request.move, self.task.scene, answer.plan
+        if plan is None:
+            no_spot = answer.failure.startswith(PlanFailure.NO_FREE_SPOT.value)
+            result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
+            return self.task.note(move, Outcome(result, before, detail=answer.failure), request.decision)
+        after = replace(before, objects=self._objects(root))
+        picked = nearest(before.objects, plan.X_TO_pick).name
+        came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
+        wanted = [o for o in before.at({picked: plan.X_TO_place}).objects if o.name != picked or not came_off]
+        instability = worst_fall(wanted, after, self._world.settle)
+        result = MoveResult.DROPPED if came_off else MoveResult.PLACED
+        if instability is not None:
+            result = MoveResult.COLLAPSED
+        error = float(np.linalg.norm((after[picked].X_TO.p - plan.X_TO_place.p)[:2]))
+        detail = "came off the cup" if came_off else f"{1000 * error:.1f} mm from where it was to be"
+        outcome = Outcome(result, after, instability, motion, detail=detail, released=plan.X_TO_place)
+        return self.task.note(move, outcome, request.decision)

@@ -1,0 +1,168 @@
+"""The exploring agent in the loop: it looks, chooses a move, waits until that is done or refused, and looks again."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
+
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.systems.move_planner import Answer
+from drake_clutter.tasks.exploration import Decision
+
+PERIOD = 0.05
+"""s, between two looks at what the others are doing."""
+
+Choose = Callable[[Sequence[SceneObject], Observation, Sequence[Move], np.random.Generator, Sequence[Move]], Decision]
+"""From K_t, what is in view, the moves so far, chance, and the moves that failed since anything last changed."""
+
+
+class Phase(Enum):
+    """What the agent is doing."""
+
+    LOOKING = "waits for things to come to rest, then looks"
+    WAITING = "waits for a plan, or for its end"
+    DONE = "has ended"
+
+
+class Finish(Enum):
+    """Why the agent ended by itself."""
+
+    OUT_OF_MOVES = "out of moves"
+    NOTHING_FEASIBLE = "nothing feasible"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A move to be carried out.
+
+    Attributes:
+        number: 1 for the episode's first.
+        move: what to do.
+        observation: what was in view when it was chosen; known: K_t then.
+        decision: why.
+    """
+
+    number: int
+    move: Move
+    observation: Observation = field(repr=False)
+    known: tuple[SceneObject, ...] = field(repr=False)
+    decision: Decision = field(repr=False)
+
+    def __deepcopy__(self, memo: object) -> "Request":
+        """Itself: it never changes, and Drake copies abstract values again and again."""
+        return self
+
+
+@dataclass(frozen=True)
+class AgentState:
+    """Everything that the agent remembers.
+
+    Attributes:
+        phase: what it is doing. look_at: s, when it is to look next.
+        known: K_t, each object as it was last seen.
+        tried: all moves; failed: those that could not be carried out since anything last changed.
+        request: the latest; carried_out: how many moves were.
+        finish: why it ended.
+    """
+
+    phase: Phase = Phase.LOOKING
+    look_at: float = 0.0
+    known: tuple[SceneObject, ...] = ()
+    tried: tuple[Move, ...] = ()
+    failed: tuple[Move, ...] = ()
+    request: Request | None = None
+    carried_out: int = 0
+    finish: Finish | None = None
+
+    def __deepcopy__(self, memo: object) -> "AgentState":
+        """Itself, as of `Request`."""
+        return self
+
+
+def seen(known: Sequence[SceneObject], observation: Observation) -> tuple[SceneObject, ...]:
+    """K_(t+1): what is in view as it is seen, the rest as it was."""
+    objects = {o.name: o for o in known}
+    objects |= {d.name: SceneObject(d.name, d.object_class, d.X_TO) for d in observation.detections}
+    return tuple(objects.values())
+
+
+class ExplorationAgent(LeafSystem):
+    """Chooses moves until nothing is left to do.
+
+    Input ports: observation, abstract, an `Observation`; answer, abstract, the planner's `Answer`; finished (1,), how many plans
+        have been carried out.
+    Output ports: request, abstract, the latest `Request` or None; state, abstract, the `AgentState`.
+    """
+
+    def __init__(self, *, choose: Choose, max_moves: int, seed: int, rest: float = 0.5) -> None:
+        """Begins an episode.
+
+        Args:
+            choose: the policy.
+            max_moves: after which it ends; a move that could not be carried out counts as one.
+            seed: of its chances.
+            rest: s, that it waits for things to come to rest before it looks.
+        """
+        super().__init__()
+        self._choose, self._max_moves, self._seed, self._rest = choose, max_moves, seed, rest
+        self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(None))
+        self._answer = self.DeclareAbstractInputPort("answer", AbstractValue.Make(Answer()))
+        self._finished = self.DeclareVectorInputPort("finished", 1)
+        self._state = self.DeclareAbstractState(AbstractValue.Make(AgentState()))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
+        of = {self.all_state_ticket()}
+        self.DeclareAbstractOutputPort("request", lambda: AbstractValue.Make(None), self._calc_request, of)
+        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(AgentState()), self._calc_state, of)
+
+    @staticmethod
+    def AddToBuilder(builder: DiagramBuilder, *, choose: Choose, max_moves: int, seed: int) -> "ExplorationAgent":
+        """Adds one."""
+        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, max_moves=max_moves, seed=seed))
+        system.set_name("exploration_agent")
+        return system
+
+    def _update(self, context: Context, state: State) -> EventStatus:
+        before: AgentState = context.get_abstract_state(self._state).get_value()
+        after = self._next(context, before)
+        if after is not before:
+            state.get_mutable_abstract_state(int(self._state)).set_value(after)
+        return EventStatus.Succeeded()
+
+    def _next(self, context: Context, now: AgentState) -> AgentState:
+        time = context.get_time()
+        if now.phase is Phase.LOOKING and time >= now.look_at:
+            return self._decided(now, self._observation.Eval(context))
+        if now.phase is Phase.WAITING:
+            assert now.request is not None
+            answer: Answer = self._answer.Eval(context)
+            if answer.number < now.request.number:
+                return now
+            move = now.request.move
+            if answer.failure:
+                return replace(now, phase=Phase.LOOKING, look_at=time, tried=(*now.tried, move), failed=(*now.failed, move))
+            if self._finished.Eval(context)[0] > now.carried_out:
+                over = replace(now, phase=Phase.LOOKING, look_at=time + self._rest, tried=(*now.tried, move), failed=())
+                return replace(over, carried_out=now.carried_out + 1)
+        return now
+
+    def _decided(self, now: AgentState, observation: Observation) -> AgentState:
+        now = replace(now, known=seen(now.known, observation))
+        number = len(now.tried) + 1
+        if number > self._max_moves:
+            return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)
+        decision = self._choose(now.known, observation, now.tried, item_rng(self._seed, number), now.failed)
+        if decision.move is None:
+            return replace(now, phase=Phase.DONE, finish=Finish.NOTHING_FEASIBLE)
+        return replace(now, phase=Phase.WAITING, request=Request(number, decision.move, observation, now.known, decision))
+
+    def _calc_request(self, context: Context, output: AbstractValue) -> None:
+        state: AgentState = context.get_abstract_state(self._state).get_value()
+        output.set_value(state.request)
+
+    def _calc_state(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())

@@ -1,0 +1,68 @@
+"""Scenarios: everything that decides an episode of the closed loop, in one typed file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drake_clutter.agents.exploration import BASELINES, make_explorers
+from drake_clutter.agents.learned_explorer import LearnedExplorers
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.systems.exploration_agent import Choose
+from drake_clutter.tasks.exploration import Decision
+
+
+@dataclass
+class Scenario:
+    """An episode of the closed loop.
+
+    Attributes:
+        scene: a scene file; "": one that the generator makes.
+        generator, objects, nodes: as for `drake-clutter generate`.
+        agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
+        max_moves: after which it ends.
+        seed: of everything that is left to chance.
+        world, arm: configs.
+    """
+
+    scene: str = ""
+    generator: str = "sg-star"
+    objects: str = "ycb7"
+    nodes: int = 25
+    agent: str = "student"
+    max_moves: int = 20
+    seed: int = 0
+    world: ClutterConfig = field(default_factory=ClutterConfig)
+    arm: ArmConfig = field(default_factory=ArmConfig)
+
+
+def policy_of(name: str, config: ClutterConfig) -> Choose:
+    """An explorer's policy as the loop's agent needs it: a function of what it is given, without memory of its own.
+
+    Raises:
+        InputError: no such explorer, or one that knows more than the camera shows.
+    """
+    if name in BASELINES:
+        agent = BASELINES[name]()
+
+        def choose(
+            known: Sequence[SceneObject],
+            observation: Observation,
+            tried: Sequence[Move],
+            rng: np.random.Generator,
+            failed: Sequence[Move],
+        ) -> Decision:
+            return agent.choose(observation, tried, rng, failed)
+
+        return choose
+    explorers = make_explorers(name, config)
+    if not isinstance(explorers, LearnedExplorers) or explorers.privileged:
+        raise InputError(
+            f"agent: {name} knows more than the camera shows; allowed is a student, or one of {', '.join(BASELINES)}"
+        )
+    learned = explorers.student()
+    return lambda known, observation, tried, rng, failed: learned.decide(known, observation, tried, failed)
