@@ -164,14 +164,14 @@ def evaluate(
     from drake_clutter.config import load_config
 
     world = load_config(config)
-    played = command.playable(scenes, world, catalogue)[:count]
+    played = command.playable(scenes, catalogue)[:count]
     names = agents or list(BASELINES)
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return tracked("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, workers, out, progress, ray)
+    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray)
     if as_json:
         print(json.dumps(rows, indent=2))
         return

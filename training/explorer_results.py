@@ -42,18 +42,18 @@ FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWL
 ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", agent) for agent in FOURTEEN]
 
 
-def played(scenes: SceneSet, agent: str, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
-    """The episodes of an agent on a set, from the file if they are there."""
+def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
+    """The episodes of an agent on a set's first scenes, from the file if they are there."""
     if path.exists():
         held = json.loads(path.read_text())
-        if held["set"] != dict(scenes.about) or (held["seed"], held["fidelity"]) != (seed, fidelity):
-            raise InputError(f"{path}: holds episodes of another set, seed or fidelity; give the same ones or another folder")
+        asked = (dict(scenes.about), count, seed, fidelity)
+        if (held["set"], len(held["episodes"]), held["seed"], held["fidelity"]) != asked:
+            raise InputError(f"{path}: holds episodes of another set, count, seed or fidelity; give the same or another folder")
         return [EpisodeResult(**{**row, "found_after": tuple(row["found_after"])}) for row in held["episodes"]]
-    config, grammar = ClutterConfig(), scenes.grammar
-    starts = [scenes.settled(k, grammar, config.layout) for k in range(len(scenes.scenes))]
+    config = ClutterConfig()
     make_explorers(agent, config)  # says what is wrong before anything is played
-    episodes = [Episode(f"{scenes.name} {k}", start, agent, k) for k, start in enumerate(starts)]
-    results = map_ordered(partial(EpisodePlayer, config, max(LIMITS), seed, fidelity), episodes, workers=workers)
+    episodes = [Episode(SCENES / scenes.name, k, agent, k) for k in range(count)]
+    results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), episodes, workers=workers)
     shown = track(results, f"{path.stem}", total=len(episodes), console=Console(stderr=True))
     found = list(shown)
     fields = {"set": dict(scenes.about), "seed": seed, "fidelity": fidelity, "commit": git_commit()}
@@ -134,6 +134,7 @@ def main(
     workers: int = 1,
     seed: Annotated[int, typer.Option(help="Of the episodes' chances.")] = 2000,
     fidelity: Annotated[str, typer.Option(help="fast or settle; the published tables are settle.")] = "settle",
+    count: Annotated[int | None, typer.Option(help="Of each set's scenes; all if not given.")] = None,
     only: Annotated[str | None, typer.Option(help="Of sets whose name contains this.")] = None,
     agents: Annotated[list[str] | None, typer.Option("--agent", help="These instead of the tables'; may be repeated.")] = None,
     out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table2.json",
@@ -142,15 +143,16 @@ def main(
     """Measures what is missing and prints the table."""
     folder.mkdir(parents=True, exist_ok=True)
     catalogue, rows = load_catalogue(), list[dict[str, Any]]()
-    names = [name for name in dict.fromkeys(name for name, _ in ROWS) if (only is None or only in name)]
+    names = [name for name in dict.fromkeys(name for name, _ in ROWS) if only is None or only in name]
     for name in names:
         scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
+        number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or [agent for of, agent in ROWS if of == name]
         found = {
-            agent: played(scenes, agent, fidelity, seed, workers, folder / f"{name}_{Path(agent).stem}.json")
+            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{Path(agent).stem}.json")
             for agent in sorted(chosen, key=lambda agent: agent != FULL_KNOWLEDGE)
         }
-        solvable = [k for k, scene in enumerate(scenes.scenes) if scene.solvable == "solvable"]
+        solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
         for agent in chosen:
             ceiling = found.get(FULL_KNOWLEDGE)
             row = {"set": name, "agent": agent, **row_of(found[agent], ceiling)}
@@ -158,7 +160,7 @@ def main(
             row["solvable"] = row_of(part, [ceiling[k] for k in solvable] if ceiling else None) if part else None
             rows.append(row)
         if curves is not None:
-            draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {len(scenes.scenes)} scenes, {fidelity}", curves)
+            draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {number} scenes, {fidelity}", curves)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, {"seed": seed, "fidelity": fidelity, "commit": git_commit(), "rows": rows})
     Console(width=180).print(table_of(rows))

@@ -3,26 +3,43 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
 from drake_clutter.agents.generation import mean_interval, wilson_interval
+from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What is to be played: an agent on a scene at rest. `index` seeds its chances; `scene` is what the scene is called."""
+    """What is to be played: an agent on a scene at rest. `index` seeds its chances.
 
-    scene: str
-    start: Scene
+    Attributes:
+        file: a scene file that a judge has called stable, or a frozen set.
+        number: of the scene in the set; None for a scene file.
+        agent: see `make_explorers`.
+        index: of the episode.
+    """
+
+    file: Path
+    number: int | None
     agent: str
     index: int
+
+    @property
+    def scene(self) -> str:
+        """What the scene is called."""
+        return self.file.name if self.number is None else f"{self.file.name} {self.number}"
 
 
 @dataclass(frozen=True)
@@ -53,17 +70,26 @@ class EpisodeResult:
 class EpisodePlayer:
     """Plays episodes at a fidelity; a worker for the runner."""
 
-    def __init__(self, config: ClutterConfig, max_moves: int, seed: int, fidelity: str) -> None:
+    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int, fidelity: str) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
+        # In this process: an object class is known by its identity.
+        self._catalogue = load_catalogue(catalogue_folder)
+        self._set = cache(partial(load_scene_set, catalogue=self._catalogue))
         self._executor = EXECUTORS[fidelity](config, follow_falls=False)
         self._detector = DETECTORS[fidelity](config.camera)
         self._explorers: dict[str, ExplorerMaker] = {}
+
+    def _scene(self, episode: Episode) -> Scene:
+        if episode.number is None:
+            return load_scene(episode.file, self._catalogue).settled_scene
+        held = self._set(episode.file)
+        return held.settled(episode.number, held.grammar, self._config.layout)
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
         if episode.agent not in self._explorers:
             self._explorers[episode.agent] = make_explorers(episode.agent, self._config)
-        task = ExplorationTask(episode.start, self._executor, self._detector, self._config.exploration, self._max_moves)
+        task = ExplorationTask(self._scene(episode), self._executor, self._detector, self._config.exploration, self._max_moves)
         play(task, self._explorers[episode.agent](task), item_rng(self._seed, episode.index))
         found_after = np.cumsum([len(step.newly_found) for step in task.steps], dtype=int)
         return EpisodeResult(

@@ -12,41 +12,38 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
 from drake_clutter.runner import map_ordered
-from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
 
 
-def playable(scenes: Path, config: ClutterConfig, catalogue_folder: Path | None) -> list[tuple[str, Scene]]:
-    """Scenes at rest that hide something, by name: of a frozen set, or those of a folder's scene files that were judged stable.
+def playable(scenes: Path, catalogue_folder: Path | None) -> list[tuple[Path, int | None]]:
+    """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set's file with each number.
 
     Raises:
         InputError: no scene files, one that is broken, or none that can be played.
     """
     catalogue = load_catalogue(catalogue_folder)
     if scenes.is_file():
-        held = load_scene_set(scenes, catalogue)
-        grammar = held.grammar
-        return [(f"{held.name} {k}", held.settled(k, grammar, config.layout)) for k in range(len(held.scenes))]
+        return [(scenes, number) for number in range(len(load_scene_set(scenes, catalogue).scenes))]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
             f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote, or a set of scenes"
         )
-    files = [(path.name, load_scene(path, catalogue)) for path in paths]
-    found = [(name, file.settled_scene) for name, file in files if file.verdict is not None and file.verdict.hidden]
+    found = [path for path in paths if (verdict := load_scene(path, catalogue).verdict) is not None and verdict.hidden]
     if not found:
         raise InputError(f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes")
-    return found
+    return [(path, None) for path in found]
 
 
 def evaluate(
-    scenes: Sequence[tuple[str, Scene]],
+    scenes: Sequence[tuple[Path, int | None]],
     agents: Sequence[str],
     max_moves: int,
     fidelity: str,
     seed: int,
     config: ClutterConfig,
+    catalogue_folder: Path | None,
     workers: int,
     out: Path,
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
@@ -55,8 +52,8 @@ def evaluate(
     """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
     for agent in agents:
         make_explorers(agent, config)  # says what is wrong before anything is played
-    episodes = [Episode(name, scene, agent, index) for agent in agents for index, (name, scene) in enumerate(scenes)]
-    make_player = partial(EpisodePlayer, config, max_moves, seed, fidelity)
+    episodes = [Episode(*scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]
+    make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = list(progress(played, len(episodes)))
     rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]

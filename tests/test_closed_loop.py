@@ -1,0 +1,206 @@
+"""The closed loop: the agent's decisions on scripted answers, and a whole episode in Drake."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import resting, scene_of
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from drake_clutter.agents.exploration import LargestClear
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.commands.run import play, write
+from drake_clutter.commands.run import scene_of as scenario_scene
+from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import Move, MoveResult, Observation
+from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase, seen
+from drake_clutter.systems.move_planner import Answer, MovePlanner
+from drake_clutter.systems.scenario import Scenario, policy_of
+from drake_clutter.tasks.exploration import Decision, EpisodeEnd
+
+COVERED = scene_of(
+    resting("gelatin_box", xy=(0.05, 0.0)),
+    resting("cracker_box", xy=(0.05, 0.0), floor=0.028),
+)
+BEFORE = RayCaster(ClutterConfig().camera).observe(COVERED)[0]
+ASIDE = COVERED.at({"cracker_box": resting("cracker_box", xy=(0.05, 0.25)).X_TO})
+AFTER = RayCaster(ClutterConfig().camera).observe(ASIDE)[0]
+
+
+def first_allowed(
+    known: Sequence[SceneObject],
+    observation: Observation,
+    tried: Sequence[Move],
+    rng: np.random.Generator,
+    failed: Sequence[Move],
+) -> Decision:
+    """The first object in view to the tray, if that has not failed."""
+    moves = [Move(d.name) for d in observation.detections if Move(d.name) not in failed]
+    return Decision(moves[0] if moves else None)
+
+
+class Bench:
+    """An agent alone, its inputs given by hand."""
+
+    def __init__(self, max_moves: int = 5) -> None:
+        self.agent = ExplorationAgent(choose=first_allowed, max_moves=max_moves, seed=0)
+        self.simulator = Simulator(self.agent)
+        self.time = 0.0
+        self.give(BEFORE, Answer(), 0)
+
+    def give(self, observation: Observation, answer: Answer, finished: int) -> None:
+        context = self.simulator.get_mutable_context()
+        self.agent.GetInputPort("observation").FixValue(context, observation)
+        self.agent.GetInputPort("answer").FixValue(context, answer)
+        self.agent.GetInputPort("finished").FixValue(context, [finished])
+
+    def after(self, seconds: float) -> AgentState:
+        self.time += seconds
+        self.simulator.AdvanceTo(self.time)
+        return self.state(self.simulator.get_context())
+
+    def state(self, context: Context) -> AgentState:
+        state: AgentState = self.agent.GetOutputPort("state").Eval(context)
+        return state
+
+
+def a_plan() -> Plan:
+    made = PickPlacePlanner(ArmConfig(), PlannerConfig(optimise=False), 0.70, 1.60).plan(
+        COVERED.objects, "cracker_box", Pose((0.05, 0.25, 0.031), COVERED["cracker_box"].X_TO.quaternion)
+    )
+    assert isinstance(made, Plan)
+    return made
+
+
+def test_it_looks_waits_rests_and_looks_again() -> None:
+    bench = Bench()
+    state = bench.after(0.1)
+    assert state.phase is Phase.WAITING
+    assert state.request is not None
+    assert (state.request.number, state.request.move) == (1, Move("cracker_box"))
+    assert [o.name for o in state.known] == ["cracker_box"]
+    bench.give(AFTER, Answer(1, a_plan()), 0)
+    assert bench.after(5.0) is state or bench.after(0.0).phase is Phase.WAITING
+    bench.give(AFTER, Answer(1, a_plan()), 1)
+    state = bench.after(0.1)
+    assert (state.phase, state.tried, state.carried_out) == (Phase.LOOKING, (Move("cracker_box"),), 1)
+    assert [o.name for o in state.known] == ["cracker_box"], "it has not looked yet"
+    state = bench.after(0.6)
+    assert state.request is not None
+    assert state.request.number == 2
+    assert {o.name: o.X_TO for o in state.known} == ASIDE.poses
+
+
+def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
+    bench = Bench()
+    bench.after(0.1)
+    bench.give(BEFORE, Answer(1, None, "no seal"), 0)
+    state = bench.after(0.2)
+    assert (state.phase, state.finish, state.failed) == (Phase.DONE, Finish.NOTHING_FEASIBLE, (Move("cracker_box"),))
+    bench = Bench(max_moves=1)
+    bench.after(0.1)
+    bench.give(AFTER, Answer(1, None, "no seal"), 0)
+    assert bench.after(0.2).finish is Finish.OUT_OF_MOVES
+
+
+def test_a_cloned_agent_goes_on_the_same() -> None:
+    bench = Bench()
+    bench.after(0.1)
+    bench.give(AFTER, Answer(1, None, "unreachable"), 0)
+    clone = Simulator(bench.agent, bench.simulator.get_context().Clone())
+    state = bench.after(0.3)
+    clone.AdvanceTo(bench.time)
+    other = bench.state(clone.get_context())
+    assert state.request is not None
+    assert other.request is not None
+    assert other.request.number == state.request.number == 2
+    assert other.request.move == state.request.move
+    assert (other.tried, other.failed, other.phase) == (state.tried, state.failed, state.phase)
+
+
+def test_what_was_seen_stays_known() -> None:
+    known = seen(seen((), AFTER), BEFORE)
+    assert {o.name: o.X_TO for o in known} == COVERED.poses, "the box under the other one is where it was seen"
+
+
+def test_the_planner_answers_each_request_once() -> None:
+    bench, asked, plan = Bench(), list[int](), a_plan()
+    request = bench.after(0.1).request
+    assert request is not None
+
+    def answer(given: object, rng: np.random.Generator) -> Plan | NoPlan:
+        asked.append(1)
+        return plan if len(asked) == 1 else NoPlan(PlanFailure.NO_SEAL, "it")
+
+    planner = MovePlanner(plan=answer, seed=0)
+    simulator = Simulator(planner)
+    context = simulator.get_mutable_context()
+    planner.GetInputPort("request").FixValue(context, None)
+    simulator.AdvanceTo(0.2)
+    assert asked == []
+    planner.GetInputPort("request").FixValue(context, request)
+    simulator.AdvanceTo(0.5)
+    assert asked == [1]
+    found: Answer = planner.GetOutputPort("answer").Eval(context)
+    assert (found.number, found.plan) == (1, plan)
+    planner.GetInputPort("request").FixValue(context, type(request)(2, *(request.move, AFTER, request.known, request.decision)))
+    simulator.AdvanceTo(1.0)
+    found = planner.GetOutputPort("answer").Eval(context)
+    assert (found.number, found.plan, found.failure) == (2, None, "no seal: it")
+    assert planner.GetOutputPort("plan").Eval(context) is plan, "the arm has nothing new to do"
+
+
+def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
+    """A marker, which no cup can hold, is refused; the cover goes aside, and the box below it is found."""
+    scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.tray_side)
+    agent, names = LargestClear(), list[str]()
+
+    def choose(
+        known: Sequence[SceneObject],
+        observation: Observation,
+        tried: Sequence[Move],
+        rng: np.random.Generator,
+        failed: Sequence[Move],
+    ) -> Decision:
+        names.append(",".join(o.name for o in known))
+        return Decision(Move("large_marker")) if not tried else agent.choose(observation, tried, rng, failed)
+
+    loop = ClosedLoop(scene, choose, max_moves=4, seed=0, world=config)
+    timing = loop.run(record=True)
+    assert [step.outcome.result for step in loop.task.steps] == [MoveResult.NOT_PLANNED, MoveResult.PLACED]
+    assert loop.task.steps[0].outcome.detail == "no seal: large_marker"
+    placed = loop.task.steps[1]
+    assert (placed.move, placed.newly_found) == (Move("cracker_box"), ("gelatin_box",))
+    assert placed.outcome.motion[0].arm is not None
+    assert max(frame.time for frame in placed.outcome.motion) > 2
+    assert loop.task.end is EpisodeEnd.ALL_FOUND
+    assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
+    assert 3 < timing.robot < 15
+    fields = write(tmp_path, Scenario(agent="largest-clear"), loop.task, timing, "A test")
+    assert fields["success"]
+    assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
+
+
+def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
+    assert load_typed(Scenario(), None, ["agent=random", "arm.payload=5"]).arm.payload == 5
+    with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
+        policy_of("full-knowledge", config)
+    with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):
+        scenario_scene(Scenario(scene=str(tmp_path / "none.yaml")))
+    move = policy_of("largest-clear", config)((), BEFORE, (), np.random.default_rng(0), ()).move
+    assert move == Move("cracker_box")
+
+
+def test_a_random_explorer_plays(config: ClutterConfig) -> None:
+    task, timing = play(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
+    assert len(task.steps) == 1
+    assert timing.robot > 0
