@@ -1,4 +1,4 @@
-# make demo   generates a scene, judges it and explores it; the results are in out/demo
+# make demo   SG* makes a scene, the arm searches it; the results are in out/demo
 # make test   every check: lint, format, types, tests
 # Both make their own environment in .venv first.
 
