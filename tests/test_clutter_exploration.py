@@ -111,8 +111,12 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -
 
 
 def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
-    with pytest.raises(ValueError, match="none stands, with at most 2 objects"):
+    with pytest.raises(InputError, match="none stands and hides something, with at most 2 objects"):
         ClutterExploration(scenes, most_objects=2).reset(seed=0)
+    with pytest.raises(InputError, match="most_objects: 2; this scene has 11"):
+        ClutterExploration(scenes, most_objects=2).reset(options={"scene": 0})
+    with pytest.raises(InputError, match="scene: 3; allowed is 0 to 2"):
+        ClutterExploration(scenes).reset(options={"scene": 3})
 
 
 # --- Learning ---

@@ -5,6 +5,7 @@
 Episodes stay in the folder, a file for each set and agent; a run that was stopped goes on with what is missing.
 """
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -24,14 +25,15 @@ from rich.table import Table
 
 from drake_clutter.agents.checkpoint import git_commit
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
-from drake_clutter.agents.exploration import FULL_KNOWLEDGE, make_explorers
+from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.resources import shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
 
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
@@ -44,21 +46,34 @@ ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", ag
 
 def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
     """The episodes of an agent on a set's first scenes, from the file if they are there."""
+    config = ClutterConfig()
+    asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
+    asked |= {"count": count, "seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
     if path.exists():
         held = json.loads(path.read_text())
-        asked = (dict(scenes.about), count, seed, fidelity)
-        if (held["set"], len(held["episodes"]), held["seed"], held["fidelity"]) != asked:
-            raise InputError(f"{path}: holds episodes of another set, count, seed or fidelity; give the same or another folder")
+        differing = ", ".join(key for key, value in asked.items() if held["asked"].get(key) != value)
+        if differing:
+            raise InputError(f"{path}: holds other episodes ({differing}); give the same options or another folder")
         return [EpisodeResult(**{**row, "found_after": tuple(row["found_after"])}) for row in held["episodes"]]
-    config = ClutterConfig()
     make_explorers(agent, config)  # says what is wrong before anything is played
     episodes = [Episode(SCENES / scenes.name, k, agent, k) for k in range(count)]
     results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), episodes, workers=workers)
     shown = track(results, f"{path.stem}", total=len(episodes), console=Console(stderr=True))
     found = list(shown)
-    fields = {"set": dict(scenes.about), "seed": seed, "fidelity": fidelity, "commit": git_commit()}
-    write_json(path, fields | {"episodes": [asdict(result) for result in found]})
+    write_json(path, {"asked": asked, "commit": git_commit(), "episodes": [asdict(result) for result in found]})
     return found
+
+
+def weights_of(agent: str) -> str:
+    """The hash of a trained agent's weights; "" for the others."""
+    if agent not in TRAINED and not agent.endswith(".safetensors"):
+        return ""
+    return hashlib.sha256((shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent)).read_bytes()).hexdigest()
+
+
+def file_name(agent: str) -> str:
+    """Of an agent's episodes."""
+    return f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
 
 
 def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | None) -> dict[str, Any]:
@@ -77,7 +92,7 @@ def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | 
         }
     won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
     row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
-    row["not_carried_out"] = sum(r.no_free_spot for r in results) / max(1, sum(r.moves for r in results))
+    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
     if ceiling is not None:
         pairs = [
             (r.moves, c.moves) for r, c in zip(results, ceiling, strict=True) if r.ended == c.ended == EpisodeEnd.ALL_FOUND.value
@@ -131,38 +146,46 @@ def draw_curves(found: dict[str, Sequence[EpisodeResult]], title: str, path: Pat
 
 def main(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")],
-    workers: int = 1,
-    seed: Annotated[int, typer.Option(help="Of the episodes' chances.")] = 2000,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the episodes' chances.")] = 2000,
     fidelity: Annotated[str, typer.Option(help="fast or settle; the published tables are settle.")] = "settle",
-    count: Annotated[int | None, typer.Option(help="Of each set's scenes; all if not given.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Of each set's scenes; all if not given.")] = None,
     only: Annotated[str | None, typer.Option(help="Of sets whose name contains this.")] = None,
     agents: Annotated[list[str] | None, typer.Option("--agent", help="These instead of the tables'; may be repeated.")] = None,
     out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table2.json",
     curves: Annotated[Path | None, typer.Option(metavar="FILE", help="PNG to write, of the last set.")] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
+    if out == RESULTS / "table2.json" and (only or agents or fidelity != "settle"):
+        raise InputError(f"--out {out}: is the whole table's; give another file for a part of it")
+    if fidelity not in EXECUTORS:
+        raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(EXECUTORS)}")
     folder.mkdir(parents=True, exist_ok=True)
     catalogue, rows = load_catalogue(), list[dict[str, Any]]()
     names = [name for name in dict.fromkeys(name for name, _ in ROWS) if only is None or only in name]
+    if not names:
+        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(dict(ROWS))}")
     for name in names:
         scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
         number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or [agent for of, agent in ROWS if of == name]
         found = {
-            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{Path(agent).stem}.json")
+            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.json")
             for agent in sorted(chosen, key=lambda agent: agent != FULL_KNOWLEDGE)
         }
         solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
         for agent in chosen:
             ceiling = found.get(FULL_KNOWLEDGE)
-            row = {"set": name, "agent": agent, **row_of(found[agent], ceiling)}
+            row = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
+            row |= row_of(found[agent], ceiling)
             part = [found[agent][k] for k in solvable]
             row["solvable"] = row_of(part, [ceiling[k] for k in solvable] if ceiling else None) if part else None
             rows.append(row)
         if curves is not None:
             draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {number} scenes, {fidelity}", curves)
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, {"seed": seed, "fidelity": fidelity, "commit": git_commit(), "rows": rows})
+        fields = {"seed": seed, "fidelity": fidelity, "commit": git_commit(), "config": asdict(ClutterConfig())}
+        write_json(out, fields | {"rows": rows})
     Console(width=180).print(table_of(rows))
 
 

@@ -30,7 +30,7 @@ class ActorCriticConfig:
         trace: of the advantage's estimate (GAE, Schulman et al. 2016).
         clip: of the ratio of probabilities.
         entropy, value: weights in the loss.
-        learning_rate: at the beginning; it falls to 0 in a straight line.
+        learning_rate: at the beginning; it falls in a straight line, to a fiftieth.
         width: of the network.
     """
 
@@ -69,7 +69,6 @@ class ActorCritic:
         """One round; returns its episodes."""
         rng = item_rng(self._seed, 1, self._round)
         played = play_episodes(self._environment, self.config.episodes, (self._seed, 2, self._round), acting(self.network, rng))
-        played = [episode for episode in played if episode.moves]
         self._learn(played, rng)
         self.step += sum(len(episode.moves) for episode in played)
         self._round += 1
@@ -82,7 +81,7 @@ class ActorCritic:
         advantages = [advantage(episode, config.discount, config.trace) for episode in played]
         gain = torch.from_numpy(np.concatenate(advantages))
         aim = gain + torch.tensor([value for episode in played for _, value in episode.notes])
-        gain = (gain - gain.mean()) / (gain.std() + 1e-6)
+        gain = (gain - gain.mean()) / (gain.std(correction=0) + 1e-6)
         observations = stacked_graphs([observation for episode in played for observation in episode.observations])
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * max(0.02, 1 - self.step / config.steps)

@@ -54,7 +54,7 @@ class EpisodeResult:
         found: those of them that were found.
         moves: moves made.
         found_after: (moves,) how many were found after each move.
-        no_free_spot: moves that could not be carried out.
+        not_carried_out: moves that could not be.
     """
 
     scene: str
@@ -64,7 +64,7 @@ class EpisodeResult:
     found: int
     moves: int
     found_after: tuple[int, ...]
-    no_free_spot: int
+    not_carried_out: int
 
 
 class EpisodePlayer:
@@ -100,7 +100,7 @@ class EpisodePlayer:
             found=len(task.found),
             moves=len(task.steps),
             found_after=tuple(int(n) for n in found_after),
-            no_free_spot=sum(step.outcome.result.value == "no free spot" for step in task.steps),
+            not_carried_out=sum(not step.outcome.result.carried_out for step in task.steps),
         )
 
 

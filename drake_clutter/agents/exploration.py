@@ -93,10 +93,14 @@ class FullKnowledge:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`. A plan that Drake did not carry out as it was meant is followed by another."""
+        """See `ExplorationAgent.choose`. A plan that did not go as it was meant is followed by another.
+
+        Objects land where the plan puts them as long as nothing but the moves draws from `rng`.
+        """
         in_view = {TRAY, *(d.name for d in observation.detections)}
-        if not self._plan or not {self._plan[0].pick, self._plan[0].place} <= in_view:
-            self._plan = list(self._search.solve(self._task.scene, len(tried), self.BUDGET).plan)
+        if not self._plan or failed or not {self._plan[0].pick, self._plan[0].place} <= in_view:
+            found = self._search.solve(self._task.scene, budget=self.BUDGET, known=self._task.known, rng=rng)
+            self._plan = list(found.plan)
         return Decision(self._plan.pop(0) if self._plan else None)
 
 

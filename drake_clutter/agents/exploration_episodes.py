@@ -56,10 +56,7 @@ def play_episodes(
         while len(running) < side_by_side and (number := next(waiting, None)) is not None:
             twin = copy(environment)
             observation, _ = twin.reset(seed=int(item_rng(*seed, number).integers(2**31)))
-            if twin.task.end is None:
-                running[number] = twin, observation
-            else:
-                played[number].end = twin.task.end
+            running[number] = twin, observation
         if not running:
             return played
         moves, notes = act([twin for twin, _ in running.values()], [observation for _, observation in running.values()])

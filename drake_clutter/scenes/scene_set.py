@@ -52,12 +52,14 @@ class SceneSet:
         classes: of the objects, in the grammar's order.
         about: agent, nodes, seed, object set, commit and whatever else says how it was made.
         scenes: the scenes.
+        sha256: of all that.
     """
 
     name: str
     classes: tuple[ObjectClass, ...]
     about: Mapping[str, Any]
     scenes: tuple[SetScene, ...]
+    sha256: str
 
     @property
     def grammar(self) -> SceneGrammar:
@@ -95,8 +97,8 @@ def lay_anew(derivation: Derivation, grammar: SceneGrammar, layout: LayoutConfig
     )
 
 
-def _digest(entries: Sequence[Mapping[str, Any]]) -> str:
-    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> str:
+    return hashlib.sha256(json.dumps([head, entries], sort_keys=True).encode()).hexdigest()
 
 
 def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene]) -> None:
@@ -110,7 +112,8 @@ def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetSce
         if scene.settled is not None:
             entry["settled"] = [[round(v, 6) for v in (*pose.translation, *pose.quaternion)] for pose in scene.settled]
         entries.append(entry)
-    head = {"version": VERSION, **about, "rules": names, "sha256": _digest(entries)}
+    head = {"version": VERSION, **about, "rules": names}
+    head["sha256"] = _digest(head, entries)
     lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
     write_text(path, f'{json.dumps(head)[:-1]}, "scenes": [\n{lines}\n]}}\n')
 
@@ -123,9 +126,9 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        entries, names = document.pop("scenes"), document.pop("rules")
-        digest, version = document.pop("sha256"), document.pop("version")
-        objects = document["objects"]
+        entries, digest = document.pop("scenes"), document.pop("sha256")
+        changed = _digest(document, entries) != digest
+        version, names, objects = document.pop("version"), document.pop("rules"), document["objects"]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -134,14 +137,14 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
         ) from error
     if version != VERSION:
         raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
-    if _digest(entries) != digest:
+    if changed:
         raise InputError(f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made")
     scenes = []
     for entry in entries:
         poses = tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
         rules = tuple(names[k] for k in entry["rules"])
         scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
-    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes))
+    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes), digest)
 
 
 def _pose(numbers: Sequence[float]) -> Pose:

@@ -18,7 +18,7 @@ from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, Ex
 from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, Knowledge, exploration_graph
 
 TRAINING_SET = "training/scenes/train_sg_star.json"
-_STABLE_TRIES = 100
+_TRIES = 100
 
 
 class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
@@ -84,23 +84,35 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[GraphObservation, dict[str, Any]]:
         """A scene at rest, and the first look at it."""
         super().reset(seed=seed)
-        if options is not None and "scene" in options:
-            scene = self.scenes.settled(options["scene"], self.grammar, self._config.layout)
+        number = None if options is None else options.get("scene")
+        if number is None:
+            self._begin_anew()
+        elif not 0 <= number < len(self.scenes.scenes):
+            raise InputError(f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them")
         else:
-            scene = self._laid_out()
-        self.begin(scene)
+            self.begin(self.scenes.settled(number, self.grammar, self._config.layout))
         return self.observe(), {}
 
-    def _laid_out(self) -> Scene:
-        for _ in range(_STABLE_TRIES):
+    def _begin_anew(self) -> None:
+        """With a scene that stands and hides something where its stacks are put now."""
+        for _ in range(_TRIES):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
             scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config.layout, self.np_random)
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
-                return scene
-        raise ValueError(f"{self.scenes.name}: of {_STABLE_TRIES} scenes none stands, with at most {self._nodes - 1} objects")
+                self.begin(scene)
+                if self.task.end is None:
+                    return
+        most = self._nodes - 1
+        raise InputError(f"{self.scenes.name}: of {_TRIES} scenes none stands and hides something, with at most {most} objects")
 
     def begin(self, scene: Scene) -> None:
-        """Starts an episode on a scene at rest."""
+        """Starts an episode on a scene at rest.
+
+        Raises:
+            InputError: it has more objects than there is room for.
+        """
+        if len(scene.objects) >= self._nodes:
+            raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
         self.knowledge = Knowledge()
         self.knowledge.see(self.task.look.observation)

@@ -96,9 +96,8 @@ def exploration_graph(
                 share = min(1.0, np.count_nonzero(detection.mask) * pixel**2 / float(extent[0] * extent[1]))
             picks = sum(move.pick == o.name for move in tried)
             kind[k + 1] = numbers[o.object_class.name]
-            sign = (
-                1 if next((q for q in o.X_TO.quaternion if abs(q) > 1e-9), 1) > 0 else -1
-            )  # of a rotation's two, always the same
+            # Of a rotation's two, always the same, also when a component that should be 0 is a little off.
+            sign = 1 if next((q for q in o.X_TO.quaternion if abs(q) > 0.01), 1) > 0 else -1
             feature[k + 1] = (
                 *(o.X_TO.p / _LENGTH),
                 *(sign * q for q in o.X_TO.quaternion),

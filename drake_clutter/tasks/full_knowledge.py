@@ -4,7 +4,7 @@ It is the ceiling for explorers, and tells whether a scene that hides objects ca
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -102,7 +102,16 @@ class FullKnowledgeSearch:
         self._executor = FastExecutor(config, self._judge)
         self._hidden_below = config.camera.hidden_below
 
-    def solve(self, scene: Scene, seed: int = 0, budget: int = 5000, *, fewest: bool = True) -> Solution:
+    def solve(
+        self,
+        scene: Scene,
+        seed: int = 0,
+        budget: int = 5000,
+        *,
+        fewest: bool = True,
+        known: Collection[str] = (),
+        rng: np.random.Generator | None = None,
+    ) -> Solution:
         """The fewest moves for a scene at rest.
 
         Args:
@@ -110,9 +119,11 @@ class FullKnowledgeSearch:
             seed: of the places that are equally good; an episode of the same seed puts the objects where the plan does.
             budget: moves to try at most.
             fewest: whether to look for a shorter plan when there is one.
+            known: what has been in view before.
+            rng: in place of the seed: as it will be when the plan is carried out. It is left as it is.
         """
         self._left, self._doubts = budget, 0
-        start = self._state(scene, frozenset(), item_rng(seed).bit_generator.state)
+        start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
         never = self._never_found(start)
         if never:
             return Solution(Answer.UNSOLVABLE, (), start.at_least, never, 0)
