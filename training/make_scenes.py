@@ -33,6 +33,8 @@ from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_
 from drake_clutter.scenes.seams import CannotJudge
 from drake_clutter.tasks.generation import GenerationTask
 
+MOST_DRAWS = 20
+"""Scenes that are drawn at most, for each that is to be collected."""
 MORE = 1.1
 """Times as many scenes are drawn as are still missing."""
 
@@ -41,8 +43,8 @@ def judged_by_drake(folder: Path) -> Iterator[SetScene]:
     """The stable scenes of a folder that hide something."""
     catalogue = load_catalogue()
     solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
-    for path, answer in zip(sorted((folder / SCENES).iterdir()), solvable, strict=True):
-        file = load_scene(path, catalogue)
+    for index, answer in enumerate(solvable):
+        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
         assert file.verdict is not None
         assert file.scene.graph is not None
         if file.verdict.stable and file.verdict.hidden:
@@ -102,18 +104,17 @@ def main(
     }
     found, drawn = list[SetScene](), 0
     if work is None:
-        made = map_ordered(partial(FastMaker, job), itertools.count(), workers=workers)
+        made = map_ordered(partial(FastMaker, job), range(MOST_DRAWS * count), workers=workers)
         fitting = itertools.islice(without_repeats(made, taken), count)
         found = list(track(fitting, out.stem, total=count, console=console))
         made.close()
-    while work is not None and len(found) < count:
+    while work is not None and len(found) < count and drawn < MOST_DRAWS * count:
         drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
         generate(job, drawn, work, workers, lambda scenes, done, total: track(scenes, out.stem, total, done, console=console))
         found = list(without_repeats(judged_by_drake(work), taken))
-        if drawn > 100 and not found:
-            raise InputError(
-                f"--agent {agent}: none of {drawn} scenes is stable and hides something; allowed is one of which some are"
-            )
+    if len(found) < count:
+        told = f"only {len(found)} of {MOST_DRAWS * count} scenes are stable, hide something, and are no repeats"
+        raise InputError(f"--count {count}: {told}; allowed is what agent and nodes can make")
     out.parent.mkdir(parents=True, exist_ok=True)
     save_scene_set(out, about, found[:count])
 

@@ -147,7 +147,10 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
         path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
     except FileNotFoundError as error:
         raise InputError(f"--agent {name}: {error}; train it with training/train_explorer.py and clone_explorer.py") from error
-    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+    try:
+        from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+    except ModuleNotFoundError as error:
+        raise InputError(f"--agent {name}: needs {error.name}; install drake_clutter with [train]") from error
 
     return LearnedExplorers(path)
 

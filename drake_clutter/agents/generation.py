@@ -107,7 +107,10 @@ def make_generation_agent(name: str, config: ClutterConfig, temperature: float |
         path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
     except FileNotFoundError as error:
         raise InputError(f"--agent {name}: {error}; train it with training/train_generator.py") from error
-    from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
+    try:
+        from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
+    except ModuleNotFoundError as error:
+        raise InputError(f"--agent {name}: needs {error.name}; install drake_clutter with [train]") from error
 
     return LearnedGenerator(path, config, temperature)
 

@@ -12,7 +12,7 @@ from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.tasks.exploration import Decision, ExplorationTask
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, Knowledge, exploration_graph
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph, seen
 
 TEACHER, STUDENT = "teacher", "student"
 
@@ -54,7 +54,7 @@ class LearnedExplorer:
             task: whose scene the agent knows all of; None: it knows K_t.
         """
         self._network, self._numbers, self._path, self._task = network, numbers, path, task
-        self._knowledge = Knowledge()
+        self._known: tuple[SceneObject, ...] = ()
 
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
@@ -64,8 +64,8 @@ class LearnedExplorer:
         Raises:
             InputError: an object of a class that the agent has not learned.
         """
-        self._knowledge.see(observation)
-        shown = self._knowledge.objects if self._task is None else self._task.scene.objects
+        self._known = seen(self._known, observation)
+        shown = self._known if self._task is None else self._task.scene.objects
         return self.decide(shown, observation, tried, failed)
 
     def decide(

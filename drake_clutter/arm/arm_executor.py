@@ -231,24 +231,31 @@ class ArmExecutor:
             return Outcome(result, scene, detail="" if no_spot else str(plan))
         simulation = ArmSimulation(self._arm, scene, plan, camera_altitude=self._config.camera.altitude)
         carried = simulation.run(record=True)
-        after = scene.at(carried.poses)
-        wanted = scene.at({move.pick: plan.X_TO_place})
-        detail, settle_config = str(carried), self._config.settle
         came_off = not carried.sealed or not math.isnan(carried.dropped)
-        others = [o for o in wanted.objects if o.name != move.pick or not came_off]
-        instability = worst_fall(others, after, settle_config)
-        if instability is None and not came_off:
-            moved = {n for n, distance in carried.displaced.items() if distance > UNTOUCHED} | {move.pick}
-            for group in touching_groups(after.objects, TOUCHING_MARGIN):
-                if moved.isdisjoint(o.name for o in group):
-                    continue
-                settled = settle(group, scene.tray_side, settle_config)
-                after = after.at(settled.poses)
-            instability = worst_fall(others, after, settle_config)
-        if instability is not None:
-            return Outcome(MoveResult.COLLAPSED, after, instability, carried.motion, detail=detail, released=plan.X_TO_place)
-        result = MoveResult.DROPPED if came_off else MoveResult.PLACED
-        return Outcome(result, after, None, carried.motion, detail=detail, released=plan.X_TO_place)
+        outcome = judged(scene, scene.at(carried.poses), move.pick, plan.X_TO_place, came_off, self._config.settle)
+        return replace(outcome, motion=carried.motion, detail=str(carried))
+
+
+def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: bool, config: SettleConfig) -> Outcome:
+    """What a motion of the arm has led to: what it touched is settled, and everything compared with where it should be.
+
+    Args:
+        before, after: the scene, at rest and after the motion.
+        pick: what was picked; X_TO_place: where it was to be let go; came_off: whether it came off the cup on the way.
+        config: the limits.
+    """
+    others = [o for o in before.at({pick: X_TO_place}).objects if o.name != pick or not came_off]
+    instability = worst_fall(others, after, config)
+    if instability is None and not came_off:
+        moved = {o.name for o in before.objects if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED} | {pick}
+        for group in touching_groups(after.objects, TOUCHING_MARGIN):
+            if not moved.isdisjoint(o.name for o in group):
+                after = after.at(settle(group, before.tray_side, config).poses)
+        instability = worst_fall(others, after, config)
+    result = MoveResult.DROPPED if came_off else MoveResult.PLACED
+    if instability is not None:
+        result = MoveResult.COLLAPSED
+    return Outcome(result, after, instability, released=X_TO_place)
 
 
 def worst_fall(before: Sequence[SceneObject], after: Scene, config: SettleConfig) -> Instability | None:

@@ -75,6 +75,7 @@ class ClutterStation(Diagram):
         bodies = self.scene.bodies.items()
         lockable = [(n, b) for n, b in bodies if n != jointed]
         self._joints = {n: plant.get_joint(i) for n, b in lockable for i in plant.GetJointIndices(b.model_instance())}
+        self._name_of = {int(body.index()): name for name, body in self.scene.bodies.items()}
         self._locked_filter: FilterId | None = None
         self._q_at, self._v_at = joint_numbers(plant, self.arm)
         ports = (("desired_state", plant.get_desired_state_input_port), ("feed_forward", plant.get_actuation_input_port))
@@ -117,6 +118,22 @@ class ClutterStation(Diagram):
         torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
         q, v = self.joint_angles(context), self.plant.GetVelocities(context)[self._v_at]
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
+
+    def touched(self, context: Context) -> set[str]:
+        """The names of objects that touch the arm, its tool, or another object, from the plant's context.
+
+        Locked objects touch nothing but what is not locked: so of them, those that something free or the arm has run into.
+        """
+        results = self.plant.get_contact_results_output_port().Eval(context)
+        surfaces = (results.hydroelastic_contact_info(i).contact_surface() for i in range(results.num_hydroelastic_contacts()))
+        pairs = [(surface.id_M(), surface.id_N()) for surface in surfaces]
+        points = (results.point_pair_contact_info(i) for i in range(results.num_point_pair_contacts()))
+        bodies = [{self._name_of.get(b, "") for b in (int(p.bodyA_index()), int(p.bodyB_index()))} for p in points]
+        inspector = self.scene.scene_graph.model_inspector()
+        for pair in pairs:
+            found = (self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in pair)
+            bodies.append({self._name_of.get(int(body.index()), "") for body in found if body is not None})
+        return set().union(*bodies) - {""}
 
     def lock_all_but(self, root: Context, free: Set[str]) -> None:
         """Makes all objects immovable but some. Those that were free must be at rest: what is locked stands still.
@@ -246,7 +263,9 @@ class Freedom:
         moving = {name for name in self.free if speeds[name] > self.AT_REST}
         lost = not math.isnan(self._vacuum.dropped) or (must_hold and not self._vacuum.sealed)
         held = {self._vacuum.held} - {""}
-        free = set(speeds) if lost else {*wanted, *moving, *held}
+        # What is run into is freed as well: a locked object that is hit would stand like a rock.
+        hit = self._station.touched(self._station.plant_context(root)) - self.free if self.free else set()
+        free = set(speeds) if lost else {*wanted, *moving, *held, *hit}
         if free != self.free:
             self._station.lock_all_but(root, free)
             self.free = free

@@ -50,6 +50,8 @@ def evaluate(
     ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
     """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
+    if not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}; give a file in one that exists")
     for agent in agents:
         make_explorers(agent, config)  # says what is wrong before anything is played
     episodes = [Episode(*scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]

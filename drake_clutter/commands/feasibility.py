@@ -19,7 +19,7 @@ from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.reachability import Reachability, base_scores
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, LayoutConfig, load_typed
+from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.files import InputError, output_directory, write_json, write_text
 from drake_clutter.reports.feasibility_report import write_report
 from drake_clutter.runner import item_rng, map_ordered
@@ -31,6 +31,8 @@ from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
 HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
 """m, of the reachability map."""
+TIME_LIMIT = 5.0
+"""s, for each move."""
 BASE_X, BASE_Y = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(), np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
 """m, of the bases that are compared, on one side of the tray: the tray is square, so the other sides are like it."""
 
@@ -204,7 +206,7 @@ class Worker:
         if scene is None:
             return {"scene": path.stem, "unstable": True, "moves": [], "noise": []}
         if setup not in self._studies:
-            arm, planner = self._job.setups[setup], PlannerConfig(optimise=False)
+            arm, planner = self._job.setups[setup], PlannerConfig(optimise=False, time_limit=TIME_LIMIT)
             self._studies[setup] = FeasibilityStudy(setup, arm, self._job.world, planner, self._job.seed)
         study = self._studies[setup]
         rows = study.moves(path.stem, number, scene)
@@ -308,17 +310,15 @@ GROUPS: dict[str, Callable[[dict[str, Any]], str]] = {
     "rest": lambda row: row["rest"],
     "objects_below": lambda row: str(row["below"]),
     "top_height_cm": lambda row: f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}",
-    "pick_from": lambda row: (
-        _third(row["pick_x"], "near", "middle", "far") + " " + _third(row["pick_y"], "right", "middle", "left")
-    ),
+    "pick_from_cm": lambda row: f"x {_twenty(row['pick_x'])}, y {_twenty(row['pick_y'])}",
 }
-"""What the moves of a summary are grouped by; near: to the arm."""
+"""What the moves of a summary are grouped by; places in the tray's frame, heights above its floor."""
 
 
-def _third(place: float, *names: str) -> str:
-    """Of the tray, as wide as it is by default."""
-    third = LayoutConfig().tray_side / 6
-    return names[(place > -third) + (place > third)]
+def _twenty(place: float) -> str:
+    """The 20 cm within which a place (m) lies, in cm."""
+    low = 20 * math.floor((place + 0.1) / 0.2) - 10
+    return f"{low} to {low + 20}"
 
 
 def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Sequence[dict[str, Any]]) -> dict[str, Any]:

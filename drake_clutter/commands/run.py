@@ -27,10 +27,12 @@ def scene_of(scenario: Scenario, first: int = 0) -> tuple[Scene, int]:
     Raises:
         InputError: a scene file that cannot be used, or a generator that makes no stable scene that hides something.
     """
+    catalogue = Path(scenario.catalogue) if scenario.catalogue else None
     if scenario.scene:
-        file = load_scene(Path(scenario.scene), load_catalogue())
-        return (file.settled_scene if file.verdict else at_rest(file.scene, scenario.world, scenario.seed)), 0
-    job = GenerationJob(scenario.generator, scenario.objects, None, scenario.nodes, scenario.seed, scenario.world)
+        file = load_scene(Path(scenario.scene), load_catalogue(catalogue))
+        judged = file.verdict is not None and file.verdict.stable
+        return (file.settled_scene if judged else at_rest(file.scene, scenario.world, scenario.seed)), 0
+    job = GenerationJob(scenario.generator, scenario.objects, catalogue, scenario.nodes, scenario.seed, scenario.world)
     generate = SceneGenerator(job)
     for index in range(first, first + SCENE_TRIES):
         made = generate(index)

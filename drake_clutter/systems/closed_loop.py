@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
-from drake_clutter.arm.arm_executor import LOOK, disturbed_by, nearest, taking_part, worst_fall
+from drake_clutter.arm.arm_executor import LOOK, disturbed_by, judged, nearest, taking_part
 from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
 from drake_clutter.arm.pick_place import PickPlaceExecutor
@@ -191,7 +191,7 @@ class ClosedLoop:
             if looked_again and before.request is not None:
                 report(self._judged(root, before.request, answers[before.request.number], tuple(motion)))
                 motion.clear()
-        end = state.finish.value if state.finish else ""
+        end = state.finish.value if state.finish and self.task.end is None else ""
         return Timing(root.get_time(), time.perf_counter() - begun_at, self._planning, end)
 
     def _objects(self, root: Context) -> tuple[SceneObject, ...]:
@@ -200,19 +200,16 @@ class ClosedLoop:
     def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Step:
         """How a move went, by the truth, once the agent has looked again."""
         move, before, plan = request.move, self.task.scene, answer.plan
-        if plan is None:
-            no_spot = answer.failure.startswith(PlanFailure.NO_FREE_SPOT.value)
+        assert plan is not None
+        if isinstance(plan, NoPlan):
+            no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
-            return self.task.note(move, Outcome(result, before, detail=answer.failure), request.decision)
+            return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), request.decision)
         after = replace(before, objects=self._objects(root))
         picked = nearest(before.objects, plan.X_TO_pick).name
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
-        wanted = [o for o in before.at({picked: plan.X_TO_place}).objects if o.name != picked or not came_off]
-        instability = worst_fall(wanted, after, self._world.settle)
-        result = MoveResult.DROPPED if came_off else MoveResult.PLACED
-        if instability is not None:
-            result = MoveResult.COLLAPSED
+        outcome = judged(before, after, picked, plan.X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - plan.X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else f"{1000 * error:.1f} mm from where it was to be"
-        outcome = Outcome(result, after, instability, motion, detail=detail, released=plan.X_TO_place)
-        return self.task.note(move, outcome, request.decision)
+        # The simulation goes on from where things are in it.
+        return self.task.note(move, replace(outcome, scene=after, motion=motion, detail=detail), request.decision)

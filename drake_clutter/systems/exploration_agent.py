@@ -8,11 +8,13 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
+from drake_clutter.arm.plan import NoPlan
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.systems.move_planner import Answer
 from drake_clutter.tasks.exploration import Decision
+from drake_clutter.tasks.exploration_graph import seen
 
 PERIOD = 0.05
 """s, between two looks at what the others are doing."""
@@ -84,13 +86,6 @@ class AgentState:
         return self
 
 
-def seen(known: Sequence[SceneObject], observation: Observation) -> tuple[SceneObject, ...]:
-    """K_(t+1): what is in view as it is seen, the rest as it was."""
-    objects = {o.name: o for o in known}
-    objects |= {d.name: SceneObject(d.name, d.object_class, d.X_TO) for d in observation.detections}
-    return tuple(objects.values())
-
-
 class ExplorationAgent(LeafSystem):
     """Chooses moves until nothing is left to do.
 
@@ -143,7 +138,7 @@ class ExplorationAgent(LeafSystem):
             if answer.number < now.request.number:
                 return now
             move = now.request.move
-            if answer.failure:
+            if isinstance(answer.plan, NoPlan):
                 return replace(now, phase=Phase.LOOKING, look_at=time, tried=(*now.tried, move), failed=(*now.failed, move))
             if self._finished.Eval(context)[0] > now.carried_out:
                 over = replace(now, phase=Phase.LOOKING, look_at=time + self._rest, tried=(*now.tried, move), failed=())

@@ -24,13 +24,11 @@ class Answer:
 
     Attributes:
         number: of the request; 0: none yet.
-        plan: if there is one.
-        failure: why there is none, or "".
+        plan: or why there is none.
     """
 
     number: int = 0
-    plan: Plan | None = field(default=None, repr=False)
-    failure: str = ""
+    plan: Plan | NoPlan | None = field(default=None, repr=False)
 
     def __deepcopy__(self, memo: object) -> "Answer":
         """Itself: it never changes, and Drake copies abstract values again and again."""
@@ -68,12 +66,9 @@ class MovePlanner(LeafSystem):
         request = self._request.Eval(context)
         if request is not None and request.number != answer.number:
             found = self._plan(request, item_rng(self._seed, request.number))
-            if isinstance(found, NoPlan):
-                answer = Answer(request.number, None, str(found))
-            else:
-                answer = Answer(request.number, found)
+            if isinstance(found, Plan):
                 state.get_mutable_abstract_state(int(self._latest)).set_value(found)
-            state.get_mutable_abstract_state(int(self._answer)).set_value(answer)
+            state.get_mutable_abstract_state(int(self._answer)).set_value(Answer(request.number, found))
         return EventStatus.Succeeded()
 
     def _calc_answer(self, context: Context, output: AbstractValue) -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drake_clutter.agents.exploration import BASELINES, make_explorers
-from drake_clutter.agents.learned_explorer import LearnedExplorers
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -22,6 +21,7 @@ class Scenario:
 
     Attributes:
         scene: a scene file; "": one that the generator makes.
+        catalogue: a folder with object classes of one's own, or "".
         generator, objects, nodes: as for `drake-clutter generate`.
         agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
         max_moves: after which it ends.
@@ -30,6 +30,7 @@ class Scenario:
     """
 
     scene: str = ""
+    catalogue: str = ""
     generator: str = "sg-star"
     objects: str = "ycb7"
     nodes: int = 25
@@ -60,6 +61,8 @@ def policy_of(name: str, config: ClutterConfig) -> Choose:
 
         return choose
     explorers = make_explorers(name, config)
+    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+
     if not isinstance(explorers, LearnedExplorers) or explorers.privileged:
         raise InputError(
             f"agent: {name} knows more than the camera shows; allowed is a student, or one of {', '.join(BASELINES)}"

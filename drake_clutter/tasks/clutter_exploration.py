@@ -15,7 +15,7 @@ from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
 from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, Knowledge, exploration_graph
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, exploration_graph, seen
 
 TRAINING_SET = "training/scenes/train_sg_star.json"
 _TRIES = 100
@@ -114,22 +114,18 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         if len(scene.objects) >= self._nodes:
             raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
-        self.knowledge = Knowledge()
-        self.knowledge.see(self.task.look.observation)
+        self.known = seen((), self.task.look.observation)
 
     @property
     def objects(self) -> tuple[str, ...]:
         """The objects that nodes 1, 2, ... stand for."""
-        shown = self.task.scene if self._privileged else self.knowledge
-        return tuple(o.name for o in shown.objects)
+        return tuple(o.name for o in (self.task.scene.objects if self._privileged else self.known))
 
     def observe(self, *, privileged: bool | None = None) -> GraphObservation:
         """The observation; or the other one, for a teacher that watches a student."""
-        shown = self.task.scene if (self._privileged if privileged is None else privileged) else self.knowledge
+        shown = self.task.scene.objects if (self._privileged if privileged is None else privileged) else self.known
         tried = [step.move for step in self.task.steps]
-        return exploration_graph(
-            shown.objects, self.task.look.observation, tried, self.numbers, self.task.failed, nodes=self._nodes
-        )
+        return exploration_graph(shown, self.task.look.observation, tried, self.numbers, self.task.failed, nodes=self._nodes)
 
     def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out."""
@@ -139,7 +135,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             return before, 0.0, False, False, {}
         step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
         if step.outcome.result is not MoveResult.COLLAPSED:
-            self.knowledge.see(self.task.look.observation)
+            self.known = seen(self.known, self.task.look.observation)
         observation, end = self.observe(), self.task.end
         if end is None and not observation["allowed"].any():
             end = EpisodeEnd.GAVE_UP

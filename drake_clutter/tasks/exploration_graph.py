@@ -136,18 +136,8 @@ def exploration_graph(
     }
 
 
-class Knowledge:
-    """K_t of an episode: what has ever been in view, each object as it was last seen."""
-
-    def __init__(self) -> None:
-        self._objects: dict[str, SceneObject] = {}
-
-    def see(self, observation: Observation) -> None:
-        """Takes in what is in view."""
-        for d in observation.detections:
-            self._objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
-
-    @property
-    def objects(self) -> tuple[SceneObject, ...]:
-        """In the order in which they were found."""
-        return tuple(self._objects.values())
+def seen(known: Sequence[SceneObject], observation: Observation) -> tuple[SceneObject, ...]:
+    """K_(t+1) from K_t: what is in view as it is seen, the rest as it was seen last; in the order in which it was found."""
+    objects = {o.name: o for o in known}
+    objects |= {d.name: SceneObject(d.name, d.object_class, d.X_TO) for d in observation.detections}
+    return tuple(objects.values())

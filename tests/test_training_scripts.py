@@ -1,0 +1,75 @@
+"""The scripts that make sets of scenes and the explorers' tables."""
+
+from pathlib import Path
+
+import pytest
+from conftest import CATALOGUE, training_script
+
+from drake_clutter.agents.evaluation import EpisodeResult
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene_set import load_scene_set
+
+ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
+
+
+def result(ended: str, hidden: int, found_after: tuple[int, ...], not_carried_out: int = 0) -> EpisodeResult:
+    found = found_after[-1] if found_after else 0
+    return EpisodeResult("scene", "agent", ended, hidden, found, len(found_after), found_after, not_carried_out)
+
+
+def test_a_row_of_the_table() -> None:
+    """By hand: one within 10 moves, one within 20, a collapse after two, and one that finds a part."""
+    results = [
+        result(ALL, 2, (1, 2)),
+        result(ALL, 3, (0,) * 10 + (1, 3), not_carried_out=3),
+        result(COLLAPSED, 4, (1, 1)),
+        result(OUT, 1, (0,) * 20),
+    ]
+    ceiling = [result(ALL, 2, (2,)), result(ALL, 3, (0, 0, 3)), result(ALL, 4, (4,)), result("gave up", 1, ())]
+    row = training_script("explorer_results").row_of(results, ceiling)
+    assert row["hidden"] == 2.5
+    assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
+    assert (row["within_10"]["found"], row["within_20"]["found"]) == (3 / 4, 6 / 4)
+    assert (row["within_10"]["found_of_hidden"], row["within_20"]["found_of_hidden"]) == (0.3, 0.6)
+    assert row["within_10"]["collapsed"] == row["within_20"]["collapsed"] == 0.25
+    assert row["moves_of_successes"] == 7
+    assert row["not_carried_out"] == 3 / 36
+    assert (row["moves_to_ceiling"], row["both_succeeded"]) == (14 / 4, 2)
+
+
+def test_episodes_are_played_once(tmp_path: Path) -> None:
+    """And those that are there are not taken for others."""
+    script = training_script("explorer_results")
+    scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOGUE)
+    path = tmp_path / "random.json"
+    played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
+    before = path.read_bytes()
+    assert script.played(scenes, "random", 1, "equilibrium", 0, 1, path) == played
+    assert path.read_bytes() == before
+    assert played[0].hidden == scenes.scenes[0].hidden
+    with pytest.raises(InputError, match=r"random\.json: holds other episodes \(agent, seed\)"):
+        script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
+    with pytest.raises(InputError, match="is the whole table's"):
+        script.main(tmp_path, only="sg_star_25")
+    with pytest.raises(InputError, match="--only none"):
+        script.main(tmp_path, only="none", out=tmp_path / "table.json")
+
+
+@pytest.mark.parametrize("drake", [False, True])
+def test_a_set_of_scenes(drake: bool, tmp_path: Path) -> None:
+    script, work = training_script("make_scenes"), tmp_path / "work" if drake else None
+    options = {"agent": "random", "nodes": 12, "work": work}
+    script.main(tmp_path / "first.json", count=2, seed=1, **options)
+    first = load_scene_set(tmp_path / "first.json", CATALOGUE)
+    assert first.about["judge"] == ("drake" if drake else "fast")
+    assert len({scene.form for scene in first.scenes}) == 2
+    assert all(scene.hidden > 0 and (scene.settled is not None) == drake for scene in first.scenes)
+    again = tmp_path / "again.json"
+    script.main(again, count=1, seed=1, not_in=[tmp_path / "first.json"], **options)
+    (other,) = load_scene_set(again, CATALOGUE).scenes
+    assert other.form not in {scene.form for scene in first.scenes}
+
+
+def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--count 1: only 0 of 20 scenes are stable"):
+        training_script("make_scenes").main(tmp_path / "set.json", agent="random", nodes=3, count=1)
