@@ -162,7 +162,7 @@ def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneSet) -> None:
         assert [environment.objects[x - 1], TRAY if y == 0 else environment.objects[y - 1]] == named
 
 
-TEACHER_SETTINGS = ["learning.steps=120", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=20"]
+TEACHER_SETTINGS = ["learning.steps=400", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=20"]
 TEACHER_SETTINGS += ["evaluation_episodes=4"]
 STUDENT_SETTINGS = ["learning.rounds=6", "learning.episodes=5", "learning.width=8", "learning.updates=4", "max_moves=4"]
 STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
@@ -183,14 +183,14 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Pa
     options = [argument for setting in settings for argument in ("--set", setting)]
     command = [sys.executable, str(ROOT / "training" / f"{script}.py"), "--out", str(tmp_path / "killed"), *options]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    train = training_script(script)
-    train.main(tmp_path / "whole", settings=settings)
     while not (tmp_path / "killed" / "state.safetensors").exists():
         assert killed.poll() is None
-        time.sleep(0.02)
+        time.sleep(0.01)
     killed.kill()
     killed.wait()
-    (tmp_path / "killed" / "explorer.safetensors").unlink(missing_ok=True)  # if the kill came too late
+    assert not (tmp_path / "killed" / "explorer.safetensors").exists()
+    train = training_script(script)
+    train.main(tmp_path / "whole", settings=settings)
     train.main(tmp_path / "killed", settings=settings)
     whole, again = (load_checkpoint(tmp_path / name / "explorer.safetensors") for name in ("whole", "killed"))
     assert all(torch.equal(whole.weights[name], again.weights[name]) for name in whole.weights)

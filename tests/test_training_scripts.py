@@ -25,7 +25,7 @@ def test_a_row_of_the_table() -> None:
         result(COLLAPSED, 4, (1, 1)),
         result(OUT, 1, (0,) * 20),
     ]
-    ceiling = [result(ALL, 2, (2,)), result(ALL, 3, (0, 0, 3)), result(ALL, 4, (4,)), result("gave up", 1, ())]
+    ceiling = [result(ALL, 2, (2, 2)), result(ALL, 3, (0, 3)), result(ALL, 4, (4,)), result("gave up", 1, ())]
     row = training_script("explorer_results").row_of(results, ceiling)
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
@@ -34,6 +34,8 @@ def test_a_row_of_the_table() -> None:
     assert row["within_10"]["collapsed"] == row["within_20"]["collapsed"] == 0.25
     assert row["moves_of_successes"] == 7
     assert row["not_carried_out"] == 3 / 36
+    low, high = row["moves_to_ceiling_ci95"]
+    assert (low, high) == (2 / 2, 12 / 2), "two scenes, drawn again and again: either of them twice, or both"
     assert (row["moves_to_ceiling"], row["both_succeeded"]) == (14 / 4, 2)
 
 

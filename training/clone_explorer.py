@@ -76,9 +76,8 @@ def main(
             episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
             run.report(figures(episodes), learner.losses)
             run.save()
-    run.finish(
-        CHECKPOINT, learner.network, {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width)}
-    )
+    about = {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
+    run.finish(CHECKPOINT, learner.network, about)
 
 
 if __name__ == "__main__":

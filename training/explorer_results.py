@@ -76,28 +76,41 @@ def file_name(agent: str) -> str:
     return f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
 
 
+def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> tuple[float, float]:
+    """95 % confidence interval of a ratio of sums over scenes, by bootstrap."""
+    scenes = np.random.default_rng(0).integers(len(numerators), size=(2000, len(numerators)))
+    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(axis=1)
+    low, high = np.quantile(ratios, [0.025, 0.975]).tolist()
+    return low, high
+
+
 def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | None) -> dict[str, Any]:
     """The figures of an agent on scenes; `ceiling`: how someone who knows everything fared on the same."""
     row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
     for limit in LIMITS:
         won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
         found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
+        fallen = [r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results]
         row[f"within_{limit}"] = {
             "success": sum(won) / len(won),
             "success_ci95": wilson_interval(sum(won), len(won)),
             "found": float(np.mean(found)),
             "found_ci95": mean_interval(found),
             "found_of_hidden": sum(found) / sum(r.hidden for r in results),
-            "collapsed": sum(r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results) / len(results),
+            "found_of_hidden_ci95": ratio_interval(found, [r.hidden for r in results]),
+            "collapsed": sum(fallen) / len(results),
+            "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
         }
     won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
     row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
+    row["moves_of_successes_ci95"] = mean_interval(won_moves)
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
     if ceiling is not None:
         pairs = [
             (r.moves, c.moves) for r, c in zip(results, ceiling, strict=True) if r.ended == c.ended == EpisodeEnd.ALL_FOUND.value
         ]
         row["moves_to_ceiling"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
+        row["moves_to_ceiling_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
         row["both_succeeded"] = len(pairs)
     return row
 

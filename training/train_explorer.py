@@ -71,7 +71,7 @@ def main(
             episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
             run.report(figures(episodes), learner.losses)
             run.save()
-    about = {"kind": TEACHER, "network": about_explorer(environment.numbers, given.learning.width)}
+    about = {"kind": TEACHER, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
     run.finish(CHECKPOINT, learner.network, about)
 
 

@@ -32,12 +32,21 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
     if about.get("kind") not in allowed:
         raise InputError(f"{path}: is a checkpoint of a {about.get('kind')}; allowed is one of a {' or '.join(allowed)}")
-    network = about["network"]
+    network = about.get("network", {})
+    if "node_kinds" not in network or "width" not in network:
+        raise InputError(
+            f"{path.with_suffix('.json')}: network: lacks node_kinds or width; allowed is the file as it was written"
+        )
     numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
     if network != about_explorer(numbers, network["width"]):
         raise InputError(f"{path}: was trained on other features; allowed is a checkpoint of this version")
     made = ExplorerNetwork(len(numbers), network["width"])
-    made.load_state_dict(checkpoint.weights)
+    try:
+        made.load_state_dict(checkpoint.weights)
+    except RuntimeError as error:
+        raise InputError(
+            f"{path}: its weights do not fit {path.with_suffix('.json')}; allowed are the files of one training"
+        ) from error
     return made.eval(), numbers
 
 

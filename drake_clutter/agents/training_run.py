@@ -96,8 +96,10 @@ def device_of(name: str) -> torch.device:
     """The device of an option: auto, cpu or cuda.
 
     Raises:
-        InputError: another name.
+        InputError: another name, or a device that is not there.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {name}; allowed are auto, cpu, cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: PyTorch finds none; allowed here are auto, cpu")
     return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)

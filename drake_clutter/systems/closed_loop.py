@@ -66,7 +66,9 @@ class LabelPerception:
         """See `Perceive`."""
         poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
         told = self._detector.look(self._scene.at(poses)).observation
-        return Observation(depth, told.detections, told.camera, told.tray_side)
+        unobstructed = depth > told.depth - 0.01  # the arm may be in the way
+        in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
+        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.tray_side)
 
 
 class _Elsewhere:
