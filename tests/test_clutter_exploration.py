@@ -162,7 +162,7 @@ def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneSet) -> None:
         assert [environment.objects[x - 1], TRAY if y == 0 else environment.objects[y - 1]] == named
 
 
-TEACHER_SETTINGS = ["learning.steps=400", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=20"]
+TEACHER_SETTINGS = ["learning.steps=240", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=40"]
 TEACHER_SETTINGS += ["evaluation_episodes=4"]
 STUDENT_SETTINGS = ["learning.rounds=6", "learning.episodes=5", "learning.width=8", "learning.updates=4", "max_moves=4"]
 STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
