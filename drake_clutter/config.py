@@ -182,7 +182,7 @@ _ALLOWED = {
     "evaluation_scenes": (1, math.inf),
     "save_every": (1, math.inf),
 }
-"""Least and greatest value of a field, by its last two names; of every other number, `_ANY`."""
+"""Least and greatest value of a field, by its last two names or else by its last; of every other number, `_ANY`."""
 
 
 def _check(given: Any, defaults: Any, source: str, where: str = "") -> None:
@@ -212,7 +212,8 @@ def _check(given: Any, defaults: Any, source: str, where: str = "") -> None:
 
 
 def _check_number(value: Any, default: float, source: str, field: str) -> None:
-    low, high = _ALLOWED.get(".".join(field.split(".")[-2:]), _ANY)
+    names = field.split(".")
+    low, high = _ALLOWED.get(".".join(names[-2:]), _ALLOWED.get(names[-1], _ANY))
     kind = int if isinstance(default, int) else (int, float)
     if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
         whole = "a whole number" if isinstance(default, int) else "a finite number"

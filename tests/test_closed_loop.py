@@ -1,7 +1,9 @@
 """The closed loop: the agent's decisions on scripted answers, and a whole episode in Drake."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -166,17 +168,11 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.tray_side)
     agent, names = LargestClear(), list[str]()
 
-    def choose(
-        known: Sequence[SceneObject],
-        observation: Observation,
-        tried: Sequence[Move],
-        rng: np.random.Generator,
-        failed: Sequence[Move],
-    ) -> Decision:
+    def marker_first(known: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], *others: Any) -> Decision:
         names.append(",".join(o.name for o in known))
-        return Decision(Move("large_marker")) if not tried else agent.choose(observation, tried, rng, failed)
+        return Decision(Move("large_marker")) if not tried else agent.choose(observation, tried, *others)
 
-    loop = ClosedLoop(scene, choose, max_moves=4, seed=0, world=config)
+    loop = ClosedLoop(scene, marker_first, max_moves=4, seed=0, world=config)
     timing = loop.run(record=True)
     assert [step.outcome.result for step in loop.task.steps] == [MoveResult.NOT_PLANNED, MoveResult.PLACED]
     assert loop.task.steps[0].outcome.detail == "no seal: large_marker"
@@ -188,7 +184,8 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
     assert 3 < timing.robot < 15
     fields = write(tmp_path, Scenario(agent="largest-clear"), loop.task, timing, "A test")
-    assert fields["success"]
+    assert (fields["success"], fields["ended"]) == (True, "all found")
+    assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
     assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
 
 
@@ -198,7 +195,10 @@ def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig
 
 
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
-    assert load_typed(Scenario(), None, ["agent=random", "arm.payload=5"]).arm.payload == 5
+    page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
+    (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
+    told = load_typed(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"])
+    assert (told.arm.base, told.arm.payload, told.arm.suction.cup_diameter) == ([-0.65, 0.0, 0.3, 0.0], 5.0, 0.015)
     with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
         policy_of("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):

@@ -1,14 +1,13 @@
 """Explorers: RE, LF and LF-clear, which need no learning (SPEC section 4), and where the trained ones are found."""
 
 from collections.abc import Callable, Collection, Sequence
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
+from drake_clutter.agents.shipped import checkpoint_path
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.scenes.seams import Detection, Move, Observation
@@ -143,14 +142,8 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
         raise InputError(
             f"--agent {name}; allowed are {', '.join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])}, or a .safetensors file"
         )
-    try:
-        path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
-    except FileNotFoundError as error:
-        raise InputError(f"--agent {name}: {error}; train it with training/train_explorer.py and clone_explorer.py") from error
-    try:
-        from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
-    except ModuleNotFoundError as error:
-        raise InputError(f"--agent {name}: needs {error.name}; install drake_clutter with [train]") from error
+    path = checkpoint_path(name, TRAINED)
+    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
     return LearnedExplorers(path)
 

@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.stats import norm
 
+from drake_clutter.agents.shipped import checkpoint_path
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
-from drake_clutter.resources import shipped_path
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
@@ -103,14 +103,8 @@ def make_generation_agent(name: str, config: ClutterConfig, temperature: float |
         return HillClimber(config)
     if not learned:
         raise InputError(f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file")
-    try:
-        path = shipped_path(TRAINED[name]) if name in TRAINED else Path(name)
-    except FileNotFoundError as error:
-        raise InputError(f"--agent {name}: {error}; train it with training/train_generator.py") from error
-    try:
-        from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
-    except ModuleNotFoundError as error:
-        raise InputError(f"--agent {name}: needs {error.name}; install drake_clutter with [train]") from error
+    path = checkpoint_path(name, TRAINED)
+    from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
 
     return LearnedGenerator(path, config, temperature)
 

@@ -34,7 +34,7 @@ class PlannerConfig:
         yaws: of the cup, that are tried.
         attempts: of grasp, yaw, branch and height, at most.
         least_acceleration: m/s^2, that a grasp must bear.
-        time_limit: s; infinite, so that the same question has the same answer on any machine.
+        time_limit: s; so long that it decides nothing: the same question has the same answer on any machine.
         optimise: whether the sure way is made quicker by trajectory optimisation, see `arm/shorten.py`.
     """
 
@@ -46,7 +46,7 @@ class PlannerConfig:
     yaws: int = 12
     attempts: int = 400
     least_acceleration: float = 0.3
-    time_limit: float = math.inf
+    time_limit: float = 600.0
     optimise: bool = True
 
 

@@ -1,6 +1,6 @@
 """`drake-clutter explore`, `move`: moves in a scene, with `episode.json` and a page to watch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,13 +171,21 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
 
 
 def write_episode(
-    out: Path, task: ExplorationTask, title: str, agent: str, fidelity: str, seed: int, *, arm: ArmConfig | None = None
+    out: Path,
+    task: ExplorationTask,
+    title: str,
+    agent: str,
+    fidelity: str,
+    seed: int,
+    *,
+    arm: ArmConfig | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
 
-    At fidelity `arm` also `trajectory.h5`, see `arm/trajectory_file.py`.
+    At fidelity `arm` also `trajectory.h5`, see `arm/trajectory_file.py`. `more` is put over what is known of the episode.
     """
-    fields = episode_fields(task, agent, fidelity, seed)
+    fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
     save_scene(out / "after.yaml", task.scene)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
     if fidelity == "arm":

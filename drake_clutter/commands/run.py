@@ -8,7 +8,7 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.explore import Report, at_rest, write_episode
 from drake_clutter.config import config_yaml
-from drake_clutter.files import InputError, write_json, write_text
+from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
@@ -53,10 +53,8 @@ def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, 
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.start)
-    fields = write_episode(out, task, title, scenario.agent, "arm", scenario.seed, arm=scenario.arm)
-    fields |= {"ended": timing.end or fields["ended"], "timing": asdict(timing), **more}
-    write_json(out / "episode.json", fields)
-    return fields
+    told: dict[str, Any] = {"timing": asdict(timing), **more} | ({"ended": timing.end} if timing.end else {})
+    return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, arm=scenario.arm, more=told)
 
 
 def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:

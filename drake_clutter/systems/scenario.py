@@ -1,18 +1,12 @@
 """Scenarios: everything that decides an episode of the closed loop, in one typed file."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from drake_clutter.agents.exploration import BASELINES, make_explorers
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.systems.exploration_agent import Choose
-from drake_clutter.tasks.exploration import Decision
 
 
 @dataclass
@@ -49,17 +43,7 @@ def policy_of(name: str, config: ClutterConfig) -> Choose:
     """
     if name in BASELINES:
         agent = BASELINES[name]()
-
-        def choose(
-            known: Sequence[SceneObject],
-            observation: Observation,
-            tried: Sequence[Move],
-            rng: np.random.Generator,
-            failed: Sequence[Move],
-        ) -> Decision:
-            return agent.choose(observation, tried, rng, failed)
-
-        return choose
+        return lambda _, observation, tried, rng, failed: agent.choose(observation, tried, rng, failed)
     explorers = make_explorers(name, config)
     from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
@@ -68,4 +52,4 @@ def policy_of(name: str, config: ClutterConfig) -> Choose:
             f"agent: {name} knows more than the camera shows; allowed is a student, or one of {', '.join(BASELINES)}"
         )
     learned = explorers.student()
-    return lambda known, observation, tried, rng, failed: learned.decide(known, observation, tried, failed)
+    return lambda known, observation, tried, _, failed: learned.decide(known, observation, tried, failed)

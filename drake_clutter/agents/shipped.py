@@ -1,0 +1,27 @@
+"""Where the checkpoints of trained agents are, without PyTorch."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+from drake_clutter.files import InputError
+from drake_clutter.resources import shipped_path
+
+
+def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
+    """The file of a trained agent.
+
+    Args:
+        name: of a shipped one, or a user's own .safetensors file.
+        shipped: where those are, by name.
+
+    Raises:
+        InputError: it is not shipped yet, or PyTorch is not installed.
+    """
+    missing = [module for module in ("torch", "safetensors") if find_spec(module) is None]
+    if missing:
+        raise InputError(f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]")
+    try:
+        return shipped_path(shipped[name]) if name in shipped else Path(name)
+    except FileNotFoundError as error:
+        raise InputError(f"--agent {name}: {error}; train it with the scripts of training/, and give its file") from error
