@@ -7,7 +7,7 @@ from drake_clutter.scenes.scene import Scene
 
 
 class RayDetector:
-    """Detects what `LabelDetector` does (a `Detector`), of convex objects, a hundred times faster."""
+    """Detects what `LabelDetector` does (a `Detector`), of convex objects, without a renderer."""
 
     def __init__(self, config: CameraConfig) -> None:
         self._rays = RayCaster(config)
