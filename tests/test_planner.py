@@ -184,7 +184,7 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
     scene, step = planner().clearance_scene(PILE), 1e-4
     scene.hold(plan.pick, inverse(plan.X_OG))
     errors = list[float]()
-    for time in np.linspace(0.0, plan.phases[1].duration, 7):
+    for time in np.linspace(0.0, plan.phases[1].duration, 15):
         q = plan.phases[1].trajectory.value(time).ravel()
         gradients = scene.gradients(q, 0.2)
         assert [clearance for clearance, _ in gradients] == scene.close(q, 0.2)

@@ -13,7 +13,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_clutter.arm.clearance import Clearance, ClearanceScene
 from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.paths import Payload, least_time, nearest_turns, sampled, smooth, straight, timed
+from drake_clutter.arm.paths import Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
 from drake_clutter.arm.plan import NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.arm.shorten import Wall, Way, shortened
 from drake_clutter.arm.station import ArmConfig
@@ -348,11 +348,11 @@ class Attempts:
             return found
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
-        q = shortened(Way(phase.trajectory, upright, carried, payload.along_axis, walls, self._scene.cup_jacobian))
-        if q is None:
+        quick = shortened(Way(phase.trajectory, upright, carried, payload.along_axis, walls, self._scene.cup_jacobian))
+        trajectory = slowed(quick, self._arm, payload) if quick else None
+        if trajectory is None or trajectory.end_time() >= phase.sure:
             return phase
-        path = smooth(q)
-        clearance, trajectory = self._checked(phase.name, path, X_OG, ends, 0), timed(path, self._arm, payload)
-        if clearance is None or trajectory is None or trajectory.end_time() >= phase.sure:
+        clearance = self._checked(phase.name, trajectory, X_OG, ends, 0)
+        if clearance is None:
             return phase
         return Phase(phase.name, trajectory, clearance, phase.sure)

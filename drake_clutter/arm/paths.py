@@ -1,6 +1,5 @@
 """From joint angles along a way to a trajectory that respects the arm's limits."""
 
-import logging
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,17 +7,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import BsplineBasis, KnotVectorType, RigidTransform
-from pydrake.multibody.optimization import Toppra
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
+from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.arm.epick import epick_sdf
+from drake_clutter.arm.kinematics import forward_kinematics
 from drake_clutter.arm.station import ArmConfig
+from drake_clutter.arm.time_optimal import squared_speeds
 from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
 from drake_clutter.resources import shipped_path
-from drake_clutter.simulation.quiet import drake_silent_below
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +32,8 @@ SPACING = 0.08
 """rad, that a joint turns at most from one point of a way to the next."""
 _ORDER = 4
 SWING = 0.1
-_GRID = 70
+"""s, see `softened`."""
+_GRID = 300
 """Points of a path at which the limits are imposed."""
 
 
@@ -119,32 +120,40 @@ def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
 
 
 def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
-    """The path as fast as velocity, acceleration, torque and the cup's hold allow (Pham and Pham 2018, "TOPP-RA"), or None."""
+    """The path as fast as velocity, acceleration, torque and the cup's hold allow; None if they do not."""
     plant = dynamics_plant(config, payload)
     grid = np.linspace(path.start_time(), path.end_time(), _GRID)
-    toppra = Toppra(path, plant, grid)
-    toppra.AddJointVelocityLimit(-MARGIN * VELOCITY_LIMIT, MARGIN * VELOCITY_LIMIT)
-    toppra.AddJointAccelerationLimit(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
+    velocity = path.MakeDerivative(1)
+    q, slope, curve = path.vector_values(grid).T, velocity.vector_values(grid).T, velocity.MakeDerivative(1).vector_values(grid).T
+    with np.errstate(divide="ignore"):
+        fastest = ((MARGIN * VELOCITY_LIMIT / np.abs(slope)) ** 2).min(axis=1)
+    limit = np.broadcast_to(MARGIN * ACCELERATION_LIMIT, slope.shape)
+    rows = [(slope, curve, -limit, limit)]
     if math.isfinite(payload.acceleration):
-        limit = np.array([np.inf] * 3 + [payload.along_axis] * 3)  # of the load's centre of mass
-        toppra.AddFrameAccelerationLimit(plant.GetFrameByName("load"), -limit, limit)
-    speed = _solved(toppra)
-    if speed is None:
-        return None
-    speed = softened(speed) if payload.mass else speed
-    trajectory = PathParameterizedTrajectory(path, speed)
-    if (np.abs(torques_along(trajectory, plant, _GRID // 2)) <= MARGIN * TORQUE_LIMIT).all():
+        p_BCm = (forward_kinematics(q) @ _p_FCm(config, payload))[:, :3]
+        limit = np.full(p_BCm.shape, payload.along_axis)
+        of_load = np.gradient(p_BCm, grid, axis=0, edge_order=2)
+        rows.append((of_load, np.gradient(of_load, grid, axis=0, edge_order=2), -limit, limit))
+
+    def run_through() -> Trajectory | None:
+        a, b, lower, upper = (np.hstack(column) for column in zip(*rows, strict=True))
+        x = squared_speeds(grid[1] - grid[0], a, b, lower, upper, fastest)
+        speed = np.sqrt(x)
+        if not (speed[1:-1] > 0).all():
+            return None
+        times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speed[1:] + speed[:-1]))])
+        along = PiecewisePolynomial.CubicHermite(times, grid[None], speed[None])
+        return PathParameterizedTrajectory(path, softened(along) if payload.mass else along)
+
+    trajectory, rest = run_through(), np.zeros_like(q)
+    if trajectory is None or (np.abs(torques(plant, *_motion(trajectory, 40))) <= MARGIN * TORQUE_LIMIT).all():
         return trajectory
-    toppra.AddJointTorqueLimit(-MARGIN * TORQUE_LIMIT, MARGIN * TORQUE_LIMIT)  # rarely needed, and a quarter of the time
-    speed = _solved(toppra)
-    if speed is None:
+    held = torques(plant, q, rest, rest)  # the torques' limits are rarely needed, and take most of the time
+    if (np.abs(held) > MARGIN * TORQUE_LIMIT).any():
         return None
-    return PathParameterizedTrajectory(path, softened(speed) if payload.mass else speed)
-
-
-def _solved(toppra: Toppra) -> Trajectory | None:
-    with drake_silent_below(logging.CRITICAL):  # that there is no solution is an answer here, and no error
-        return toppra.SolvePathParameterization()
+    lower, upper = -MARGIN * TORQUE_LIMIT - held, MARGIN * TORQUE_LIMIT - held
+    rows.append((torques(plant, q, rest, slope) - held, torques(plant, q, slope, curve) - held, lower, upper))
+    return run_through()
 
 
 def softened(along: Trajectory) -> Trajectory:
@@ -160,19 +169,45 @@ def softened(along: Trajectory) -> Trajectory:
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(np.arange(len(mean)) * step, mean[None], rest, rest)
 
 
-def torques_along(trajectory: Trajectory, plant: MultibodyPlant, count: int) -> Floats:
-    """(count, 6) N m, that a motion takes, at times equally far apart."""
+def slowed(trajectory: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
+    """The same motion, evenly slower until velocity, acceleration, torque and the cup's hold allow it; None if they never do."""
+    plant, end = dynamics_plant(config, payload), trajectory.end_time()
+    count = max(200, math.ceil(end / 0.005))
+    q, v, a = _motion(trajectory, count)
+    held = torques(plant, q, np.zeros_like(q), np.zeros_like(q))
+    moving = torques(plant, q, v, a) - held
+    room = MARGIN * TORQUE_LIMIT - np.sign(moving) * held
+    if (room <= 0).any():
+        return None
+    square = max((np.abs(v) / VELOCITY_LIMIT / MARGIN).max() ** 2, (np.abs(a) / ACCELERATION_LIMIT / MARGIN).max())
+    square = max(square, (np.abs(moving) / room).max())
+    if math.isfinite(payload.acceleration):
+        p_BCm = (forward_kinematics(q) @ _p_FCm(config, payload))[:, :3]
+        of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
+        square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.acceleration)
+    by = max(1.0, math.sqrt(square))
+    return PathParameterizedTrajectory(trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]]))
+
+
+def _motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
+    """q, v and a, (count, 6) each, at times equally far apart."""
     times = np.linspace(trajectory.start_time(), trajectory.end_time(), count)
-    q, v, a = (
-        np.array([trajectory.EvalDerivative(t, order).ravel() if order else trajectory.value(t).ravel() for t in times])
-        for order in range(3)
-    )
-    return torques(plant, q, v, a)
+    v, a = (np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2))
+    return trajectory.vector_values(times).T, v, a
+
+
+def _p_FCm(config: ArmConfig, payload: Payload) -> Floats:
+    return np.asarray(config.X_FG @ np.array([*payload.p_GCm, 1.0]))
+
+
+@lru_cache(maxsize=64)
+def _context(plant: MultibodyPlant) -> Context:
+    return plant.CreateDefaultContext()
 
 
 def torques(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
     """(n, 6) N m, that motions (n, 6) each, take."""
-    context, found = plant.CreateDefaultContext(), np.empty_like(q)
+    context, found = _context(plant), np.empty_like(q)
     for k in range(len(q)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])

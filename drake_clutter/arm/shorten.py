@@ -3,7 +3,7 @@
 A cubic spline over joint angles is made as quick as the joints' limits and the cup's hold allow, while it keeps clear of
 everything. Distances are linear in the joint angles for a small step, and so in the spline's control points: each round takes
 them at the last round's spline, and moves no control point by more than a step (as in Schulman et al. 2014, "Motion planning with
-sequential convex optimization and convex collision checking"). The result is a proposal: who asks checks it and times it anew.
+sequential convex optimization and convex collision checking"). The result is a proposal: who asks checks it.
 """
 
 import math
@@ -12,20 +12,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import BsplineBasis
 from pydrake.planning import KinematicTrajectoryOptimization
 from pydrake.solvers import LinearConstraint, QuadraticConstraint, SnoptSolver, SolverOptions
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 
-from drake_clutter.arm.paths import ACCELERATION_LIMIT, MARGIN, SPACING, VELOCITY_LIMIT
+from drake_clutter.arm.paths import ACCELERATION_LIMIT, MARGIN, VELOCITY_LIMIT
 
 Floats = NDArray[np.float64]
 
-CONTROL_POINTS = 18
+CONTROL_POINTS = 28
 STEPS = (0.8, 0.4, 0.2)
 """rad, by which a control point may move in each round."""
 LOOKED_AT = 50
 """Points of a spline at which distances are taken, and at half of them how the cup is accelerated."""
-UPRIGHT = 0.008
+SETTLED = 0.02
+"""rad; a round that moves no control point further is the last: the next would see the same distances."""
+UPRIGHT = 0.002
 """m, that the cup moves straight up from a grasp, and straight down to a place."""
 ENDS = 0.15
 """Share of a way at either end, where it may stay as close as it is: there the ends leave it no choice."""
@@ -70,37 +73,40 @@ class Way:
     walls: Callable[[Floats, float], list[Wall]]
     jacobian: Callable[[Floats], Floats]
 
+    @property
+    def still(self) -> int:
+        """Control points that are one at either end: two, and it is at rest there; three, and what it carries is not jerked."""
+        return 3 if self.level else 2
 
-def shortened(way: Way) -> Floats | None:
-    """(n, 6) rad along a quicker way; None if none was found."""
-    points = _fitted(way.sure)
+
+def shortened(way: Way) -> BsplineTrajectory | None:
+    """A quicker way, and how it is run through; None if none was found."""
+    points = _fitted(way.sure, way.still)
     duration = way.sure.end_time()
     for step in STEPS:
         found = _round(way, points, duration, step)
         if found is None:
             return None
+        moved = np.abs(found[0] - points).max()
         points, duration = found
-    q = BsplineTrajectory(_BASIS, points.T).vector_values(np.linspace(0.0, 1.0, 400)).T
-    along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
-    # Ten times as dense at the ends as in the middle, so that straight up stays straight up.
-    u = np.linspace(0.0, 1.0, max(12, math.ceil(1.8 * along[-1] / SPACING) + 1))
-    chosen = along[-1] * (u - 0.9 * np.sin(2 * math.pi * u) / (2 * math.pi))
-    return np.column_stack([np.interp(chosen, along, column) for column in q.T])
+        if moved < SETTLED:
+            break
+    return BsplineTrajectory(BsplineBasis(_ORDER, duration * np.array(_BASIS.knots())), points.T)
 
 
 _BASIS = KinematicTrajectoryOptimization(6, CONTROL_POINTS, _ORDER, 1.0).basis()
 _SECOND = BsplineTrajectory(_BASIS, np.eye(CONTROL_POINTS)).MakeDerivative(2)
 
 
-def _fitted(sure: Trajectory) -> Floats:
-    """Control points (n, 6) of the spline that is nearest to a timed way and at rest at its ends."""
+def _fitted(sure: Trajectory, still: int) -> Floats:
+    """Control points (n, 6) of the spline that is nearest to a timed way; the first, and the last, `still` of them are one."""
     s = np.linspace(0.0, 1.0, 120)
     q = sure.vector_values(s * sure.end_time()).T
     B = np.array([_BASIS.EvaluateLinearInControlPoints(x).ravel() for x in s])
     points = np.empty((CONTROL_POINTS, 6))
-    points[:2], points[-2:] = q[0], q[-1]
-    at_ends = [0, 1, CONTROL_POINTS - 2, CONTROL_POINTS - 1]
-    points[2:-2] = np.linalg.lstsq(B[:, 2:-2], q - B[:, at_ends] @ points[at_ends], rcond=None)[0]
+    points[:still], points[-still:] = q[0], q[-1]
+    at_ends = [*range(still), *range(CONTROL_POINTS - still, CONTROL_POINTS)]
+    points[still:-still] = np.linalg.lstsq(B[:, still:-still], q - B[:, at_ends] @ points[at_ends], rcond=None)[0]
     return points
 
 
@@ -115,14 +121,14 @@ def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floa
     kto.AddVelocityBounds(-MARGIN * VELOCITY_LIMIT, MARGIN * VELOCITY_LIMIT)
     kto.AddAccelerationBounds(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
     for k in range(CONTROL_POINTS):
-        reach = 0.0 if k in (0, 1, CONTROL_POINTS - 2, CONTROL_POINTS - 1) else step
+        reach = step if way.still <= k < CONTROL_POINTS - way.still else 0.0
         prog.AddBoundingBoxConstraint(points[k] - reach, points[k] + reach, variables[:, k])
         if way.level:
             prog.AddLinearEqualityConstraint(_TILT, _TILT @ points[0], variables[:, k])
     for upright, end, inwards in ((way.upright[0], 0, 1), (way.upright[1], CONTROL_POINTS - 1, -1)):
         if upright:
             J, q = way.jacobian(points[end]), points[end]
-            for k, least in ((2, 0.0), (3, UPRIGHT)):
+            for k, least in ((way.still, 0.0), (way.still + 1, UPRIGHT)):
                 prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, variables[:, end + inwards * k])
                 prog.AddLinearConstraint(J[5:], J[5:] @ q + least, [np.inf], variables[:, end + inwards * k])
     for number, s in enumerate(np.linspace(0.0, 1.0, LOOKED_AT + 2)[1:-1]):

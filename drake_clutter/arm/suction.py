@@ -162,9 +162,9 @@ def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> 
 
     low, high = 0.0, 50.0
     while high - low > 0.01:
-        between = np.linspace(low, high, 129)
+        between = np.linspace(low, high, 9)
         largest = int(np.argmin(np.append(bears(between), False))) - 1
         if largest < 0:
             return -1.0
-        low, high = float(between[largest]), float(between[min(largest + 1, 128)])
+        low, high = float(between[largest]), float(between[min(largest + 1, 8)])
     return low
