@@ -56,7 +56,7 @@ class Bench:
     """An agent alone, its inputs given by hand."""
 
     def __init__(self, max_moves: int = 5) -> None:
-        self.agent = ExplorationAgent(choose=first_allowed, max_moves=max_moves, seed=0)
+        self.agent = ExplorationAgent(choose=first_allowed, track=None, max_moves=max_moves, seed=0)
         self.simulator = Simulator(self.agent)
         self.time = 0.0
         self.give(BEFORE, Answer(), 0)

@@ -14,7 +14,6 @@ from conftest import CATALOGUE, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import advantage
-from drake_clutter.agents.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.agents.cloning import Cloning, CloningConfig
 from drake_clutter.agents.exploration import make_explorers, play
 from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
@@ -22,6 +21,7 @@ from drake_clutter.agents.explorer_network import ExplorerNetwork
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
 from drake_clutter.scenes.seams import Move

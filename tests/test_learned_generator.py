@@ -8,7 +8,6 @@ import pytest
 import torch
 from conftest import GRAMMARS, rng
 
-from drake_clutter.agents.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, make_generation_agent
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.agents.learned_generator import LearnedGenerator, about_values, load_values
@@ -17,6 +16,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, canonical_form
+from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphVocabulary

@@ -12,9 +12,9 @@ import pytest
 import torch
 from conftest import rng, training_script
 
-from drake_clutter.agents.checkpoint import load_checkpoint
 from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, chances, play, soft_value, softmax_choice
 from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
 CPU = torch.device("cpu")

@@ -11,15 +11,15 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.agents.checkpoint import load_checkpoint
 from drake_clutter.agents.cloning import Cloning, CloningConfig
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.agents.training_run import TrainingRun, device_of
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.files import InputError, told_in_one_line
+from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 

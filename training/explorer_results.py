@@ -23,13 +23,13 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.checkpoint import git_commit
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.learning.checkpoint import git_commit
 from drake_clutter.resources import shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set

@@ -22,13 +22,13 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.checkpoint import git_commit
 from drake_clutter.agents.generation import GenerationJob
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.learning.checkpoint import git_commit
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.seams import CannotJudge
 

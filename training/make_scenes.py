@@ -19,7 +19,6 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from drake_clutter.agents.checkpoint import git_commit
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
@@ -27,6 +26,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.grammar import canonical_form
+from drake_clutter.learning.checkpoint import git_commit
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set

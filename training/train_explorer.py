@@ -15,10 +15,10 @@ from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
 from drake_clutter.agents.learned_explorer import TEACHER, about_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.agents.training_run import TrainingRun, device_of
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.files import told_in_one_line
+from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 

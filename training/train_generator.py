@@ -13,15 +13,15 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_clutter.agents.checkpoint import load_checkpoint
 from drake_clutter.agents.learned_generator import about_values, load_values
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
-from drake_clutter.agents.training_run import TrainingRun, device_of
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.files import told_in_one_line
 from drake_clutter.grammar import canonical_form
+from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
 
 CHECKPOINT = "generator.safetensors"

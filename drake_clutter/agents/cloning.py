@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drake_clutter.agents.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.agents.exploration_episodes import Played, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
+from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation

@@ -5,9 +5,9 @@ from typing import Protocol
 
 import numpy as np
 
-from drake_clutter.agents.shipped import checkpoint_path
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.scenes.seams import Detection, Move, Observation

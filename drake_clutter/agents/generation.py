@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.stats import norm
 
-from drake_clutter.agents.shipped import checkpoint_path
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
+from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene

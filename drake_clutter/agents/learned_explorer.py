@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.checkpoint import Checkpoint, load_checkpoint
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
 from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
 from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.tasks.exploration import Decision, ExplorationTask

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drake_clutter.agents.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 

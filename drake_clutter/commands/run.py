@@ -12,7 +12,7 @@ from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
-from drake_clutter.systems.scenario import Scenario, policy_of
+from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 
 DEMO_TRIES = 5
@@ -44,7 +44,8 @@ def scene_of(scenario: Scenario, first: int = 0) -> tuple[Scene, int]:
 def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
     """Plays a scenario on a scene at rest."""
     choose, options = policy_of(scenario.agent, scenario.world), {"max_moves": scenario.max_moves, "seed": scenario.seed}
-    loop = ClosedLoop(scene, choose, world=scenario.world, arm=scenario.arm, **options)
+    perceive = perception_of(scenario, scene.tray_side)
+    loop = ClosedLoop(scene, choose, perceive=perceive, world=scenario.world, arm=scenario.arm, **options)
     timing = loop.run(report, record=True)
     return loop.task, timing
 

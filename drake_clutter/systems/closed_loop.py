@@ -2,13 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import MakeRenderEngineVtk
-from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
@@ -23,13 +21,13 @@ from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Scene, SceneObject
+from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
-from drake_clutter.simulation.plant import pose_of
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
 from drake_clutter.systems.move_planner import Answer, MovePlanner
-from drake_clutter.systems.scene_perception import ScenePerception
+from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception
+from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
 
 TIME_STEP = 0.005
@@ -54,23 +52,6 @@ class Timing:
     end: str
 
 
-class LabelPerception:
-    """The perfect detector in the loop: classes, poses and masks are the truth, depth is what the camera in the cell renders."""
-
-    def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
-        """For the objects of a scene."""
-        self._scene, self._detector = scene, LabelDetector(world.camera)
-        self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
-
-    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
-        """See `Perceive`."""
-        poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
-        told = self._detector.look(self._scene.at(poses)).observation
-        unobstructed = depth > told.depth - 0.01  # the arm may be in the way
-        in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
-        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.tray_side)
-
-
 class _Elsewhere:
     """In place of an executor: moves are carried out in the diagram."""
 
@@ -87,13 +68,22 @@ class ClosedLoop:
     """
 
     def __init__(
-        self, scene: Scene, choose: Choose, *, max_moves: int, seed: int, world: ClutterConfig, arm: ArmConfig | None = None
+        self,
+        scene: Scene,
+        choose: Choose,
+        *,
+        perceive: Perceive | None = None,
+        max_moves: int,
+        seed: int,
+        world: ClutterConfig,
+        arm: ArmConfig | None = None,
     ) -> None:
         """Builds the diagram around a scene at rest.
 
         Args:
             scene: the objects.
             choose: the explorer's policy.
+            perceive: what sees; None: the perfect detector.
             max_moves: after which the episode ends.
             seed: of all chances.
             world, arm: configs.
@@ -115,9 +105,12 @@ class ClosedLoop:
         scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
         sensor = builder.AddSystem(RgbdSensor(scene_graph.world_frame_id(), eye.X_TC, eye.color, eye.depth))
         sensor.set_name("overhead_camera")
-        perceive = LabelPerception(scene, self.station, world)
-        perception = ScenePerception.AddToBuilder(builder, perceive=perceive, width=camera.width, height=camera.height)
-        self.agent = ExplorationAgent.AddToBuilder(builder, choose=choose, max_moves=max_moves, seed=seed)
+        sees: Perceive = perceive or LabelPerception(scene, self.station, world)
+        perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
+        self._tracks = perceive is not None
+        self.agent = ExplorationAgent.AddToBuilder(
+            builder, choose=choose, track=tracked if self._tracks else None, max_moves=max_moves, seed=seed
+        )
         self._ways = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, camera.altitude)
         self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed)
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=self._arm)
@@ -201,12 +194,18 @@ class ClosedLoop:
 
     def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Step:
         """How a move went, by the truth, once the agent has looked again."""
-        move, before, plan = request.move, self.task.scene, answer.plan
+        before, plan = self.task.scene, answer.plan
         assert plan is not None
+        move, decision = request.move, request.decision
+        if self._tracks:  # what it calls an object is its own affair
+            truly = {TRAY: TRAY} | {o.name: nearest(before.objects, o.X_TO).name for o in request.known}
+            move = Move(truly[move.pick], truly[move.place])
+            picks = {truly[name]: chance for name, chance in decision.picks.items()}
+            decision = replace(decision, move=move, picks=picks, known=tuple(truly[name] for name in decision.known))
         if isinstance(plan, NoPlan):
             no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
-            return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), request.decision)
+            return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), decision)
         after = replace(before, objects=self._objects(root))
         picked = nearest(before.objects, plan.X_TO_pick).name
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
@@ -214,4 +213,4 @@ class ClosedLoop:
         error = float(np.linalg.norm((after[picked].X_TO.p - plan.X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else f"{1000 * error:.1f} mm from where it was to be"
         # The simulation goes on from where things are in it.
-        return self.task.note(move, replace(outcome, scene=after, motion=motion, detail=detail), request.decision)
+        return self.task.note(move, replace(outcome, scene=after, motion=motion, detail=detail), decision)

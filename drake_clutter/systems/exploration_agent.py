@@ -8,17 +8,20 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
-from drake_clutter.arm.plan import NoPlan
+from drake_clutter.arm.plan import NoPlan, Plan
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.systems.move_planner import Answer
+from drake_clutter.systems.tracking import Tracked
 from drake_clutter.tasks.exploration import Decision
 from drake_clutter.tasks.exploration_graph import seen
 
 PERIOD = 0.05
 """s, between two looks at what the others are doing."""
 
+Track = Callable[[Sequence[SceneObject], Observation], Tracked]
+"""From K_t and an image whose detections' names mean nothing, see `tracked`."""
 Choose = Callable[[Sequence[SceneObject], Observation, Sequence[Move], np.random.Generator, Sequence[Move]], Decision]
 """From K_t, what is in view, the moves so far, chance, and the moves that failed since anything last changed."""
 
@@ -67,6 +70,7 @@ class AgentState:
     Attributes:
         phase: what it is doing. look_at: s, when it is to look next.
         known: K_t, each object as it was last seen.
+        lost: names of those of them that are not in view any more, and not where they were.
         tried: all moves; failed: those that could not be carried out since anything last changed.
         request: the latest; carried_out: how many moves were.
         finish: why it ended.
@@ -75,6 +79,7 @@ class AgentState:
     phase: Phase = Phase.LOOKING
     look_at: float = 0.0
     known: tuple[SceneObject, ...] = ()
+    lost: tuple[str, ...] = ()
     tried: tuple[Move, ...] = ()
     failed: tuple[Move, ...] = ()
     request: Request | None = None
@@ -94,17 +99,18 @@ class ExplorationAgent(LeafSystem):
     Output ports: request, abstract, the latest `Request` or None; state, abstract, the `AgentState`.
     """
 
-    def __init__(self, *, choose: Choose, max_moves: int, seed: int, rest: float = 0.5) -> None:
+    def __init__(self, *, choose: Choose, track: Track | None, max_moves: int, seed: int, rest: float = 0.5) -> None:
         """Begins an episode.
 
         Args:
             choose: the policy.
+            track: what gives detections names that last; None: they have them.
             max_moves: after which it ends; a move that could not be carried out counts as one.
             seed: of its chances.
             rest: s, that it waits for things to come to rest before it looks.
         """
         super().__init__()
-        self._choose, self._max_moves, self._seed, self._rest = choose, max_moves, seed, rest
+        self._choose, self._track, self._max_moves, self._seed, self._rest = choose, track, max_moves, seed, rest
         self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(None))
         self._answer = self.DeclareAbstractInputPort("answer", AbstractValue.Make(Answer()))
         self._finished = self.DeclareVectorInputPort("finished", 1)
@@ -115,9 +121,11 @@ class ExplorationAgent(LeafSystem):
         self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(AgentState()), self._calc_state, of)
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, *, choose: Choose, max_moves: int, seed: int) -> "ExplorationAgent":
+    def AddToBuilder(
+        builder: DiagramBuilder, *, choose: Choose, track: Track | None, max_moves: int, seed: int
+    ) -> "ExplorationAgent":
         """Adds one."""
-        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, max_moves=max_moves, seed=seed))
+        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, track=track, max_moves=max_moves, seed=seed))
         system.set_name("exploration_agent")
         return system
 
@@ -141,11 +149,18 @@ class ExplorationAgent(LeafSystem):
             if isinstance(answer.plan, NoPlan):
                 return replace(now, phase=Phase.LOOKING, look_at=time, tried=(*now.tried, move), failed=(*now.failed, move))
             if self._finished.Eval(context)[0] > now.carried_out:
+                assert isinstance(answer.plan, Plan)
+                # Until it is seen there, an object is taken to be where it was put.
+                known = tuple(replace(o, X_TO=answer.plan.X_TO_place) if o.name == move.pick else o for o in now.known)
                 over = replace(now, phase=Phase.LOOKING, look_at=time + self._rest, tried=(*now.tried, move), failed=())
-                return replace(over, carried_out=now.carried_out + 1)
+                return replace(over, known=known, carried_out=now.carried_out + 1)
         return now
 
     def _decided(self, now: AgentState, observation: Observation) -> AgentState:
+        if self._track is not None:
+            observation, lost = self._track(now.known, observation)
+            # What is lost is no longer known: wherever it is, it will be found again as another.
+            now = replace(now, known=tuple(o for o in now.known if o.name not in lost), lost=(*now.lost, *lost))
         now = replace(now, known=seen(now.known, observation))
         number = len(now.tried) + 1
         if number > self._max_moves:

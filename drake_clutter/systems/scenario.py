@@ -1,12 +1,16 @@
 """Scenarios: everything that decides an episode of the closed loop, in one typed file."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from drake_clutter.agents.exploration import BASELINES, make_explorers
 from drake_clutter.arm.station import ArmConfig
+from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.systems.exploration_agent import Choose
+from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
 
 
 @dataclass
@@ -18,6 +22,8 @@ class Scenario:
         catalogue: a folder with object classes of one's own, or "".
         generator, objects, nodes: as for `drake-clutter generate`.
         agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
+        perception: what sees: labels, the perfect detector; depth or depth-color, trained networks; or the file of a checkpoint.
+        camera_noise: whether what a trained network is given has a depth camera's noise.
         max_moves: after which it ends.
         seed: of everything that is left to chance.
         world, arm: configs.
@@ -29,10 +35,39 @@ class Scenario:
     objects: str = "ycb7"
     nodes: int = 25
     agent: str = "student"
+    perception: str = "labels"
+    camera_noise: bool = True
     max_moves: int = 20
     seed: int = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)
     arm: ArmConfig = field(default_factory=ArmConfig)
+
+
+DETECTORS = {
+    "depth": "training/checkpoints/detector_depth.safetensors",
+    "depth-color": "training/checkpoints/detector_depth_color.safetensors",
+}
+"""The shipped detectors, by name."""
+
+
+def perception_of(scenario: Scenario, tray_side: float) -> Perceive | None:
+    """What a scenario sees with; None: the perfect detector.
+
+    Raises:
+        InputError: no such detector.
+    """
+    if scenario.perception == "labels":
+        return None
+    if scenario.perception not in DETECTORS and not scenario.perception.endswith(".safetensors"):
+        allowed = f"labels, {', '.join(DETECTORS)}, or a .safetensors file"
+        raise InputError(f"perception: {scenario.perception}; allowed are {allowed}")
+    path = checkpoint_path(scenario.perception, DETECTORS)
+    from drake_clutter.learning.checkpoint import load_checkpoint  # takes PyTorch
+    from drake_clutter.perception.learned_detector import LearnedDetector
+
+    classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(scenario.objects)
+    detector = LearnedDetector(load_checkpoint(path), classes, scenario.world.camera, tray_side)
+    return LearnedPerception(detector.detect, noise=scenario.camera_noise, seed=scenario.seed)
 
 
 def policy_of(name: str, config: ClutterConfig) -> Choose:

@@ -1,6 +1,8 @@
 """From rendered images to what an explorer may know."""
 
+import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +11,20 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from drake_clutter.arm.clutter_station import ClutterStation
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.depth_noise import noisy_depth
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Observation
+from drake_clutter.simulation.plant import pose_of
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation]
 """From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned
 one leaves alone."""
+Detect = Callable[[NDArray[np.float32], NDArray[np.uint8]], Observation]
+"""Depth and colour alone, as `LearnedDetector.detect`."""
 
 
 class ScenePerception(LeafSystem):
@@ -42,3 +53,34 @@ class ScenePerception(LeafSystem):
     def _calc_observation(self, context: Context, output: AbstractValue) -> None:
         depth, color = (port.Eval(context).data for port in (self._depth, self._color))
         output.set_value(self._perceive(depth[..., 0].copy(), color[..., :3].copy(), self._poses.Eval(context)))
+
+
+class LearnedPerception:
+    """A detector in the loop that is given images as a depth camera takes them."""
+
+    def __init__(self, detect: Detect, *, noise: bool, seed: int) -> None:
+        """`noise`: whether the rendered depth gets the camera's noise, by a seed."""
+        self._detect, self._noise, self._seed = detect, noise, seed
+
+    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
+        """See `Perceive`; the same image gets the same noise."""
+        if self._noise:
+            depth = noisy_depth(depth, item_rng(self._seed, zlib.crc32(depth.tobytes())))
+        return self._detect(depth, color)
+
+
+class LabelPerception:
+    """The perfect detector in the loop: classes, poses and masks are the truth, depth is what the camera in the cell renders."""
+
+    def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
+        """For the objects of a scene."""
+        self._scene, self._detector = scene, LabelDetector(world.camera)
+        self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
+
+    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
+        """See `Perceive`."""
+        poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
+        told = self._detector.look(self._scene.at(poses)).observation
+        unobstructed = depth > told.depth - 0.01  # the arm may be in the way
+        in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
+        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.tray_side)

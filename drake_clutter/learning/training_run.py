@@ -12,9 +12,9 @@ from rich.console import Console
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
-from drake_clutter.agents.checkpoint import git_commit, save_checkpoint
 from drake_clutter.config import config_yaml
 from drake_clutter.files import InputError, output_directory, write_json, write_text
+from drake_clutter.learning.checkpoint import git_commit, save_checkpoint
 
 CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
 

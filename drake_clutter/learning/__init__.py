@@ -1,0 +1,1 @@
+"""What every training of a network needs: checkpoints, and runs that can be taken up."""

@@ -1,0 +1,79 @@
+"""Which object of an image is which of those known: the same object seen again is the same object, and a lost one is noticed."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.seams import Detection, Observation
+
+NEAR = 0.04
+"""m; an object that is seen so near to where one of its class is known to be is that one."""
+SEEN_THROUGH = 0.02
+"""m, by which what the camera sees must be below the middle of a known object that is no longer there."""
+
+
+class Tracked(NamedTuple):
+    """An image, told in the names of what is known.
+
+    Attributes:
+        observation: its detections bear the names of the known objects that they are, or new ones.
+        lost: names of known objects that are no longer where they were, and are not in view elsewhere.
+    """
+
+    observation: Observation
+    lost: tuple[str, ...]
+
+
+def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
+    """Gives the detections of an image names that last.
+
+    Objects of a class are matched with the least sum of distances. What is far from all that is known of its class is an object
+    that has been moved, if one is gone from its place, and else one that has never been seen.
+
+    Args:
+        known: K_t, each object where it was seen last, or where a move was to put it.
+        observation: whose detections' names mean nothing.
+    """
+    named: dict[str, Detection] = {}
+    lost = list[str]()
+    classes = [o.object_class for o in known] + [d.object_class for d in observation.detections]
+    for object_class in dict.fromkeys(classes):
+        of_class = [o for o in known if o.object_class is object_class]
+        seen = [d for d in observation.detections if d.object_class is object_class]
+        pairs = _matched(of_class, seen, NEAR)
+        left = [o for k, o in enumerate(of_class) if k not in pairs and _gone(o, observation)]
+        unnamed = [d for k, d in enumerate(seen) if k not in pairs.values()]
+        named |= {of_class[k].name: seen[d] for k, d in pairs.items()}
+        moved = _matched(left, unnamed, np.inf)
+        named |= {left[k].name: unnamed[d] for k, d in moved.items()}
+        lost += [o.name for k, o in enumerate(left) if k not in moved]
+        number = len(of_class)
+        for k, detection in enumerate(unnamed):
+            if k not in moved.values():
+                number += 1
+                named[f"{object_class.name}_{number}"] = detection
+    detections = tuple(replace(detection, name=name) for name, detection in named.items())
+    return Tracked(replace(observation, detections=detections), tuple(lost))
+
+
+def _matched(known: Sequence[SceneObject], seen: Sequence[Detection], within: float) -> dict[int, int]:
+    """Indices of the seen by those of the known, no further apart than `within`, m."""
+    if not known or not seen:
+        return {}
+    apart = np.array([[np.linalg.norm(o.X_TO.p - d.X_TO.p) for d in seen] for o in known])
+    cost = np.minimum(apart, min(within, 10.0))  # further away is no match, however far
+    rows, columns = linear_sum_assignment(cost)
+    return {int(k): int(d) for k, d in zip(rows, columns, strict=True) if apart[k, d] <= within}
+
+
+def _gone(known: SceneObject, observation: Observation) -> bool:
+    """Whether the camera sees what is below the place where an object was."""
+    camera, p_TO = observation.camera, known.X_TO.p
+    column, row = np.rint(camera.project(p_TO[None])[0]).astype(int)
+    if not (0 <= row < camera.height and 0 <= column < camera.width):
+        return False
+    return bool(observation.depth[row, column] > camera.altitude - p_TO[2] + SEEN_THROUGH)

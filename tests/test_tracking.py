@@ -1,0 +1,60 @@
+"""Names that last from image to image."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import CameraConfig
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.scenes.seams import Detection, Observation
+from drake_clutter.systems.tracking import tracked
+
+CLASSES, CAMERA = load_catalogue().classes, CameraConfig()
+CAN = "tomato_soup_can"
+
+
+def at(x: float, y: float, name: str = CAN) -> SceneObject:
+    return SceneObject(name, CLASSES[name.rsplit("_", 1)[0] if name[-1].isdigit() else name], Pose((x, y, 0.05)))
+
+
+def image(*objects: SceneObject, top: float = 0.1) -> Observation:
+    """Of objects whose names say nothing; everywhere is seen what is `top` high, m."""
+    depth = np.full((CAMERA.height, CAMERA.width), CAMERA.altitude - top, np.float32)
+    nothing = np.zeros(depth.shape, bool)
+    detections = [Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)]
+    return Observation(depth, tuple(detections), CAMERA, 0.7)
+
+
+def names(known: list[SceneObject], observation: Observation) -> dict[str, tuple[float, float]]:
+    found, _ = tracked(known, observation)
+    return {d.name: d.X_TO.translation[:2] for d in found.detections}
+
+
+def test_what_is_new_gets_a_name_of_its_own() -> None:
+    assert names([], image(at(0, 0), at(0.1, 0))) == {f"{CAN}_1": (0, 0), f"{CAN}_2": (0.1, 0)}
+    assert names([at(0, 0, f"{CAN}_1")], image(at(0.01, 0), at(0.2, 0))) == {f"{CAN}_1": (0.01, 0), f"{CAN}_2": (0.2, 0)}
+
+
+def test_two_of_a_class_are_not_exchanged() -> None:
+    known = [at(0, 0, f"{CAN}_1"), at(0.03, 0, f"{CAN}_2")]
+    assert names(known, image(at(0.035, 0), at(0.012, 0))) == {f"{CAN}_1": (0.012, 0), f"{CAN}_2": (0.035, 0)}
+
+
+def test_classes_are_told_apart() -> None:
+    box = replace(at(0, 0), name="sugar_box_1", object_class=CLASSES["sugar_box"])
+    assert set(names([box], image(at(0, 0)))) == {f"{CAN}_1"}
+
+
+def test_what_is_gone_from_its_place_and_seen_elsewhere_has_moved() -> None:
+    known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
+    floor = image(at(-0.2, 0), at(0.2, 0.2), top=0.0)
+    assert names(known, floor) == {f"{CAN}_1": (-0.2, 0), f"{CAN}_2": (0.2, 0.2)}
+    covered = image(at(-0.2, 0), at(0.2, 0.2), top=0.1)
+    assert names(known, covered)[f"{CAN}_3"] == (-0.2, 0), "the first may still be where it was, below something"
+
+
+def test_what_is_gone_and_not_in_view_is_lost() -> None:
+    known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
+    assert tracked(known, image(at(0.2, 0.2), top=0.0)).lost == (f"{CAN}_1",)
+    assert tracked(known, image(at(0.2, 0.2), top=0.1)).lost == ()
