@@ -58,7 +58,8 @@ def noisy_depth(depth: NDArray[np.float32], rng: np.random.Generator, noise: Dep
     np.divide(fb, depth, out=disparity, where=seen)
     error = _smoothed(rng.standard_normal((depth.shape[0] + 2, depth.shape[1] + 2), np.float32))
     shadow = _hidden_from_right_eye(disparity) > np.abs(error) * (noise.ragged / _LEFT_BY_SMOOTHING)
-    measured = np.round((disparity + noise.subpixel * error) / noise.step) * np.float32(noise.step)
+    steps = np.round((disparity + noise.subpixel * error) / noise.step)
+    measured = np.asarray(steps * noise.step, np.float32)
     measured[~seen | shadow | (measured <= 0)] = np.inf
     _punch_speckles(measured, rng, noise)
     return np.asarray(fb / measured, np.float32)

@@ -1,0 +1,257 @@
+"""Poses that an object may have, from the planes and edges among the points that a depth image shows of it."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, worth
+
+FEWEST_POINTS = 12
+_COARSE_WITHIN = 0.015
+_ON_PLANE = 0.004
+_PLANE_TRIES = 120
+_SECOND_PLANE_SHARE = 0.1
+_PLANE_LEVEL_WITHIN = math.radians(4.0)
+SLACKS = (0.012, 0.048)
+"""m, by which points may reach past the face that they are said to lie on; the second where the first leaves nothing good."""
+
+
+@njit(cache=True)
+def spread_points(view, most):  # type: ignore[no-untyped-def]
+    """The object's measured points (N, 3) m in T, at most so many, and those at its own edges, (M, 3)."""
+    height, width = view.depth.shape
+    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    row, row_end, column, column_end = view.window
+    total = 0
+    for v in range(row, row_end):
+        for u in range(column, column_end):
+            if view.mask[v, u] and 0.05 < view.depth[v, u] < view.altitude + 0.05:
+                total += 1
+    every = max(1, (total + most - 1) // most)
+    points, edges = np.empty((total // every + 1, 3)), np.empty((total + 1, 3))
+    count, found, at_edge = 0, 0, 0
+    for v in range(row, row_end):
+        for u in range(column, column_end):
+            z = view.depth[v, u]
+            if not (view.mask[v, u] and 0.05 < z < view.altitude + 0.05):
+                continue
+            x, y = (u - middle_u) / view.focal_length * z, (middle_v - v) / view.focal_length * z
+            if count % every == 0:
+                points[found, 0], points[found, 1], points[found, 2] = x, y, view.altitude - z
+                found += 1
+            count += 1
+            for dv, du in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                j, i = v + dv, u + du
+                beside = 0 <= j < height and 0 <= i < width
+                if beside and not view.mask[j, i] and not view.depth[j, i] < z - WITHIN:
+                    edges[at_edge, 0], edges[at_edge, 1], edges[at_edge, 2] = x, y, view.altitude - z
+                    at_edge += 1
+                    break
+    return points[:found], edges[:at_edge]
+
+
+@njit(cache=True)
+def _plane(points, altitude):  # type: ignore[no-untyped-def]
+    """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
+    count, state = len(points), 12345
+    best, best_n, best_p = 0, np.array([0.0, 0.0, 1.0]), points[0].copy()
+    picks = np.empty(3, np.int64)
+    for _ in range(_PLANE_TRIES):
+        for i in range(3):
+            state = (state * 1103515245 + 12345) % 2147483648
+            picks[i] = (state >> 8) % count
+        n = np.cross(points[picks[1]] - points[picks[0]], points[picks[2]] - points[picks[0]])
+        length = math.sqrt((n * n).sum())
+        if length < 1e-6:
+            continue
+        n /= length
+        p = points[picks[0]]
+        on = 0
+        for k in range(count):
+            off = n[0] * (points[k, 0] - p[0]) + n[1] * (points[k, 1] - p[1]) + n[2] * (points[k, 2] - p[2])
+            on += abs(off) < _ON_PLANE
+        if on > best:
+            best, best_n, best_p = on, n, p.copy()
+    member = np.zeros(count, np.bool_)
+    for _ in range(2):
+        total, mean = 0, np.zeros(3)
+        for k in range(count):
+            x, y, z = points[k, 0] - best_p[0], points[k, 1] - best_p[1], points[k, 2] - best_p[2]
+            member[k] = abs(x * best_n[0] + y * best_n[1] + z * best_n[2]) < _ON_PLANE
+            if member[k]:
+                total += 1
+                for i in range(3):
+                    mean[i] += points[k, i]
+        if total < 3:
+            break
+        best_p = mean / total
+        off = points[member] - best_p
+        best_n = np.linalg.eigh(off.T @ off)[1][:, 0].copy()
+    if best_n[2] * (altitude - best_p[2]) < best_n[0] * best_p[0] + best_n[1] * best_p[1]:
+        best_n = -best_n
+    return best_n, best_p, member
+
+
+@njit(cache=True)
+def _extent(points, p, axis):  # type: ignore[no-untyped-def]
+    """Least and greatest m along an axis from p, without the outermost two in a hundred."""
+    along = np.empty(len(points))
+    for k in range(len(points)):
+        along[k] = (points[k, 0] - p[0]) * axis[0] + (points[k, 1] - p[1]) * axis[1] + (points[k, 2] - p[2]) * axis[2]
+    along.sort()
+    cut = len(points) // 100
+    return along[cut], along[len(points) - 1 - cut]
+
+
+@njit(cache=True)
+def _axes_in(n):  # type: ignore[no-untyped-def]
+    """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
+    x_axis = np.cross(np.array([0.0, 1.0, 0.0]) if abs(n[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), n)
+    x_axis /= math.sqrt((x_axis * x_axis).sum())
+    return x_axis, np.cross(n, x_axis)
+
+
+@njit(cache=True)
+def _edge_angle(x, y):  # type: ignore[no-untyped-def]
+    """The angle, rad within a quarter turn, at which points x, y (N,) m fall on the fewest lines (a Hough transform)."""
+    best, best_angle = -1.0, 0.0
+    for k in range(60):
+        angle = k * (math.pi / 120)
+        lines = np.zeros((2, 256))
+        c, s = math.cos(angle), math.sin(angle)
+        for i in range(len(x)):
+            lines[0, int((c * x[i] + s * y[i]) / 0.003 + 1152) % 256] += 1
+            lines[1, int((c * y[i] - s * x[i]) / 0.003 + 1152) % 256] += 1
+        value = (lines * lines).sum()
+        if value > best:
+            best, best_angle = value, angle
+    return best_angle
+
+
+@njit(cache=True)
+def _least_rectangle(x, y):  # type: ignore[no-untyped-def]
+    """The angle, rad within a quarter turn, of the smallest rectangle about points x, y (N,) m."""
+    best, best_angle = np.inf, 0.0
+    for k in range(45):
+        angle = k * (math.pi / 90)
+        c, s = math.cos(angle), math.sin(angle)
+        low, high, left, right = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(len(x)):
+            along, across = c * x[i] + s * y[i], c * y[i] - s * x[i]
+            low, high, left, right = min(low, along), max(high, along), min(left, across), max(right, across)
+        if (high - low) * (right - left) < best:
+            best, best_angle = (high - low) * (right - left), angle
+    return best_angle
+
+
+@njit(cache=True)
+def _middles(low, high, size, guess, slack):  # type: ignore[no-untyped-def]
+    """Where the middle of a side may be, m (n,), of which the points reach from low to high; none if they reach too far."""
+    if high - low > size + slack:
+        return np.empty(0)
+    if high - low > size - SLACKS[0] / 2:
+        return np.array([(low + high) / 2])
+    return np.array([low + size / 2, high - size / 2, min(max(guess, high - size / 2), low + size / 2)])
+
+
+@njit(cache=True)
+def _faced(half, axes, points, p, n, angles, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
+    """Adds the poses with one of the axes along a plane's normal, its face on the plane's points, to R and p_TO; their number."""
+    x_axis, y_axis = _axes_in(n)
+    for angle in angles:
+        first = math.cos(angle) * x_axis + math.sin(angle) * y_axis
+        second = np.cross(n, first)
+        low, high = _extent(points, p, first)
+        left, right = _extent(points, p, second)
+        for a in axes:
+            for swapped in range(2):
+                b, c = ((a + 1) % 3, (a + 2) % 3) if swapped == 0 else ((a + 2) % 3, (a + 1) % 3)
+                off = guess - p
+                for u in _middles(low, high, 2 * half[b], (off * first).sum(), slack):
+                    for v in _middles(left, right, 2 * half[c], (off * second).sum(), slack):
+                        if count == len(R):
+                            return count
+                        R[count, :, a], R[count, :, b], R[count, :, c] = n, first, second if swapped == 0 else -second
+                        p_TO[count] = p + u * first + v * second - half[a] * n
+                        count += 1
+    return count
+
+
+@njit(cache=True)
+def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
+    """Adds the poses of a cylinder whose side is seen, its axis as given (3,), to R and p_TO; returns their number."""
+    level = math.hypot(axis[0], axis[1])
+    if level < 0.2:
+        return count
+    across = np.array([-axis[1] / level, axis[0] / level, 0.0])
+    up = np.cross(axis, across)
+    low, high = _extent(points, guess, axis)
+    left, right = _extent(points, guess, across)
+    top = _extent(points, guess, up)[1]
+    along, to_the_side = _middles(low, high, 2 * half[2], 0.0, slack), _middles(left, right, 2 * half[0], 0.0, slack)[-1:]
+    if slack > SLACKS[0]:  # a marker's mask may hold more of the tray than of it
+        along, to_the_side = along if len(along) else np.zeros(1), to_the_side if len(to_the_side) else np.zeros(1)
+    for u in along:
+        for v in to_the_side:
+            if count == len(R):
+                return count
+            R[count, :, 2], R[count, :, 0], R[count, :, 1] = axis, across, up
+            p_TO[count] = guess + u * axis + v * across + (top - half[0]) * up
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def candidates(cylinder, half, points, edges, view, slack):  # type: ignore[no-untyped-def]
+    """Poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first."""
+    R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0
+    guess, vertical = view.p_TO_guess, np.array([0.0, 0.0, 1.0])
+    n, p, member = _plane(points, view.altitude)
+    rest = points[~member]
+    has_second = len(rest) > max(FEWEST_POINTS, _SECOND_PLANE_SHARE * len(points))
+    second_n, second_p, second_member = _plane(rest if has_second else points, view.altitude)
+    has_second = has_second and abs((n * second_n).sum()) < 0.2 and second_member.sum() > _SECOND_PLANE_SHARE * len(points)
+    for which in range(2):
+        if which == 1:
+            if not has_second:
+                break
+            n, p, second_n, face = second_n, second_p, n, rest[second_member]
+        else:
+            face = points[member]
+        if n[2] > math.cos(_PLANE_LEVEL_WITHIN):
+            n = vertical
+        if cylinder:
+            count = _faced(half, (2,), face, p, n, np.zeros(1), guess, slack, R, p_TO, count)
+            continue
+        x_axis, y_axis = _axes_in(n)
+        angles, some = np.empty(3), 0
+        beside = edges[np.abs((edges - p) @ n) < 2 * _ON_PLANE]
+        if len(beside) >= FEWEST_POINTS:
+            angles[some] = _edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)
+            some += 1
+        angles[some] = _least_rectangle((face - p) @ x_axis, (face - p) @ y_axis)
+        some += 1
+        if has_second:
+            angles[some] = math.atan2((second_n * y_axis).sum(), (second_n * x_axis).sum())
+            some += 1
+        count = _faced(half, (0, 1, 2), face, p, n, angles[:some], guess, slack, R, p_TO, count)
+    if cylinder:
+        mean = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
+        off = points - mean
+        main = np.linalg.eigh(off.T @ off)[1][:, 2].copy()
+        fewer = points[::2].copy()
+        count = _lying(half, fewer, main, guess, slack, R, p_TO, count)
+        for tilt in (0.0, -0.5, 0.5):
+            azimuth = math.atan2(main[1], main[0])
+            for k in range(12):
+                a = azimuth + k * math.pi / 12 if tilt == 0.0 else azimuth + k * math.pi / 6
+                if tilt != 0.0 and k >= 6:
+                    break
+                axis = np.array([math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)])
+                count = _lying(half, fewer, axis, guess, slack, R, p_TO, count)
+    value = np.empty(count)
+    for k in range(count):
+        value[k] = worth(cylinder, half, R[k], p_TO[k], view, COARSE_RAYS, _COARSE_WITHIN)
+    order = np.argsort(-value)
+    return R[:count][order], p_TO[:count][order], value[order]

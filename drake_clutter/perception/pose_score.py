@@ -1,0 +1,177 @@
+"""How well a pose of an object explains what a depth image shows, and the search for the pose that does best.
+
+The camera's rays are cast at a box or a cylinder: where it is seen as it should be it gains, where the camera sees past it, and
+where the mask shows what it does not cover, it loses; what stands before it counts neither way.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+WITHIN = 0.006
+"""m along the optical axis, within which what is seen agrees with a pose."""
+_PRIOR = 0.001
+"""What a centre 1 cm away from the guess costs a score: little, it decides only what the image leaves open."""
+COARSE_RAYS, FINE_RAYS = 350, 1500
+_LONG_STEP = 0.0015
+"""m; a step that is at least so long is judged by few rays."""
+
+
+class View(NamedTuple):
+    """An object in the image.
+
+    Attributes:
+        depth: (height, width) float32 m.
+        mask: (height, width) bool.
+        window: first row, end row, first column, end column of the mask.
+        p_TO_guess: (3,) m.
+        altitude: m.
+        focal_length: pixels.
+    """
+
+    depth: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    window: tuple[int, int, int, int]
+    p_TO_guess: Floats
+    altitude: float
+    focal_length: float
+
+
+@njit(cache=True, error_model="numpy")
+def _box_distance(h, e, x, y, z):  # type: ignore[no-untyped-def]
+    """m along the optical axis to a box of half sizes h, from the eye e along the ray (x, y, z), all in O; inf if missed."""
+    # Never 0: a ray along a face is turned by a hair.
+    ix = 1 / (x if abs(x) > 1e-12 else 1e-12)
+    iy = 1 / (y if abs(y) > 1e-12 else 1e-12)
+    iz = 1 / (z if abs(z) > 1e-12 else 1e-12)
+    rx, ry, rz = h[0] * abs(ix), h[1] * abs(iy), h[2] * abs(iz)
+    near = max(-e[0] * ix - rx, -e[1] * iy - ry, -e[2] * iz - rz)
+    far = min(-e[0] * ix + rx, -e[1] * iy + ry, -e[2] * iz + rz)
+    return near if near <= far else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _cylinder_distance(h, e, x, y, z):  # type: ignore[no-untyped-def]
+    """Likewise to a cylinder."""
+    a, b = max(x * x + y * y, 1e-20), e[0] * x + e[1] * y
+    root = b * b - a * (e[0] * e[0] + e[1] * e[1] - h[0] * h[0])
+    if root < 0:
+        return np.inf
+    root, iz = math.sqrt(root), 1 / (z if abs(z) > 1e-12 else 1e-12)
+    rz = h[2] * abs(iz)
+    near, far = max((-b - root) / a, -e[2] * iz - rz), min((-b + root) / a, -e[2] * iz + rz)
+    return near if near <= far else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
+    """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
+    height, width = view.depth.shape
+    middle_u, middle_v, focal = width / 2 - 1, height / 2 - 1, view.focal_length
+    row, row_end, column, column_end = view.window
+    for corner in range(8):
+        x = half[0] if corner & 1 else -half[0]
+        y = half[1] if corner & 2 else -half[1]
+        z = half[2] if corner & 4 else -half[2]
+        away = view.altitude - p[2] - R[2, 0] * x - R[2, 1] * y - R[2, 2] * z
+        if away < 0.05:
+            return 0.0
+        u = middle_u + focal * (p[0] + R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / away
+        v = middle_v - focal * (p[1] + R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / away
+        row, row_end = min(row, math.floor(v)), max(row_end, math.ceil(v) + 1)
+        column, column_end = min(column, math.floor(u)), max(column_end, math.ceil(u) + 1)
+    row, row_end, column, column_end = max(row, 0), min(row_end, height), max(column, 0), min(column_end, width)
+    window = view.window
+    stride = max(1, round(math.sqrt((window[1] - window[0]) * (window[3] - window[2]) / rays)))
+    e = (
+        -R[0, 0] * p[0] - R[1, 0] * p[1] + R[2, 0] * (view.altitude - p[2]),
+        -R[0, 1] * p[0] - R[1, 1] * p[1] + R[2, 1] * (view.altitude - p[2]),
+        -R[0, 2] * p[0] - R[1, 2] * p[1] + R[2, 2] * (view.altitude - p[2]),
+    )
+    h = (half[0], half[1], half[2])
+    ax, ay, az = R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal
+    speaks_for, against = 0.0, 0.0
+    for v in range(row - row % stride, row_end, stride):
+        if v < row:
+            continue
+        y = (middle_v - v) / focal
+        bx, by, bz = R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2]
+        for u in range(column - column % stride + (v // stride) % stride, column_end, stride):
+            x = u - middle_u
+            if cylinder:
+                away = _cylinder_distance(h, e, bx + ax * x, by + ay * x, bz + az * x)
+            else:
+                away = _box_distance(h, e, bx + ax * x, by + ay * x, bz + az * x)
+            seen, ours = view.depth[v, u], view.mask[v, u]
+            if away == np.inf:
+                against += 1.0 if ours else 0.0
+            elif not 0.05 < seen < 50.0:
+                speaks_for += 0.5 if ours else 0.0
+                against += 0.0 if ours else 0.5
+            elif ours:
+                off = min(abs(seen - away) / within, 1.0)
+                speaks_for += 1.0 - off * off
+                against += off * off
+            elif seen > away - within:
+                against += 1.0 if seen > away + within else 0.5  # masks are drawn too small rather than objects
+    return speaks_for / (speaks_for + against) if speaks_for > 0 else 0.0
+
+
+@njit(cache=True)
+def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
+    """The score, less what the distance to the guess costs."""
+    off = p - view.p_TO_guess
+    return share_explained(cylinder, half, R, p, view, rays, within) - _PRIOR * (off * off).sum() / 1e-4
+
+
+@njit(cache=True)
+def turned(R, axis, angle):  # type: ignore[no-untyped-def]
+    """R (3, 3) turned about a unit axis (3,) of T by an angle, rad."""
+    c, s = math.cos(angle), math.sin(angle)
+    turned = np.empty((3, 3))
+    for i in range(3):
+        column = R[:, i]
+        along = axis[0] * column[0] + axis[1] * column[1] + axis[2] * column[2]
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            turned[j, i] = c * column[j] + s * (axis[k] * column[m] - axis[m] * column[k]) + (1 - c) * along * axis[j]
+    return turned
+
+
+@njit(cache=True)
+def search(cylinder, half, R, p, view, first_step, steps, resting):  # type: ignore[no-untyped-def]
+    """Moves and turns a pose to a greater value, in steps that are halved; a resting one turns about the vertical only."""
+    step, reach, rays, best = first_step, half.max(), 0, 0.0
+    vertical = np.array([0.0, 0.0, 1.0])
+    for _ in range(steps):
+        if rays != FINE_RAYS:
+            rays = FINE_RAYS if step < _LONG_STEP else COARSE_RAYS
+            best = worth(cylinder, half, R, p, view, rays, WITHIN)
+        for _ in range(3):
+            better = False
+            for way in range(6):
+                turn = way - 3
+                if way >= 3 and ((resting and turn != 2) or (cylinder and not resting and turn == 2)):
+                    continue
+                if resting and cylinder and way == 5 and abs(R[2, 2]) > 0.999:
+                    continue
+                for sign in (1.0, -1.0):
+                    new_R, new_p = R, p.copy()
+                    if way < 3:
+                        new_p[way] += sign * step
+                    else:
+                        axis = vertical if resting else R[:, turn].copy()
+                        new_R = turned(R, axis, sign * step / reach)
+                    value = worth(cylinder, half, new_R, new_p, view, rays, WITHIN)
+                    if value > best + 1e-6:
+                        best, R, p, better = value, new_R, new_p, True
+                        break
+            if not better:
+                break
+        step /= 2
+    return best, R, p

@@ -1,0 +1,257 @@
+"""A network that tells, from depth or from depth and colour, what stands where (SPEC section 4, "Sensing").
+
+For every second pixel each way it says of which class the object there is, and where the middle of that object is. What votes
+for the same place is one object (as in Qi et al. 2019, "Deep Hough voting for 3D object detection in point clouds"): unlike the
+middles of masks in the image, the middles of two objects never coincide, also when one lies across the other.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.learning.checkpoint import Checkpoint
+
+Element = TypeVar("Element", bound=np.generic)
+
+COARSE = 2
+"""Pixels, each way, for one answer."""
+_MULTIPLE = 16
+_HIGHEST = 0.5
+"""m, that objects reach: at the tray's edge they must be in the window."""
+_WIDTHS = (24, 48, 96, 128)
+_HEIGHT_UNIT, _VOTE_UNIT = 0.25, 0.05
+"""m, in which the network is given heights, and answers with votes."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The square part of the image that holds the tray, about its middle.
+
+    Attributes:
+        rows, columns: of the image.
+    """
+
+    rows: slice
+    columns: slice
+
+    @staticmethod
+    def of(camera: CameraConfig, tray_side: float) -> "Window":
+        """Of a camera over a tray."""
+        reach = camera.focal_length * tray_side / 2 / (camera.altitude - _HIGHEST)
+        side = min(_MULTIPLE * math.ceil(2 * reach / _MULTIPLE), min(camera.width, camera.height) // _MULTIPLE * _MULTIPLE)
+        top, left = (camera.height - side) // 2, (camera.width - side) // 2
+        return Window(slice(top, top + side), slice(left, left + side))
+
+    @property
+    def side(self) -> int:
+        """Pixels."""
+        return int(self.rows.stop - self.rows.start)
+
+
+def points(depth: NDArray[np.float32], camera: CameraConfig, window: Window) -> NDArray[np.float32]:
+    """(side, side, 3) p_TP, m, of what the pixels of a window show; NaN where nothing is measured.
+
+    Args:
+        depth: (height, width) m along the camera's axis; 0 or infinite where nothing is measured.
+    """
+    z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[window.rows, window.columns]
+    row, column = np.mgrid[window.rows, window.columns].astype(np.float32)
+    x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
+    y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length
+    return np.stack([x, y, camera.altitude - z], axis=-1).astype(np.float32)
+
+
+def coarse(array: NDArray[Element]) -> NDArray[Element]:
+    """Of (side, side, ...) what belongs to the network's answers."""
+    return array[::COARSE, ::COARSE]
+
+
+def network_input(points_T: NDArray[np.floating], color: NDArray[np.number] | None) -> NDArray[np.float32]:
+    """(channels, side, side) what the network is given: heights, where they are known, and colour if it looks at that.
+
+    Args:
+        points_T: see `points`.
+        color: (side, side, 3), of the window.
+    """
+    height = points_T[..., 2]
+    known = np.isfinite(height)
+    channels = [np.where(known, np.clip(height, -0.1, 0.9), 0.0) / _HEIGHT_UNIT, known]
+    if color is not None:
+        channels += [color[..., k] / 127.5 - 1.0 for k in range(3)]
+    return np.stack(channels).astype(np.float32)
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+class SegmentationNetwork(nn.Module):
+    """A U-Net (Ronneberger et al. 2015) whose halves are joined by addition.
+
+    Attributes:
+        classes: names of what it knows.
+        looks_at_color: whether it is given colour beside depth.
+    """
+
+    def __init__(self, classes: Sequence[str], looks_at_color: bool) -> None:
+        super().__init__()
+        self.classes, self.looks_at_color = tuple(classes), looks_at_color
+        channels = COARSE**2 * (5 if looks_at_color else 2)
+        self.into = nn.Sequential(nn.PixelUnshuffle(COARSE), _block(channels, _WIDTHS[0]))
+        steps = list(pairwise(_WIDTHS))
+        self.down = nn.ModuleList(nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in steps)
+        self.middle = _block(_WIDTHS[-1], _WIDTHS[-1])
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in reversed(steps))
+        self.up = nn.ModuleList(_block(a, a) for a, _ in reversed(steps))
+        self.out = nn.Conv2d(_WIDTHS[0], 1 + len(classes) + 3, 1)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B, 1 + classes, side / 2, side / 2), the first of no object, and votes (B, 3, ...), m, from the pixel's point.
+
+        Args:
+            image: (B, channels, side, side), see `network_input`.
+        """
+        x = self.into(image)
+        kept = []
+        for down in self.down:
+            kept.append(x)
+            x = down(x)
+        x = self.middle(x)
+        for narrow, up in zip(self.narrow, self.up, strict=True):
+            x = up(nn.functional.interpolate(narrow(x), scale_factor=2.0) + kept.pop())
+        found = self.out(x)
+        return found[:, :-3], found[:, -3:] * _VOTE_UNIT
+
+    @staticmethod
+    def of(checkpoint: Checkpoint) -> "SegmentationNetwork":
+        """From a checkpoint, ready to be asked."""
+        network = SegmentationNetwork(checkpoint.about["classes"], checkpoint.about["looks_at_color"])
+        network.load_state_dict(checkpoint.weights)
+        return network.eval()
+
+
+def loss(logits: Tensor, votes: Tensor, kind: Tensor, to_middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Cross entropy of the classes, and the mean error of the votes, m.
+
+    Args:
+        logits, votes: see `SegmentationNetwork.forward`.
+        kind: (B, h, w) 0 where there is no object, -1 where it is not known.
+        to_middle: (B, 3, h, w) m, from the pixel's point to the object's middle; NaN where it is not known.
+    """
+    of_classes = nn.functional.cross_entropy(logits, kind, ignore_index=-1)
+    known = torch.isfinite(to_middle).all(dim=1) & (kind > 0)
+    error = (votes - torch.nan_to_num(to_middle)).abs().sum(dim=1)[known]
+    return of_classes, error.mean() if len(error) else votes.sum() * 0
+
+
+@njit(cache=True)
+def _densest(votes, free, cell):  # type: ignore[no-untyped-def]
+    """Of the votes that are free, or of every so many if they are many, that with most others near it; -1 if there is none."""
+    left = np.flatnonzero(free)
+    left = left[:: max(1, len(left) // 300)]
+    best, found = 0, -1
+    for n in range(len(left)):
+        i, count = left[n], 0
+        for j in left:
+            x, y, z = votes[i, 0] - votes[j, 0], votes[i, 1] - votes[j, 1], votes[i, 2] - votes[j, 2]
+            count += x * x + y * y + z * z < cell * cell
+        if count > best:
+            best, found = count, int(i)
+    return found
+
+
+@njit(cache=True)
+def gathered(votes, radius, least):  # type: ignore[no-untyped-def]
+    """(n,) for each of (n, 3) votes the number of the object that it is for; -1 for none.
+
+    Again and again the place with most votes is taken, moved to their mean, and given all votes within `radius`, m, of it; one
+    with fewer than `least` votes is no object.
+    """
+    number = np.full(len(votes), -1)
+    free = np.ones(len(votes), np.bool_)
+    found = 0
+    while True:
+        first = _densest(votes, free, radius)
+        if first < 0:
+            return number
+        x, y, z = votes[first]
+        for _ in range(3):
+            total, sx, sy, sz = 0, 0.0, 0.0, 0.0
+            for j in range(len(votes)):
+                a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
+                if free[j] and a * a + b * b + c * c < radius * radius:
+                    total, sx, sy, sz = total + 1, sx + votes[j, 0], sy + votes[j, 1], sz + votes[j, 2]
+            if total > 0:
+                x, y, z = sx / total, sy / total, sz / total
+        total = 0
+        for j in range(len(votes)):
+            a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
+            if free[j] and (j == first or a * a + b * b + c * c < radius * radius):
+                free[j] = False
+                number[j] = found
+                total += 1
+        if total < least:
+            number[number == found] = -2  # no object: it is not asked again
+        else:
+            found += 1
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Pixels that belong together.
+
+    Attributes:
+        name: of the class.
+        mask: (height, width) bool.
+        p_TO: (3,) m, where the middle of the object is said to be.
+    """
+
+    name: str
+    mask: NDArray[np.bool_]
+    p_TO: NDArray[np.float64]
+
+
+def segments(
+    kind: NDArray[np.int64],
+    votes_T: NDArray[np.float32],
+    radii: Sequence[float],
+    names: Sequence[str],
+    window: Window,
+    shape: tuple[int, int],
+    least: int = 8,
+) -> list[Segment]:
+    """Objects from the network's answers.
+
+    Args:
+        kind: (h, w) 0 for no object, else number of the class + 1.
+        votes_T: (h, w, 3) m, where the object's middle is; NaN where no depth is measured.
+        radii: m, by class, within which votes are for the same object. names: of the classes.
+        window: that was looked at. shape: of the image.
+        least: votes for an object.
+    """
+    found = []
+    known = np.isfinite(votes_T).all(axis=2)
+    for k, (name, radius) in enumerate(zip(names, radii, strict=True), start=1):
+        rows, columns = np.nonzero((kind == k) & known)
+        if len(rows) < least:
+            continue
+        votes = votes_T[rows, columns].astype(np.float64)
+        number = gathered(votes, radius, least)
+        for each in range(number.max() + 1):
+            mine = number == each
+            small = np.zeros(kind.shape, bool)
+            small[rows[mine], columns[mine]] = True
+            mask = np.zeros(shape, bool)
+            mask[window.rows, window.columns] = small.repeat(COARSE, axis=0).repeat(COARSE, axis=1)
+            found.append(Segment(name, mask, np.median(votes[mine], axis=0)))
+    return found

@@ -1,0 +1,167 @@
+"""Labelled images on disk, and a stereo camera's noise."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CLASSES, resting, rng, scene_of, training_script
+from numpy.typing import NDArray
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.files import InputError
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.depth_noise import D435, DepthNoise, noisy_depth
+from drake_clutter.perception.image_set import ImageSet, LabelledImage, run_lengths, write_images
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.drop import above_tray, dropped
+
+SCENE = scene_of(
+    resting("gelatin_box", xy=(0.2, -0.2), name="under"),
+    resting("cracker_box", xy=(0.2, -0.2), floor=0.028, name="over"),
+    resting("tomato_soup_can", xy=(-0.2, 0.1), name="can"),
+    resting("large_marker", Orientation.FLAT_30, (-0.1, -0.2), name="marker"),
+)
+
+
+def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """The mask (H, W) of COCO's uncompressed counts, as their definition says."""
+    pixels = [k % 2 == 1 for k, count in enumerate(counts) for _ in range(count)]
+    return np.reshape(pixels, shape, order="F")
+
+
+@pytest.fixture(scope="module")
+def images(camera: OverheadCamera) -> list[LabelledImage]:
+    """Two images of the scene, the second without what lies on top."""
+    known: dict[SceneObject, int] = {}
+    photograph, generator = training_script("make_images").photograph, rng()
+    scenes = (SCENE, scene_of(*(o for o in SCENE.objects if o.name != "over")))
+    return [photograph(camera, scene, known, generator) for scene in scenes]
+
+
+@pytest.mark.parametrize(("distance", "expected"), [(1.0, 0.0010), (1.6, 0.0025)])
+def test_noise_grows_with_the_square_of_the_distance(distance: float, expected: float) -> None:
+    measured = noisy_depth(np.full((480, 640), distance, np.float32), rng())
+    held = measured[measured > 0]
+    assert measured.dtype == np.float32
+    assert held.size > 0.995 * measured.size
+    assert held.mean() == pytest.approx(distance, abs=0.0003)
+    assert held.std() == pytest.approx(expected, rel=0.08)
+    beside = (measured[:, 1:] > 0) & (measured[:, :-1] > 0)
+    assert np.corrcoef(measured[:, 1:][beside], measured[:, :-1][beside])[0, 1] > 0.4, "of neighbours"
+
+
+def test_disparity_comes_in_steps() -> None:
+    measured = noisy_depth(np.full((48, 64), 1.2, np.float32), rng())
+    steps = D435.focal_length * D435.baseline / measured[measured > 0] / D435.step
+    assert steps == pytest.approx(steps.round(), abs=1e-2)
+
+
+def test_holes_are_shadows_and_speckles() -> None:
+    """A wall 0.3 m before the floor: its shadow falls to the left, as wide as the two disparities differ, 3.6 px."""
+    depth = np.full((480, 640), 1.6, np.float32)
+    depth[100:300, 200:400] = 1.3
+    depth[400:] = np.inf
+    holes = noisy_depth(depth, rng(), DepthNoise(speckles=0)) == 0
+    assert holes[400:].all()
+    rows, columns = np.nonzero(holes[:400])
+    assert 100 <= rows.min() <= rows.max() < 300
+    assert 196 <= columns.min() <= columns.max() == 199
+    assert 200 * 2 < rows.size < 200 * 4, "ragged"
+    speckled = noisy_depth(depth, rng()) == 0
+    extra = np.count_nonzero(speckled & ~holes)
+    assert 0 < extra < 3 * D435.speckles * np.pi * D435.speckle_radius**2
+    assert np.array_equal(noisy_depth(depth, rng(1)), noisy_depth(depth, rng(1)))
+
+
+def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabelledImage]) -> None:
+    (tmp_path / ".000000").mkdir()  # of an interrupted run
+    write_images(tmp_path / "000000", images, CameraConfig(), list(CLASSES))
+    assert [path.name for path in tmp_path.iterdir()] == ["000000"]
+    read = ImageSet(tmp_path)
+    assert len(read) == 2
+    for written, again in zip(images, (read[0], read[1]), strict=True):
+        assert np.array_equal(written.color, again.color)
+        assert np.array_equal(np.isinf(written.depth), np.isinf(again.depth))
+        assert np.allclose(written.depth, again.depth, rtol=0, atol=0.51e-4)
+        assert np.array_equal(written.label, again.label)
+        assert written.classes == again.classes
+        assert np.array_equal(written.alone, again.alone)
+        for X, Y in zip(written.X_TO, again.X_TO, strict=True):
+            assert pytest.approx(X.p) == Y.p
+            assert pytest.approx(X.rotation, abs=1e-7) == Y.rotation
+    assert read[0].visible_share == pytest.approx([0, 1, 1, 1])
+    assert read[1].visible_share == pytest.approx([1, 1, 1])
+    with pytest.raises(InputError, match="holds no images"):
+        ImageSet(tmp_path / "000000")
+
+
+def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabelledImage]) -> None:
+    assert dict(zip(SCENE.names, images[0].visible_share, strict=True)) == camera.visible_shares(SCENE)
+
+
+def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabelledImage]) -> None:
+    write_images(tmp_path / "000000", images, CameraConfig(), list(CLASSES))
+    gt, info, eye, coco = (
+        json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info", "camera", "gt_coco")
+    )
+    names = {category["id"]: category["name"] for category in coco["categories"]}
+    K = np.reshape(eye["0"]["cam_K"], (3, 3))
+    for number, instance in enumerate(gt["0"]):
+        assert names[instance["obj_id"]] == images[0].classes[number]
+        R_CO, p_CO = np.reshape(instance["cam_R_m2c"], (3, 3)), np.array(instance["cam_t_m2c"])
+        corners = CLASSES[images[0].classes[number]].corners * 1000 @ R_CO.T + p_CO
+        pixels = (corners @ K.T / corners[:, 2:])[:, :2]
+        if info["0"][number]["px_count_visib"]:
+            x, y, width, height = info["0"][number]["bbox_visib"]
+            lower, upper = pixels.min(axis=0), pixels.max(axis=0)
+            assert [x, y, x + width - 1, y + height - 1] == pytest.approx([*lower, *upper], abs=1.0)
+    assert info["0"][0] == {"px_count_all": info["1"][0]["px_count_all"], "px_count_visib": 0, "visib_fract": 0.0} | {
+        "bbox_visib": [-1, -1, -1, -1]
+    }
+    annotated = [a for a in coco["annotations"] if a["image_id"] == 0]
+    assert [names[a["category_id"]] for a in annotated] == list(images[0].classes[1:]), "the hidden one has no mask"
+    for instance, annotation in enumerate(annotated, start=1):
+        mask = decoded(annotation["segmentation"]["counts"], annotation["segmentation"]["size"])
+        assert np.array_equal(mask, images[0].label == instance)
+        assert annotation["area"] == mask.sum()
+
+
+def test_run_lengths() -> None:
+    """By hand: they run down the columns, and begin with what is outside."""
+    assert run_lengths(np.array([[False, True], [True, True]])) == [1, 3]
+    assert run_lengths(np.array([[True, False], [False, False]])) == [0, 1, 3]
+    assert run_lengths(np.zeros((2, 3), bool)) == [6]
+
+
+def test_a_heap() -> None:
+    classes = [CLASSES[name] for name in ("gelatin_box", "tomato_soup_can", "pudding_box")]
+    start = above_tray(classes, 0.7, rng(2))
+    for k, one in enumerate(start.objects):
+        assert all(
+            (np.minimum(one.bounds_T[1], o.bounds_T[1]) < np.maximum(one.bounds_T[0], o.bounds_T[0])).any()
+            for o in start.objects[:k]
+        ), "nothing begins within another"
+    early, late = dropped(start, 0.002, (0.1, 0.5))
+    assert len(early.objects) == 3
+    assert all(late[o.name].X_TO.p[2] < o.X_TO.p[2] for o in start.objects if o.name in late.names)
+    assert all(o.bounds_T[0][2] > -0.002 for o in late.objects)
+
+
+def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = training_script("make_images")
+    monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
+    monkeypatch.setattr(script, "NODES", 10)
+    monkeypatch.setattr(script, "AGENTS", {"random": ""})
+    for out in ("one", "other"):
+        script.main(tmp_path / out, count=2, dropped_share=0.0, seed=3, objects="ycb7")
+    files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
+    assert len(files) == 1 + 4 + 6
+    for file in files:
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes(), file
+    before = (tmp_path / "one" / "000000").stat().st_mtime_ns
+    script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=3, objects="ycb7")
+    assert (tmp_path / "one" / "000000").stat().st_mtime_ns == before, "what is there is not made again"
+    with pytest.raises(InputError, match="of another job"):
+        script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=4, objects="ycb7")

@@ -1,0 +1,151 @@
+"""The segmentation network: what it is given, how votes become objects, and that it learns and can be interrupted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import rng
+
+from drake_clutter.config import CameraConfig
+from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.perception.image_set import LabelledImage
+from drake_clutter.perception.segmentation import (
+    SegmentationNetwork,
+    Window,
+    coarse,
+    gathered,
+    loss,
+    network_input,
+    points,
+    segments,
+)
+from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
+from drake_clutter.scenes.scene import Pose
+
+CAMERA = CameraConfig(width=160, height=120)
+WINDOW = Window.of(CAMERA, 0.7)
+CLASSES = ("gelatin_box", "sugar_box")
+
+
+def picture(number: int) -> LabelledImage:
+    """Two boxes of different heights on the floor, told by nothing but that."""
+    draw = rng(number)
+    depth, label = np.full((120, 160), 1.6, np.float32), np.full((120, 160), -1)
+    poses = []
+    for k, (height, half) in enumerate(((0.05, 6), (0.15, 9))):
+        row, column = int(draw.integers(20, 100)), int(draw.integers(45, 75)) + 40 * k
+        patch = slice(row - half, row + half), slice(column - half, column + half)
+        depth[patch], label[patch] = 1.6 - height, k
+        pixel = (1.6 - height) / CAMERA.focal_length
+        x, y = (column - 0.5 - (CAMERA.width / 2 - 1)) * pixel, -(row - 0.5 - (CAMERA.height / 2 - 1)) * pixel
+        poses.append(Pose((x, y, height / 2)))
+    return LabelledImage(np.zeros((120, 160, 3), np.uint8), depth, label, CLASSES, tuple(poses), np.full(2, 100))
+
+
+def test_the_window_holds_the_tray() -> None:
+    corner = np.array([[0.35, 0.35, 0.5], [-0.35, -0.35, 0.5]])
+    for camera in (CameraConfig(), CAMERA):
+        window = Window.of(camera, 0.7)
+        (right, top), (left, bottom) = camera.project(corner)
+        assert window.side % 16 == 0
+        assert window.columns.start <= left < right < window.columns.stop
+        assert window.rows.start <= top < bottom < window.rows.stop
+
+
+def test_points_are_what_the_camera_projects() -> None:
+    image = picture(0)
+    p_TP = points(image.depth, CAMERA, WINDOW)
+    row, column = 40, 31
+    assert CAMERA.project(p_TP[row, column][None]) == pytest.approx(
+        np.array([[column + WINDOW.columns.start, row + WINDOW.rows.start]]), abs=1e-3
+    )
+    image.depth[WINDOW.rows.start, WINDOW.columns.start] = 0.0
+    assert np.isnan(points(image.depth, CAMERA, WINDOW)[0, 0]).all()
+    given = network_input(points(image.depth, CAMERA, WINDOW), None)
+    assert given.shape == (2, WINDOW.side, WINDOW.side)
+    assert given[:, 0, 0] == pytest.approx([0.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_turned_and_mirrored_examples_vote_for_the_same_middles(seed: int) -> None:
+    image = picture(1)
+    plain = example(image, CLASSES, CAMERA, WINDOW, None, False)
+    turned = example(image, CLASSES, CAMERA, WINDOW, rng(seed), False)
+    for kind in (1, 2):
+        lengths = [np.linalg.norm(e.to_middle[:, e.kind == kind], axis=0) for e in (plain, turned)]
+        assert np.nanmedian(lengths[1]) == pytest.approx(np.nanmedian(lengths[0]), abs=0.01)
+    p_TP = coarse(points(image.depth, CAMERA, WINDOW))
+    voted = p_TP + np.moveaxis(plain.to_middle, 0, 2)
+    for k, pose in enumerate(image.X_TO):
+        of_one = voted[plain.kind == k + 1]
+        assert of_one == pytest.approx(np.broadcast_to(pose.translation, of_one.shape), abs=1e-6)
+
+
+def test_votes_for_one_place_are_one_object() -> None:
+    draw = rng(3)
+    centres = np.array([[0.0, 0.0, 0.02], [0.0, 0.0, 0.06], [0.2, 0.1, 0.02]])  # two lie across each other
+    votes = np.vstack([centre + draw.normal(0, 0.003, (count, 3)) for centre, count in zip(centres, (900, 300, 40), strict=True)])
+    number = gathered(np.vstack([votes, [[0.5, 0.5, 0.5]]]), 0.015, 8)
+    assert number[-1] < 0, "one vote is no object"
+    assert [len(set(part)) for part in np.split(number[:-1], [900, 1200])] == [1, 1, 1]
+    assert len(set(number[:-1])) == 3
+
+
+def test_segments_are_masks_in_the_image() -> None:
+    image = picture(2)
+    plain = example(image, CLASSES, CAMERA, WINDOW, None, False)
+    votes = coarse(points(image.depth, CAMERA, WINDOW)) + np.moveaxis(plain.to_middle, 0, 2)
+    found = segments(plain.kind, votes, (0.02, 0.02), CLASSES, WINDOW, image.depth.shape, least=4)
+    assert [segment.name for segment in found] == list(CLASSES)
+    for k, segment in enumerate(found):
+        true = image.label == k
+        assert (segment.mask & true).sum() / (segment.mask | true).sum() > 0.8
+        assert segment.p_TO == pytest.approx(image.X_TO[k].translation, abs=1e-3)
+
+
+@pytest.mark.parametrize("looks_at_color", [False, True])
+def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
+    network = SegmentationNetwork(CLASSES, looks_at_color).eval()
+    given = torch.randn(2, 5 if looks_at_color else 2, 64, 64)
+    logits, votes = network(given)
+    assert (logits.shape, votes.shape) == ((2, 3, 32, 32), (2, 3, 32, 32))
+    assert torch.allclose(network(given[:1])[0], logits[:1], atol=1e-5), "one by one as in a batch"
+    about = {"classes": list(CLASSES), "looks_at_color": looks_at_color}
+    save_checkpoint(tmp_path / "d.safetensors", network, about)
+    again = SegmentationNetwork.of(load_checkpoint(tmp_path / "d.safetensors"))
+    assert torch.equal(again(given)[1], votes)
+
+
+def test_the_loss_leaves_out_what_is_not_known() -> None:
+    kind = torch.tensor([[[1, 0], [2, 0]]])
+    to_middle = torch.full((1, 3, 2, 2), torch.nan)
+    to_middle[0, :, 0, 0] = 0.1
+    logits = torch.nn.functional.one_hot(kind, 3).permute(0, 3, 1, 2) * 50.0
+    of_classes, of_votes = loss(logits, torch.zeros(1, 3, 2, 2), kind, to_middle)
+    assert float(of_classes) == pytest.approx(0.0, abs=1e-6)
+    assert float(of_votes) == pytest.approx(0.3)
+
+
+def learner() -> SegmentationLearner:
+    torch.manual_seed(0)
+    config = SegmentationConfig(steps=40, batch=4)
+    network = SegmentationNetwork(CLASSES, False)
+    return SegmentationLearner(network, picture, 20, config, CAMERA, 0.7, 0, torch.device("cpu"))
+
+
+def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path: Path) -> None:
+    whole = learner()
+    losses = []
+    for step in range(40):
+        whole.advance()
+        losses.append(whole.losses["classes"])
+        if step == 29:
+            whole.save(tmp_path / "state.safetensors")
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+    resumed = learner()
+    resumed.load(tmp_path / "state.safetensors")
+    for _ in range(10):
+        resumed.advance()
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(resumed.network.state_dict()[name], value), name

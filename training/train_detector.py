@@ -1,0 +1,100 @@
+"""Trains the network that finds objects in images of `make_images.py`.
+
+    python training/make_images.py --out runs/images --count 20000 --workers 2
+    python training/train_detector.py --config training/configs/detector.yaml --out runs/detector
+
+A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import CameraConfig, LayoutConfig, load_typed
+from drake_clutter.files import told_in_one_line
+from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.perception.image_set import ImageSet
+from drake_clutter.perception.segmentation import SegmentationNetwork, Window
+from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
+from drake_clutter.runner import item_rng
+
+CHECKPOINT = "detector.safetensors"
+
+
+@dataclass
+class TrainDetector:
+    """A training.
+
+    Attributes:
+        images: folder of `make_images.py`; held_out: of its last images are not learned from, but looked at as it goes.
+        objects: name of the object set; catalogue: a folder with object classes of one's own, or "".
+        looks_at_color: whether the network is given colour beside depth.
+        seed: same seed, same weights (on the same kind of machine).
+        evaluate_every: steps.
+        learning, camera, layout: see there.
+    """
+
+    images: str = "runs/images"
+    held_out: int = 200
+    objects: str = "pantry14"
+    catalogue: str = ""
+    looks_at_color: bool = False
+    seed: int = 0
+    evaluate_every: int = 250
+    learning: SegmentationConfig = field(default_factory=SegmentationConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    layout: LayoutConfig = field(default_factory=LayoutConfig)
+
+
+def main(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainDetector.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
+) -> None:
+    """Trains, evaluates as it goes, and writes detector.safetensors."""
+    given = load_typed(TrainDetector(), config, settings or [])
+    torch.set_num_threads(threads)
+    chosen, camera, tray_side = device_of(device), given.camera, given.layout.tray_side
+    classes = [c.name for c in load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(given.objects)]
+    images = ImageSet(Path(given.images))
+    learned = len(images) - given.held_out
+    torch.manual_seed(given.seed)
+    network = SegmentationNetwork(classes, given.looks_at_color)
+    learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, tray_side, given.seed, chosen)
+    run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, tray_side)
+
+    def figures() -> dict[str, float]:
+        """Of the images held out: share of the pixels whose class is right, over the union, mean of classes; error of votes."""
+        network.eval()
+        both, either, errors = np.zeros(len(classes)), np.zeros(len(classes)), list[float]()
+        for k in range(learned, len(images)):
+            shown = example(images[k], classes, camera, window, item_rng(given.seed, 1, k), given.looks_at_color)
+            with torch.inference_mode():
+                logits, votes = network(torch.from_numpy(shown.image)[None].to(chosen))
+            kind = logits[0].argmax(dim=0).cpu().numpy()
+            for c in range(len(classes)):
+                is_, said = shown.kind == c + 1, kind == c + 1
+                both[c], either[c] = both[c] + (is_ & said).sum(), either[c] + (is_ | said).sum()
+            error = np.linalg.norm(votes[0].cpu().numpy() - shown.to_middle, axis=0)[kind > 0]
+            errors.append(float(np.nanmedian(error)) if np.isfinite(error).any() else np.nan)
+        return {"iou": float(np.mean(both / np.maximum(either, 1))), "median_vote_mm": 1000 * float(np.nanmean(errors))}
+
+    while learner.step < given.learning.steps:
+        learner.advance()
+        if learner.step == given.learning.steps or learner.step % given.evaluate_every == 0:
+            run.report(figures(), learner.losses)
+            run.save()
+    about = {"kind": "detector", "classes": classes, "looks_at_color": given.looks_at_color, "images": learned}
+    run.finish(CHECKPOINT, network, about)
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
