@@ -133,7 +133,7 @@ def main(
             )
             names = tuple(o.object_class.name for o in scene.objects)
             found.append(LabelledImage(image.color, image.depth, image.label, names, tuple(o.X_TO for o in scene.objects), alone))
-        return [c.name for c in held.grammar.classes], found
+        return [c.name for c in held.classes], found
 
     def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
         eye = LearnedDetector(checkpoint, [catalogue.classes[n] for n in names], config.camera, config.layout.tray_side)
