@@ -45,7 +45,7 @@ from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
 
 JOB_FILE = "job.json"
-HEAP_IMAGES, GENERATED_IMAGES = 20, 8
+HEAP_IMAGES, GENERATED_IMAGES = 20, 16
 """Of one item."""
 HEAP_OBJECTS = 20
 MOMENTS = (0.9, 1.1, 1.3, 1.5)

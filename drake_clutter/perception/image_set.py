@@ -92,10 +92,10 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: CameraCo
     coco["categories"] = [{"id": k, "name": name} for k, name in enumerate(class_names, start=1)]
     for number, image in enumerate(images):
         name = f"{number:06d}.png"
-        Image.fromarray(image.color).save(temporary / COLOR / name)
+        _write_png(image.color, temporary / COLOR / name)
         depth = np.where(np.isfinite(image.depth), np.round(image.depth / _DEPTH_UNIT), 0).astype(np.uint16)
-        Image.fromarray(depth).save(temporary / DEPTH / name)
-        Image.fromarray(np.where(image.label < 0, _NO_INSTANCE, image.label).astype(np.uint8)).save(temporary / LABEL / name)
+        _write_png(depth, temporary / DEPTH / name)
+        _write_png(np.where(image.label < 0, _NO_INSTANCE, image.label).astype(np.uint8), temporary / LABEL / name)
         ids = [class_names.index(class_name) + 1 for class_name in image.classes]
         eyes[str(number)] = eye
         poses[str(number)] = [{"obj_id": k, **_in_camera(X, camera)} for k, X in zip(ids, image.X_TO, strict=True)]
@@ -119,6 +119,10 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: CameraCo
     for file, value in ((CAMERA_FILE, eyes), (POSES_FILE, poses), (INFO_FILE, infos), (COCO_FILE, coco)):
         (temporary / file).write_text(json.dumps(value, separators=(",", ":"), allow_nan=False), encoding="utf-8")
     temporary.rename(folder)
+
+
+def _write_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None:
+    Image.fromarray(pixels).save(path, compress_level=1)  # a fifth larger than by default, written in a fraction of the time
 
 
 def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
