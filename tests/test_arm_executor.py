@@ -91,14 +91,14 @@ def test_the_schedule(plan: Plan) -> None:
     assert schedule.phase(schedule.suction_off + 0.01) == "release"
     assert schedule.phase(schedule.end) == "idle"
     home = np.concatenate([ArmConfig().home, np.zeros(6)])
-    assert schedule.reference.value(0.0).ravel() == pytest.approx(home, abs=1e-3)
-    assert schedule.reference.value(schedule.end).ravel() == pytest.approx(home, abs=1e-3)
+    assert schedule.command.value(0.0).ravel()[:12] == pytest.approx(home, abs=1e-3)
+    assert schedule.command.value(schedule.end).ravel()[:12] == pytest.approx(home, abs=1e-3)
 
 
 def test_an_executor_without_a_plan_stays_at_home() -> None:
     executor = PickPlaceExecutor(config=ArmConfig())
     context = executor.CreateDefaultContext()
-    assert executor.GetOutputPort("desired_state").Eval(context)[:6] == pytest.approx(ArmConfig().home)
+    assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(ArmConfig().home)
     assert executor.GetOutputPort("suction").Eval(context)[0] == 0
     assert executor.GetOutputPort("status").Eval(context) == "idle"
 
@@ -113,11 +113,11 @@ def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     clone = Simulator(executor, simulator.get_context().Clone())
     simulator.AdvanceTo(2.0)
     clone.AdvanceTo(2.0)
-    for port in ("desired_state", "feed_forward", "suction"):
+    for port in ("command", "suction"):
         first, second = (executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone))
         assert (first == second).all()
     assert executor.GetOutputPort("status").Eval(clone.get_context()) == scheduled(plan, ArmConfig()).phase(2.0)
-    assert executor.GetOutputPort("desired_state").Eval(clone.get_context())[:6] != pytest.approx(ArmConfig().home)
+    assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(ArmConfig().home)
 
 
 def test_the_same_plan_has_the_same_outcome(plan: Plan) -> None:

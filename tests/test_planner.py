@@ -181,11 +181,12 @@ def test_turned_by_a_quarter() -> None:
 
 
 def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
-    scene, step = planner().clearance_scene(PILE), 1e-4
+    """Beside the way, where faces are not parallel: between those that are, the nearest points are not unique."""
+    scene, step, draw = planner().clearance_scene(PILE), 1e-4, rng(0)
     scene.hold(plan.pick, inverse(plan.X_OG))
     errors = list[float]()
     for time in np.linspace(0.0, plan.phases[1].duration, 15):
-        q = plan.phases[1].trajectory.value(time).ravel()
+        q = plan.phases[1].trajectory.value(time).ravel() + draw.normal(0, 0.1, 6)
         gradients = scene.gradients(q, 0.2)
         assert [clearance for clearance, _ in gradients] == scene.close(q, 0.2)
         pairs = [clearance.pair for clearance, _ in gradients]
@@ -199,8 +200,8 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
                 if abs(sides[0] - sides[1]) < 1e-2:  # not where the nearest corner changes
                     errors.append(abs(float(gradient[joint] - sum(sides) / 2)))
     assert len(errors) > 100
-    assert np.quantile(errors, 0.9) < 2e-3
-    assert max(errors) < 0.05  # between faces that are nearly parallel the nearest points jump
+    assert np.quantile(errors, 0.9) < 5e-4
+    assert max(errors) < 5e-3
 
 
 def test_optimised_ways_are_quicker(plan: Plan) -> None:

@@ -137,8 +137,7 @@ class ArmSimulation:
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=config)
         source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(plan)))
         builder.Connect(source.get_output_port(), self.executor.GetInputPort("plan"))
-        for name in ("desired_state", "feed_forward"):
-            builder.Connect(self.executor.GetOutputPort(name), self.station.GetInputPort(name))
+        builder.Connect(self.executor.GetOutputPort("command"), self.station.GetInputPort("command"))
         self.diagram: Diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         self._suction = self.executor.GetOutputPort("suction")
@@ -150,7 +149,7 @@ class ArmSimulation:
     def run(self, *, record: bool = False) -> Carried:
         """Simulates until the arm is home again and all has come to rest."""
         root, station = self.simulator.get_mutable_context(), self.station
-        context, desired = station.plant_context(root), self.executor.GetOutputPort("desired_state")
+        context, command = station.plant_context(root), self.executor.GetOutputPort("command")
         station.set_scene(root, np.array(self.config.home), self._objects)
         self.simulator.set_monitor(self.vacuum)
         beside_pick, beside_place = disturbed_by(self._objects, self._plan)
@@ -164,7 +163,7 @@ class ArmSimulation:
             wanted = taking_part(schedule, beside_pick, beside_place, time)
             freedom.update(root, wanted, must_hold=time >= schedule.suction_on + LOOK)
             self.simulator.AdvanceTo(k * LOOK + self._time_step / 2)
-            now = desired.Eval(self.executor.GetMyContextFromRoot(root))[:6]
+            now = command.Eval(self.executor.GetMyContextFromRoot(root))[:6]
             tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))
             if record:
                 state = station.arm_state(context, self._vacuum_wanted(root))

@@ -49,7 +49,7 @@ class ClearanceScene:
         builder = DiagramBuilder()
         made = add_scene_plant(builder, objects, tray_side, 0.0, visuals=False)
         self.plant, self._bodies = made.plant, made.bodies
-        self._arm: Arm = add_arm(made.plant, made.scene_graph, config, camera_altitude, compliant=False)
+        self._arm: Arm = add_arm(made.plant, made.scene_graph, config, camera_altitude, compliant=False, visuals=False)
         made.plant.Finalize()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()

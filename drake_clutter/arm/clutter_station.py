@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
+from pydrake.systems.primitives import Demultiplexer
 
 from drake_clutter.arm.hold import HexapodHold, Hold, JointHold
 from drake_clutter.arm.kinematics import JOINTS
@@ -25,6 +26,8 @@ from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_tr
 
 Floats = NDArray[np.float64]
 
+LOAD_PERIOD = 0.01
+"""s, of the looks at what the cup bears, and at whether the vacuum is wanted."""
 LETS_GO_AFTER = 0.02
 """s of overload: the time in which air gets in."""
 SUCKED_FROM = 0.005
@@ -36,7 +39,7 @@ STIFFNESS, DAMPING = 1e5, 2e3
 class ClutterStation(Diagram):
     """The arm among objects.
 
-    Input ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m.
+    Input port: command (18,), desired state, rad and rad/s, and feed-forward torque, N m.
     Output ports: state, of the whole plant; body_poses, of all its bodies; query, of the geometry.
     """
 
@@ -67,7 +70,7 @@ class ClutterStation(Diagram):
         builder = DiagramBuilder()
         self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=visuals, jointed=jointed)
         self.plant = plant = self.scene.plant
-        self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True)
+        self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True, visuals=visuals)
         for name in JOINTS:
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
         self.hold: Hold = JointHold(plant, self.arm, self.scene.bodies[jointed]) if jointed else HexapodHold(plant, self.arm)
@@ -78,9 +81,10 @@ class ClutterStation(Diagram):
         self._name_of = {int(body.index()): name for name, body in self.scene.bodies.items()}
         self._locked_filter: FilterId | None = None
         self._q_at, self._v_at = joint_numbers(plant, self.arm)
-        ports = (("desired_state", plant.get_desired_state_input_port), ("feed_forward", plant.get_actuation_input_port))
-        for name, port in ports:
-            builder.ExportInput(port(self.arm.robot), name)
+        command = builder.AddSystem(Demultiplexer(np.array([12, 6])))
+        builder.ExportInput(command.get_input_port(), "command")
+        builder.Connect(command.get_output_port(0), plant.get_desired_state_input_port(self.arm.robot))
+        builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self.scene.scene_graph.get_query_output_port(), "query")
@@ -187,11 +191,15 @@ class Vacuum:
     largest_share: float = 0.0
     slip: float = math.nan
     _on: bool = False
-    _overloaded: int = 0  # steps in a row
+    _overloaded: int = 0  # looks in a row
+    _looked: float = -math.inf  # s
 
     def __call__(self, root: Context) -> EventStatus:
         """The monitor."""
-        station = self.station
+        station, time = self.station, root.get_time()
+        if 0 <= time - self._looked < LOAD_PERIOD - station.time_step / 2:
+            return EventStatus.DidNothing()
+        self._looked = time
         context = station.plant_context(root)
         wanted = self.wanted(root)
         if wanted and not self._on:
@@ -205,8 +213,8 @@ class Vacuum:
             share = float(load_share(*station.hold.load(context), station.config.suction))
             self.largest_share = max(self.largest_share, share)
             self._overloaded = self._overloaded + 1 if share > 1 else 0
-            if self._overloaded * station.time_step > LETS_GO_AFTER:
-                self.dropped = root.get_time()
+            if self._overloaded * LOAD_PERIOD > LETS_GO_AFTER:
+                self.dropped = time
                 self._release(context)
         return EventStatus.DidNothing()
 
@@ -259,13 +267,13 @@ class Freedom:
             wanted: names.
             must_hold: whether the cup is holding something, if all went well; if it does not, what falls may hit anything.
         """
-        speeds = self._station.scene.speeds(self._station.plant_context(root))
+        speeds = self._station.scene.speeds(self._station.plant_context(root), self.free)
         moving = {name for name in self.free if speeds[name] > self.AT_REST}
         lost = not math.isnan(self._vacuum.dropped) or (must_hold and not self._vacuum.sealed)
         held = {self._vacuum.held} - {""}
         # What is run into is freed as well: a locked object that is hit would stand like a rock.
         hit = self._station.touched(self._station.plant_context(root)) - self.free if self.free else set()
-        free = set(speeds) if lost else {*wanted, *moving, *held, *hit}
+        free = set(self._station.classes) if lost else {*wanted, *moving, *held, *hit}
         if free != self.free:
             self._station.lock_all_but(root, free)
             self.free = free

@@ -14,6 +14,7 @@ from pydrake.multibody.plant import DistanceConstraintParams, MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
+from drake_clutter.arm.epick import CUP_MASS
 from drake_clutter.arm.station import Arm
 from drake_clutter.arm.suction import GRAVITY
 
@@ -40,8 +41,8 @@ def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Flo
     """What the cup is loaded with besides its own weight, from the reaction in the bellows; in G."""
     bellows = plant.GetJointByName("bellows", arm.tool)
     reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
-    R_GT = arm.cup.CalcPoseInWorld(context).rotation().inverse()
-    weight = R_GT @ np.array([0.0, 0.0, -GRAVITY * plant.GetBodyByName("cup", arm.tool).default_mass()])
+    down_G = -arm.cup.CalcPoseInWorld(context).rotation().matrix()[2]
+    weight = GRAVITY * CUP_MASS * down_G
     return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
 
 

@@ -19,6 +19,7 @@ from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.time_optimal import squared_speeds
 from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
 from drake_clutter.resources import shipped_path
+from drake_clutter.simulation.plant import physics_sdf
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], bas
     config = ArmConfig(base=list(base))
     config.suction.extension = extension
     plant = MultibodyPlant(0.0)
-    (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
+    (robot,) = Parser(plant).AddModelsFromString(physics_sdf(shipped_path("models/ur10.sdf")), "sdf")
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=False), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), RigidTransform(config.X_TB))
     plant.WeldFrames(plant.GetFrameByName("flange", robot), plant.GetFrameByName("body", tool))
@@ -146,7 +147,7 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
         return PathParameterizedTrajectory(path, softened(along) if payload.mass else along)
 
     trajectory, rest = run_through(), np.zeros_like(q)
-    if trajectory is None or (np.abs(torques(plant, *_motion(trajectory, 40))) <= MARGIN * TORQUE_LIMIT).all():
+    if trajectory is None or (np.abs(torques(plant, *motion(trajectory, 40))) <= MARGIN * TORQUE_LIMIT).all():
         return trajectory
     held = torques(plant, q, rest, rest)  # the torques' limits are rarely needed, and take most of the time
     if (np.abs(held) > MARGIN * TORQUE_LIMIT).any():
@@ -173,7 +174,7 @@ def slowed(trajectory: Trajectory, config: ArmConfig, payload: Payload) -> Traje
     """The same motion, evenly slower until velocity, acceleration, torque and the cup's hold allow it; None if they never do."""
     plant, end = dynamics_plant(config, payload), trajectory.end_time()
     count = max(200, math.ceil(end / 0.005))
-    q, v, a = _motion(trajectory, count)
+    q, v, a = motion(trajectory, count)
     held = torques(plant, q, np.zeros_like(q), np.zeros_like(q))
     moving = torques(plant, q, v, a) - held
     room = MARGIN * TORQUE_LIMIT - np.sign(moving) * held
@@ -189,10 +190,10 @@ def slowed(trajectory: Trajectory, config: ArmConfig, payload: Payload) -> Traje
     return PathParameterizedTrajectory(trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]]))
 
 
-def _motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
-    """q, v and a, (count, 6) each, at times equally far apart."""
+def motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
+    """q rad, v rad/s and a rad/s^2, (count, 6) each, at times equally far apart, both ends among them."""
     times = np.linspace(trajectory.start_time(), trajectory.end_time(), count)
-    v, a = (np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2))
+    v, a = (trajectory.MakeDerivative(order).vector_values(times).T for order in (1, 2))
     return trajectory.vector_values(times).T, v, a
 
 
@@ -207,11 +208,10 @@ def _context(plant: MultibodyPlant) -> Context:
 
 def torques(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
     """(n, 6) N m, that motions (n, 6) each, take."""
-    context, found = _context(plant), np.empty_like(q)
+    context, forces, found = _context(plant), MultibodyForces(plant), np.empty_like(q)
     for k in range(len(q)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])
-        forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
         found[k] = plant.CalcInverseDynamics(context, a[k], forces)
     return found

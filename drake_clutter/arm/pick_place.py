@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_clutter.arm.paths import Payload, dynamics_plant, torques
+from drake_clutter.arm.paths import Payload, dynamics_plant, motion, torques
 from drake_clutter.arm.plan import Plan
 from drake_clutter.arm.station import ArmConfig
 
@@ -16,8 +16,10 @@ Floats = NDArray[np.float64]
 
 DWELL = 0.15
 """s, that the arm waits for the vacuum to build up, and to be gone."""
-PERIOD = 0.01
-"""s, of the looks for a new plan, and of the samples of reference and feed-forward torque."""
+PERIOD = 0.025
+"""s, of the looks for a new plan."""
+SAMPLE_PERIOD = 0.01
+"""s, of the samples of reference and feed-forward torque, interpolated linearly."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,12 @@ class Schedule:
     """A plan as it is run: over the time since it began.
 
     Attributes:
-        reference: (12,) rad and rad/s. torque: (6,) N m, feed-forward.
+        command: (18,), desired state, rad and rad/s, and feed-forward torque, N m.
         suction_on, suction_off, end: s.
         starts: name and start, s, of each phase and dwell.
     """
 
-    reference: PiecewisePolynomial
-    torque: PiecewisePolynomial
+    command: PiecewisePolynomial
     suction_on: float
     suction_off: float
     end: float
@@ -46,7 +47,7 @@ def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
     """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take."""
     approach, carry, retreat = plan.phases
     mass, p_GCm = plan.mass, plan.p_GCm
-    q_parts, t_parts, torque_parts = list[Floats](), list[Floats](), list[Floats]()
+    parts, t_parts, at_rest = list[Floats](), list[Floats](), np.zeros((2, 6))
     starts, time = list[tuple[str, float]](), 0.0
     empty, loaded = Payload(), Payload(mass, p_GCm)
     for name, phase, payload in (
@@ -58,23 +59,17 @@ def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
     ):
         starts.append((name, time))
         duration = phase.duration if phase else DWELL
-        times = np.linspace(0.0, duration, max(2, round(duration / PERIOD) + 1))
         if phase:
-            q = np.array([phase.trajectory.value(t).ravel() for t in times])
-            v = np.array([phase.trajectory.EvalDerivative(t, 1).ravel() for t in times])
-            a = np.array([phase.trajectory.EvalDerivative(t, 2).ravel() for t in times])
+            q, v, a = motion(phase.trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
         else:
-            q, v, a = np.repeat(q_parts[-1][-1:], len(times), axis=0), np.zeros((len(times), 6)), np.zeros((len(times), 6))
-        q_parts.append(q)
-        t_parts.append(time + times)
-        torque_parts.append(np.column_stack([v, torques(dynamics_plant(config, payload), q, v, a)]))
+            q, v, a = np.repeat(parts[-1][-1:, :6], 2, axis=0), at_rest, at_rest
+        t_parts.append(time + np.linspace(0.0, duration, len(q)))
+        parts.append(np.column_stack([q, v, torques(dynamics_plant(config, payload), q, v, a)]))
         time += duration
     on, off = starts[1][1], starts[3][1]
     # Neighbouring parts share a time: the later sample is left a moment later.
     t = np.concatenate([part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)])
-    q, more = np.vstack(q_parts), np.vstack(torque_parts)
-    reference = PiecewisePolynomial.FirstOrderHold(t, np.column_stack([q, more[:, :6]]).T)
-    return Schedule(reference, PiecewisePolynomial.FirstOrderHold(t, more[:, 6:].T), on, off, time, tuple(starts))
+    return Schedule(PiecewisePolynomial.FirstOrderHold(t, np.vstack(parts).T), on, off, time, tuple(starts))
 
 
 @dataclass(frozen=True)
@@ -100,21 +95,22 @@ class PickPlaceExecutor(LeafSystem):
     """Runs one plan after the other.
 
     Input port: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended.
-    Output ports: desired_state (12,) rad and rad/s; feed_forward (6,) N m; suction (1,), 1 for on; status, abstract, the phase;
-        finished (1,), how many plans have ended.
+    Output ports: command (18,), desired state, rad and rad/s, and feed-forward torque, N m; suction (1,), 1 for on; status,
+        abstract, the phase; finished (1,), how many plans have ended.
     """
 
     def __init__(self, *, config: ArmConfig) -> None:
         """Begins at home, with nothing to do."""
         super().__init__()
         self._config = config
+        home, still = np.array(config.home)[None], np.zeros((1, 6))
+        self._at_home = np.hstack([home, still, torques(dynamics_plant(config, Payload()), home, still, still)]).ravel()
         self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
         self._state = self.DeclareAbstractState(AbstractValue.Make(Running()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         of = {self.all_state_ticket(), self.time_ticket()}
-        self.DeclareVectorOutputPort("desired_state", 12, self._calc_desired_state, of)
-        self.DeclareVectorOutputPort("feed_forward", 6, self._calc_feed_forward, of)
+        self.DeclareVectorOutputPort("command", 18, self._calc_command, of)
         self.DeclareVectorOutputPort("suction", 1, self._calc_suction, of)
         self.DeclareVectorOutputPort("finished", 1, self._calc_finished, of)
         self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status, of)
@@ -146,18 +142,9 @@ class PickPlaceExecutor(LeafSystem):
             return None, 0.0
         return running.schedule, min(context.get_time() - running.begun, running.schedule.end)
 
-    def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
         schedule, time = self._now(context)
-        rest = np.concatenate([self._config.home, np.zeros(6)])
-        output.SetFromVector(rest if schedule is None else schedule.reference.value(time).ravel())
-
-    def _calc_feed_forward(self, context: Context, output: BasicVector) -> None:
-        schedule, time = self._now(context)
-        if schedule is None:
-            home = np.array(self._config.home)[None]
-            output.SetFromVector(torques(dynamics_plant(self._config, Payload()), home, 0 * home, 0 * home)[0])
-        else:
-            output.SetFromVector(schedule.torque.value(time).ravel())
+        output.SetFromVector(self._at_home if schedule is None else schedule.command.value(time).ravel())
 
     def _calc_suction(self, context: Context, output: BasicVector) -> None:
         schedule, time = self._now(context)

@@ -20,6 +20,7 @@ from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.assets.tray import RIM_THICKNESS
 from drake_clutter.resources import shipped_path
+from drake_clutter.simulation.plant import physics_sdf
 
 Floats = NDArray[np.float64]
 
@@ -81,9 +82,26 @@ _TABLE = (Box(2.4, 2.4, 0.04), RigidTransform([0.0, 0.0, -0.031]))
 """Its upper surface is a millimetre below the tray's floor, which lies on it."""
 
 
-def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph, config: ArmConfig, camera_altitude: float, *, compliant: bool) -> Arm:
-    """Adds pedestal, arm, tool, table and the camera's housing to a plant that is not finalized; `compliant`: see `epick_sdf`."""
-    (robot,) = Parser(plant).AddModels(str(shipped_path("models/ur10.sdf")))
+def add_arm(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    config: ArmConfig,
+    camera_altitude: float,
+    *,
+    compliant: bool,
+    visuals: bool,
+) -> Arm:
+    """Adds pedestal, arm, tool, table and the camera's housing to a plant that is not finalized.
+
+    Args:
+        plant, scene_graph: what to add to.
+        config: the arm.
+        camera_altitude: m.
+        compliant: see `epick_sdf`.
+        visuals: whether cameras are to see the arm, see `add_scene_plant`.
+    """
+    parser, model = Parser(plant), shipped_path("models/ur10.sdf")
+    (robot,) = parser.AddModels(str(model)) if visuals else parser.AddModelsFromString(physics_sdf(model), "sdf")
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=compliant), "sdf")
     world, X_TB = plant.world_body(), RigidTransform(config.X_TB)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), X_TB)

@@ -45,7 +45,7 @@ def strip(scene: Scene, frames: Sequence[Frame], arm_config: ArmConfig | None = 
     builder = DiagramBuilder()
     made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.tray_side, 0.01, visuals=True)
     plant = made.plant
-    arm = add_arm(plant, made.scene_graph, arm_config or ArmConfig(), CameraConfig().altitude, compliant=True)
+    arm = add_arm(plant, made.scene_graph, arm_config or ArmConfig(), CameraConfig().altitude, compliant=True, visuals=True)
     plant.Finalize()
     made.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(ENGINE))
     diagram = builder.Build()

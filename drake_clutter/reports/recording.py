@@ -161,7 +161,7 @@ def _shown(scene: Scene, *, arm: bool = False) -> tuple[Meshcat, dict[str, str],
     plant = scene_plant.plant
     links, added = {}, None
     if arm:
-        added = add_arm(plant, scene_plant.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=False)
+        added = add_arm(plant, scene_plant.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=False, visuals=True)
         links = {f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body for body in added.bodies}
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))

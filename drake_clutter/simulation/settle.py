@@ -87,7 +87,7 @@ def settle(
             motion.append(Frame(simulator.get_context().get_time(), scene_plant.poses(context)))
         # Half a step is added so that rounding never leaves a step out.
         simulator.AdvanceTo(sample * SAMPLE_PERIOD + config.time_step / 2)
-        poses, speeds = scene_plant.poses(context), scene_plant.speeds(context)
+        poses, speeds = scene_plant.poses(context), scene_plant.speeds(context, scene_plant.bodies)
         history.append(poses)
         if record:
             motion.append(Frame(sample * SAMPLE_PERIOD, poses))

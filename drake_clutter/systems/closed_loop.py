@@ -123,7 +123,7 @@ class ClosedLoop:
             (self.executor, self.agent, {"finished": "finished"}),
             (self.agent, planner, {"request": "request"}),
             (planner, self.executor, {"plan": "plan"}),
-            (self.executor, self.station, {"desired_state": "desired_state", "feed_forward": "feed_forward"}),
+            (self.executor, self.station, {"command": "command"}),
         ):
             for output, input_ in ports.items():
                 builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
