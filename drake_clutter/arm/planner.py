@@ -80,6 +80,10 @@ class PickPlacePlanner:
                     return found
         return attempt.furthest
 
+    def holds(self, scene_object: SceneObject) -> bool:
+        """Whether the cup seals somewhere on top of an object and can carry it."""
+        return not isinstance(self._grasps(scene_object), NoPlan)
+
     def _grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
         """Where the cup seals on top and can hold, the nearest to its middle first."""
         suction = self.config.suction

@@ -39,18 +39,18 @@ class SettleExecutor:
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         X_TO = choose_placement(observation, move, self._config.exploration, rng)
-        if X_TO is None:
-            return Outcome(MoveResult.NO_FREE_SPOT, scene)
+        return Outcome(MoveResult.NO_FREE_SPOT, scene) if X_TO is None else self.put(scene, move.pick, X_TO, rng)
+
+    def put(self, scene: Scene, pick: str, X_TO: Pose, rng: np.random.Generator) -> Outcome:
+        """Lets an object of the scene go at a pose, random offsets added, and settles."""
         # What is let go sinks by the height of release; else it would never count as calm.
         sinks = self._config.settle.calm_displacement + self._config.exploration.release_height
         settle_config = replace(self._config.settle, calm_displacement=sinks)
-        (released,) = jittered([replace(scene[move.pick], X_TO=X_TO)], settle_config.jitter, rng)
-        moved = scene.at({move.pick: released.X_TO})
+        (released,) = jittered([replace(scene[pick], X_TO=X_TO)], settle_config.jitter, rng)
+        moved = scene.at({pick: released.X_TO})
 
-        left_behind = next(
-            group for group in touching_groups(scene.objects, TOUCHING_MARGIN) if move.pick in {o.name for o in group}
-        )
-        touched = {o.name for o in left_behind}
+        groups = touching_groups(scene.objects, TOUCHING_MARGIN)
+        touched = next(names for group in groups if pick in (names := {o.name for o in group}))
         settled = []
         for group in touching_groups(moved.objects, TOUCHING_MARGIN):
             if touched.isdisjoint(o.name for o in group):

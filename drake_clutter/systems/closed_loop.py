@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
-from drake_clutter.arm.arm_executor import LOOK, disturbed_by, judged, nearest, taking_part
+from drake_clutter.arm.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
 from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
 from drake_clutter.arm.pick_place import PickPlaceExecutor
@@ -21,7 +21,7 @@ from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
+from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
@@ -30,8 +30,6 @@ from drake_clutter.systems.scene_perception import LabelPerception, Perceive, Sc
 from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
 
-TIME_STEP = 0.005
-"""s, of the simulation."""
 PATIENCE = 1.0
 """s, after a plan's end, for which what has fallen is followed."""
 
@@ -196,12 +194,8 @@ class ClosedLoop:
         """How a move went, by the truth, once the agent has looked again."""
         before, plan = self.task.scene, answer.plan
         assert plan is not None
-        move, decision = request.move, request.decision
-        if self._tracks:  # what it calls an object is its own affair
-            truly = {TRAY: TRAY} | {o.name: nearest(before.objects, o.X_TO).name for o in request.known}
-            move = Move(truly[move.pick], truly[move.place])
-            picks = {truly[name]: chance for name, chance in decision.picks.items()}
-            decision = replace(decision, move=move, picks=picks, known=tuple(truly[name] for name in decision.known))
+        # What an agent that tracks calls an object is its own affair.
+        move, decision = request.truly(before.objects) if self._tracks else (request.move, request.decision)
         if isinstance(plan, NoPlan):
             no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED

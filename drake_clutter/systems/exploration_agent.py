@@ -8,9 +8,10 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
+from drake_clutter.arm.arm_executor import nearest
 from drake_clutter.arm.plan import NoPlan, Plan
 from drake_clutter.runner import item_rng
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.systems.move_planner import Answer
 from drake_clutter.systems.tracking import Tracked
@@ -62,6 +63,13 @@ class Request:
         """Itself: it never changes, and Drake copies abstract values again and again."""
         return self
 
+    def truly(self, objects: Sequence[SceneObject]) -> tuple[Move, Decision]:
+        """Move and decision in the names of what is really there, each known object being the nearest to its place."""
+        name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in self.known}
+        move = Move(name[self.move.pick], name[self.move.place])
+        picks = {name[pick]: chance for pick, chance in self.decision.picks.items()}
+        return move, replace(self.decision, move=move, picks=picks, known=tuple(name[known] for known in self.decision.known))
+
 
 @dataclass(frozen=True)
 class AgentState:
@@ -89,6 +97,21 @@ class AgentState:
     def __deepcopy__(self, memo: object) -> "AgentState":
         """Itself, as of `Request`."""
         return self
+
+    @property
+    def refused(self) -> "AgentState":
+        """After a request that could not be carried out."""
+        assert self.request is not None
+        move = self.request.move
+        return replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), failed=(*self.failed, move))
+
+    def placed(self, X_TO: Pose) -> "AgentState":
+        """After a request that was carried out: until it is seen there, an object is taken to be where it was put."""
+        assert self.request is not None
+        move = self.request.move
+        known = tuple(replace(o, X_TO=X_TO) if o.name == move.pick else o for o in self.known)
+        over = replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), failed=(), known=known)
+        return replace(over, carried_out=self.carried_out + 1)
 
 
 class ExplorationAgent(LeafSystem):
@@ -139,24 +162,21 @@ class ExplorationAgent(LeafSystem):
     def _next(self, context: Context, now: AgentState) -> AgentState:
         time = context.get_time()
         if now.phase is Phase.LOOKING and time >= now.look_at:
-            return self._decided(now, self._observation.Eval(context))
+            return self.decided(now, self._observation.Eval(context))
         if now.phase is Phase.WAITING:
             assert now.request is not None
             answer: Answer = self._answer.Eval(context)
             if answer.number < now.request.number:
                 return now
-            move = now.request.move
             if isinstance(answer.plan, NoPlan):
-                return replace(now, phase=Phase.LOOKING, look_at=time, tried=(*now.tried, move), failed=(*now.failed, move))
+                return replace(now.refused, look_at=time)
             if self._finished.Eval(context)[0] > now.carried_out:
                 assert isinstance(answer.plan, Plan)
-                # Until it is seen there, an object is taken to be where it was put.
-                known = tuple(replace(o, X_TO=answer.plan.X_TO_place) if o.name == move.pick else o for o in now.known)
-                over = replace(now, phase=Phase.LOOKING, look_at=time + self._rest, tried=(*now.tried, move), failed=())
-                return replace(over, known=known, carried_out=now.carried_out + 1)
+                return replace(now.placed(answer.plan.X_TO_place), look_at=time + self._rest)
         return now
 
-    def _decided(self, now: AgentState, observation: Observation) -> AgentState:
+    def decided(self, now: AgentState, observation: Observation) -> AgentState:
+        """After a look: with a request for a move, or done."""
         if self._track is not None:
             observation, lost = self._track(now.known, observation)
             # What is lost is no longer known: wherever it is, it will be found again as another.

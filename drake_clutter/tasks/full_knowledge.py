@@ -124,7 +124,8 @@ class FullKnowledgeSearch:
         """
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
-        never = self._never_found(start)
+        fixed = self._judge.never_movable(scene)
+        never = self.never_found(scene, start.known, fixed if isinstance(fixed, frozenset) else ())
         if never:
             return Solution(Answer.UNSOLVABLE, (), start.at_least, never, 0)
         plan, at_least, exhausted = None, start.at_least, False
@@ -195,17 +196,22 @@ class FullKnowledgeSearch:
             seen += rays[moves]
             if seen >= self._hidden_below * total:
                 return moves, involved
-        return 0, involved  # out of the frame, see `_never_found`
+        return 0, involved  # out of the frame, see `never_found`
 
-    def _never_found(self, start: _State) -> tuple[str, ...]:
-        """What is out of the camera's frame, or stays hidden behind objects that can never be moved."""
-        fixed = self._judge.never_movable(start.scene)
+    def never_found(self, scene: Scene, known: Collection[str], fixed: Collection[str]) -> tuple[str, ...]:
+        """What is out of the camera's frame, or stays hidden behind objects that can never be moved.
+
+        Args:
+            scene: at rest.
+            known: names of what has been in view.
+            fixed: names of what can never be moved.
+        """
         found = []
-        for name in start.scene.names:
-            if name in start.known:
+        for name in scene.names:
+            if name in known:
                 continue
-            left = [o for o in start.scene.objects if o.name == name or (isinstance(fixed, frozenset) and o.name in fixed)]
-            out_of_frame = not self._rays.cover(start.scene, name)
+            left = [o for o in scene.objects if o.name == name or o.name in fixed]
+            out_of_frame = not self._rays.cover(scene, name)
             if out_of_frame or self._rays.visible_shares(left)[name] < self._hidden_below:
                 found.append(name)
         return tuple(found)

@@ -1,0 +1,62 @@
+"""The loop without an arm: a detector sees rendered images, what the agent picks appears at its place, and Drake settles it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from drake_clutter.arm.arm_executor import nearest
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import MoveResult, Outcome
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase
+from drake_clutter.systems.scene_perception import Perceive
+from drake_clutter.systems.tracking import tracked
+from drake_clutter.tasks.exploration import ExplorationTask, Step
+
+
+def explore_images(
+    scene: Scene,
+    choose: Choose,
+    perceive: Perceive,
+    *,
+    max_moves: int,
+    seed: int,
+    world: ClutterConfig,
+    report: Callable[[Step], None] = lambda _: None,
+) -> ExplorationTask:
+    """Plays an episode on a scene at rest; the task is the book of a referee who knows the truth.
+
+    Arguments: as of `ClosedLoop`.
+    """
+    executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.camera)
+    task = ExplorationTask(scene, executor, LabelDetector(world.camera), world.exploration, max_moves)
+    agent, state = ExplorationAgent(choose=choose, track=tracked, max_moves=max_moves, seed=seed), AgentState()
+    while task.end is None:
+        images = camera.render(task.scene)
+        state = agent.decided(state, perceive(images.depth, images.color, ()))
+        if state.phase is Phase.DONE or state.request is None:
+            break
+        request, rng = state.request, item_rng(seed, state.request.number, 1)
+        move, decision = request.truly(task.scene.objects)
+        X_TO = choose_placement(request.observation, request.move, world.exploration, rng)
+        if X_TO is None:
+            state = state.refused
+            report(task.note(move, Outcome(MoveResult.NO_FREE_SPOT, task.scene), decision))
+            continue
+        believed = next(o for o in request.known if o.name == request.move.pick).X_TO
+        outcome = executor.put(task.scene, move.pick, carried(believed, X_TO, nearest(task.scene.objects, believed).X_TO), rng)
+        state = state.placed(X_TO)
+        report(task.note(move, replace(outcome, released=X_TO), decision))
+    return task
+
+
+def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
+    """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
+    R = X_TA_new.rotation @ X_TA.rotation.T
+    return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))

@@ -1,0 +1,235 @@
+"""The closed loop on frozen sets: perfect or learned perception, moves teleported and settled, or carried out by the arm.
+
+    python training/closed_loop_results.py runs/closed_loop --workers 2
+    python training/closed_loop_results.py runs/closed_loop --only arm --count 20 --out runs/part.json
+
+Every episode is a file; a run that was stopped goes on with what is missing. An episode that ends in an exception is counted as
+one. `arm_can` says of a scene that nothing hidden stays behind objects that no cup holds, or that carry such: more than that no
+arm finds.
+"""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.generation import mean_interval, wilson_interval
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.learning.checkpoint import git_commit
+from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.scenes.seams import CannotJudge, MoveResult
+from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
+from drake_clutter.systems.teleported_loop import explore_images
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
+
+HERE = Path(__file__).parent
+OUT = HERE / "results" / "closed_loop.json"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Episodes of one kind; `perception` and `agent` as of `Scenario`; labels with settle are in the explorers' own table."""
+
+    perception: str
+    motion: str
+    scenes: str
+    agent: str
+    count: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.scenes}_{Path(self.agent).stem}_{Path(self.perception).stem}_{self.motion}"
+
+
+ROWS = [
+    Row(perception, motion, scenes, agent, count)
+    for scenes, agent, count in (("sg_star_25", "student", 100), ("sg_14", "student-14", 50))
+    for perception, motion in (("depth", "settle"), ("labels", "arm"), ("depth", "arm"))
+]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One episode: a scene of a row's set, and where its result goes."""
+
+    row: Row
+    number: int
+    path: Path
+
+
+class Player:
+    """Plays episodes, one file each; a worker for the runner."""
+
+    def __init__(self) -> None:
+        self._catalogue = load_catalogue()
+        self._set = cache(lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue))
+        self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
+        self._judge = FastJudge(Scenario().world)
+        self._search = FullKnowledgeSearch(Scenario().world, self._judge)
+
+    def __call__(self, asked: Asked) -> None:
+        """Plays one."""
+        row, number = asked.row, asked.number
+        held: SceneSet = self._set(row.scenes)
+        scenario = Scenario(agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number)
+        scene = held.settled(number, held.grammar, scenario.world.layout)
+        begun = time.perf_counter()
+        told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
+        told["arm_can"] = not self._never_found_by_arm(scene, scenario)
+        try:
+            task, robot, end = self._played(scene, scenario, row.motion)
+        except Exception as error:  # whatever it is, it is a result
+            told |= {"ended": "exception", "exception": repr(error)}
+        else:
+            told |= told_of(task) | {"robot": robot, "ended": task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value}
+        write_json(asked.path, told | {"wall": time.perf_counter() - begun})
+
+    def _played(self, scene: Scene, scenario: Scenario, motion: str) -> tuple[ExplorationTask, float, str]:
+        perceive, choose = perception_of(scenario, scene.tray_side), self._policy(scenario.agent)
+        options: dict[str, Any] = {"max_moves": scenario.max_moves, "seed": scenario.seed, "world": scenario.world}
+        if motion == "arm":
+            loop = ClosedLoop(scene, choose, perceive=perceive, arm=scenario.arm, **options)
+            timing = loop.run()
+            return loop.task, timing.robot, timing.end
+        assert perceive is not None, "labels with settle are not in the rows"
+        return explore_images(scene, choose, perceive, **options), 0.0, ""
+
+    def _never_found_by_arm(self, scene: Scene, scenario: Scenario) -> tuple[str, ...]:
+        """What stays hidden behind what no cup holds, and what carries that."""
+        planner = PickPlacePlanner(scenario.arm, PlannerConfig(), scene.tray_side, scenario.world.camera.altitude)
+        fixed = {o.name for o in scene.objects if not planner.holds(o)}
+        supports = self._judge.supports(scene)
+        if not isinstance(supports, CannotJudge):
+            while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
+                fixed |= below
+        in_view = self._judge.rays.observe(scene)[0].detections
+        return self._search.never_found(scene, [d.name for d in in_view], fixed)
+
+
+def told_of(task: ExplorationTask) -> dict[str, Any]:
+    """What is kept of an episode."""
+    results = Counter(step.outcome.result for step in task.steps)
+    reasons = Counter(s.outcome.detail.split(":")[0] for s in task.steps if s.outcome.result is MoveResult.NOT_PLANNED)
+    worst = task.steps[-1].outcome if task.steps and task.end is EpisodeEnd.COLLAPSED else None
+    return {
+        "hidden": len(task.hidden_at_start),
+        "found": len(task.found),
+        "found_after": np.cumsum([len(step.newly_found) for step in task.steps], dtype=int).tolist(),
+        "moves": len(task.steps),
+        "results": {result.value: count for result, count in results.items()},
+        "not_planned": dict(reasons),
+        "collapse": f"{task.steps[-1].move}: {worst.instability}; {worst.detail}" if worst else "",
+    }
+
+
+def stage(episode: dict[str, Any]) -> str:
+    """What an episode that did not find everything failed of."""
+    if episode["ended"] in ("exception", EpisodeEnd.COLLAPSED.value):
+        return str(episode["ended"])
+    if not episode["arm_can"]:
+        return "what is left lies behind what no cup holds"
+    refused = sum(episode["not_planned"].values())
+    if refused > episode["moves"] / 2:
+        return "moves that the arm cannot plan"
+    return str(episode["ended"])
+
+
+def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of a row."""
+    won = [e["ended"] == EpisodeEnd.ALL_FOUND.value for e in episodes]
+    played, able = [e for e in episodes if e["ended"] != "exception"], [k for k, e in enumerate(episodes) if e["arm_can"]]
+    won_able = sum(won[k] for k in able)
+    told = {
+        **asdict(row),
+        "episodes": len(episodes),
+        "success": sum(won) / len(won),
+        "success_ci95": wilson_interval(sum(won), len(won)),
+    }
+    told |= {"arm_can": len(able) / len(episodes), "success_of_arm_can": won_able / len(able) if able else None}
+    told["success_of_arm_can_ci95"] = wilson_interval(won_able, len(able)) if able else None
+    told |= {"hidden": float(np.mean([e["hidden"] for e in played])), "found": float(np.mean([e["found"] for e in played]))}
+    told["found_ci95"] = mean_interval([e["found"] for e in played])
+    told["found_of_hidden"] = sum(e["found"] for e in played) / max(1, sum(e["hidden"] for e in played))
+    moves = [e["moves"] for e, success in zip(episodes, won, strict=True) if success]
+    told["moves_of_successes"] = float(np.mean(moves)) if moves else None
+    told["robot_minutes"] = float(np.median([e["robot"] for e in played])) / 60
+    told["wall_seconds"] = float(np.median([e["wall"] for e in played]))
+    told["not_planned"] = dict(sum((Counter(e["not_planned"]) for e in played), Counter[str]()))
+    told["dropped"] = sum(e["results"].get(MoveResult.DROPPED.value, 0) for e in played)
+    told["failed_of"] = dict(Counter(stage(e) for e, success in zip(episodes, won, strict=True) if not success))
+    return told
+
+
+def table_of(rows: Sequence[dict[str, Any]]) -> Table:
+    """For the screen."""
+    table = Table(
+        "set", "perception", "motion", "episodes", "success", "arm can", "of these", "found", "moves", "robot min", "wall s"
+    )
+    for row in rows:
+        low, high = row["success_ci95"]
+        numbers = [row[key] for key in ("arm_can", "success_of_arm_can", "found_of_hidden", "moves_of_successes")]
+        cells = [
+            row["scenes"],
+            row["perception"],
+            row["motion"],
+            str(row["episodes"]),
+            f"{row['success']:.2f} ({low:.2f} to {high:.2f})",
+        ]
+        cells += ["" if number is None else f"{number:.2f}" for number in numbers]
+        table.add_row(*cells, f"{row['robot_minutes']:.1f}", f"{row['wall_seconds']:.0f}")
+    return table
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")],
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    count: Annotated[int | None, typer.Option(min=1, help="Of each row's scenes, at most.")] = None,
+    only: Annotated[str | None, typer.Option(help="Of rows whose name contains this.")] = None,
+    perception: Annotated[
+        str | None, typer.Option(metavar="FILE", help="A detector's checkpoint, in place of the shipped.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
+) -> None:
+    """Plays what is missing and prints the table."""
+    if out == OUT and (only or count or perception):
+        raise InputError(f"--out {out}: is the whole table's; give another file for a part of it")
+    rows = [row for row in ROWS if only is None or only in row.name]
+    if not rows:
+        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(row.name for row in ROWS)}")
+    told = list[dict[str, Any]]()
+    for row in rows:
+        if perception is not None and row.perception != "labels":
+            row = replace(row, perception=perception)
+        asked = [Asked(row, k, folder / row.name / f"{k:04d}.json") for k in range(min(row.count, count or row.count))]
+        missing = [one for one in asked if not one.path.exists()]
+        (folder / row.name).mkdir(parents=True, exist_ok=True)
+        made = map_ordered(Player, missing, workers=workers)
+        for _ in track(made, row.name, len(asked), len(asked) - len(missing), console=Console(stderr=True)):
+            pass
+        told.append(row_of(row, [json.loads(one.path.read_text()) for one in asked]))
+        write_json(out, {"commit": git_commit(), "rows": told})
+    Console(width=180).print(table_of(told))
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
