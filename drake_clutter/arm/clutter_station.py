@@ -5,6 +5,7 @@ monitor.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 
@@ -249,11 +250,13 @@ class Freedom:
     """
 
     AT_REST = 0.002
-    """m/s."""
+    """m/s; of an object that was free for some looks, on their average: contact may make it tremble without getting anywhere."""
+    LOOKS = 4
 
     def __init__(self, station: ClutterStation, vacuum: Vacuum) -> None:
         self._station, self._vacuum = station, vacuum
         self.free = set[str]()
+        self._before = deque[tuple[float, dict[str, Floats]]](maxlen=self.LOOKS)
 
     def begin(self, root: Context) -> None:
         """Locks all."""
@@ -267,8 +270,7 @@ class Freedom:
             wanted: names.
             must_hold: whether the cup is holding something, if all went well; if it does not, what falls may hit anything.
         """
-        speeds = self._station.scene.speeds(self._station.plant_context(root), self.free)
-        moving = {name for name in self.free if speeds[name] > self.AT_REST}
+        moving = {name for name, speed in self._speeds(root).items() if speed > self.AT_REST}
         lost = not math.isnan(self._vacuum.dropped) or (must_hold and not self._vacuum.sealed)
         held = {self._vacuum.held} - {""}
         # What is run into is freed as well: a locked object that is hit would stand like a rock.
@@ -277,3 +279,13 @@ class Freedom:
         if free != self.free:
             self._station.lock_all_but(root, free)
             self.free = free
+
+    def _speeds(self, root: Context) -> dict[str, float]:
+        """Of what is free, m/s."""
+        scene, context, time = self._station.scene, self._station.plant_context(root), root.get_time()
+        speeds, places = scene.speeds(context, self.free), {n: X_TO.p for n, X_TO in scene.poses(context, self.free).items()}
+        if len(self._before) == self.LOOKS:
+            then, earlier = self._before[0]
+            speeds |= {n: float(np.linalg.norm(p - earlier[n])) / (time - then) for n, p in places.items() if n in earlier}
+        self._before.append((time, places))
+        return speeds

@@ -141,7 +141,8 @@ def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
             {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 0.8}}
         ],
         "textures": [{"sampler": 0, "source": 0}],
-        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        # Linear, without mipmaps: with them, Mesa's software renderer never returns from a face that is seen exactly edge-on.
+        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
         "images": [{"uri": _data_uri("image/png", texture_png)}],
         "accessors": accessors,
         "bufferViews": views,

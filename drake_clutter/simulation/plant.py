@@ -65,9 +65,9 @@ class ScenePlant:
         for scene_object in objects:
             self.plant.SetFreeBodyPose(context, self.bodies[scene_object.name], rigid_transform(scene_object.X_TO))
 
-    def poses(self, context: Context) -> dict[str, Pose]:
-        """X_TO by name, from the plant's context."""
-        return {name: pose_of(body.EvalPoseInWorld(context)) for name, body in self.bodies.items()}
+    def poses(self, context: Context, names: Iterable[str] | None = None) -> dict[str, Pose]:
+        """X_TO of all objects, or of those that are named, by name; from the plant's context."""
+        return {n: pose_of(self.bodies[n].EvalPoseInWorld(context)) for n in (self.bodies if names is None else names)}
 
     def speeds(self, context: Context, names: Iterable[str]) -> dict[str, float]:
         """Speed of the origin of each object that is named, m/s."""
