@@ -1,0 +1,89 @@
+"""The loop without an arm, with a detector whose every answer is given."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import resting, scene_of, training_script
+
+from drake_clutter.agents.exploration import LargestClear
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.seams import MoveResult, Observation
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.systems.teleported_loop import carried, explore_images
+from drake_clutter.tasks.exploration import Decision, EpisodeEnd
+
+COVERED = scene_of(resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028))
+
+
+def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
+    """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
+    observation = LabelDetector(config.camera).look(scene).observation
+    shifted = [replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0))) for k, d in enumerate(observation.detections)]
+    return replace(observation, detections=tuple(shifted))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.004])
+def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: float) -> None:
+    """And it lands as far off as it was seen."""
+    sees, agent, names = seen_but_shifted(COVERED, config, shift), LargestClear(), list[str]()
+
+    def choose(known: Sequence[Any], observation: Observation, *others: Any) -> Decision:
+        names.extend(o.name for o in known)
+        return agent.choose(observation, *others)
+
+    task = explore_images(COVERED, choose, lambda *_: sees, max_moves=3, seed=0, world=config)
+    (step,) = task.steps
+    assert names == ["cracker_box_1"], "a name of its own"
+    assert (step.move.pick, task.end) == ("cracker_box", EpisodeEnd.ALL_FOUND)
+    assert step.outcome.released is not None
+    off = task.scene["cracker_box"].X_TO.p - step.outcome.released.p
+    assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
+
+
+def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
+    sees = seen_but_shifted(COVERED, config, 0.0)
+    task = explore_images(COVERED, lambda *_: Decision(None), lambda *_: sees, max_moves=3, seed=0, world=config)
+    assert (task.steps, task.end) == ([], None)
+
+
+def test_carried() -> None:
+    quarter = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    believed, real = Pose((0.1, 0.0, 0.05)), Pose((0.11, 0.0, 0.05))
+    put = carried(believed, Pose((0.0, 0.2, 0.05), quarter), real)
+    assert put.p == pytest.approx([0.0, 0.21, 0.05]), "the error turns with it"
+    assert put.quaternion == pytest.approx(quarter)
+
+
+def test_rows_of_the_results() -> None:
+    script = training_script("closed_loop_results")
+    episode = {"hidden": 2, "found": 2, "moves": 4, "robot": 60.0, "wall": 9.0, "not_planned": {}, "results": {}, "arm_can": True}
+    episodes = [
+        episode | {"ended": "all found"},
+        episode | {"ended": "all found", "arm_can": False},
+        episode | {"ended": "collapsed", "found": 1, "results": {MoveResult.DROPPED.value: 1}},
+        episode | {"ended": "out of moves", "found": 0, "not_planned": {"no seal": 3}},
+        episode | {"ended": "nothing feasible", "found": 0, "arm_can": False},
+        {"ended": "exception", "wall": 1.0, "arm_can": True},
+    ]
+    row = script.row_of(script.ROWS[0], episodes)
+    assert (row["success"], row["arm_can"], row["success_of_arm_can"]) == (2 / 6, 4 / 6, 1 / 4)
+    assert (row["found_of_hidden"], row["moves_of_successes"], row["robot_minutes"]) == (0.5, 4, 1)
+    assert (row["dropped"], row["not_planned"]) == (1, {"no seal": 3})
+    held, refused = "what is left lies behind what no cup holds", "moves that the arm cannot plan"
+    assert row["failed_of"] == {"collapsed": 1, refused: 1, held: 1, "exception": 1}
+    assert json.dumps(row)
+
+
+def test_what_the_arm_can() -> None:
+    """A marker that lies on a box keeps what is below it hidden for ever: no cup holds it."""
+    player = training_script("closed_loop_results").Player()
+    on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
+    assert player._never_found_by_arm(COVERED, Scenario()) == ()
+    above = replace(on_top, X_TO=on_top.X_TO.moved((0.0, 0.0, COVERED["cracker_box"].top - on_top.bounds_T[0][2])))
+    assert player._never_found_by_arm(replace(COVERED, objects=(*COVERED.objects, above)), Scenario()) == ("gelatin_box",)
