@@ -1,11 +1,12 @@
 # make demo   SG* makes a scene, the arm searches it; the results are in out/demo
 # make test   every check: lint, format, types, tests
-# Both make their own environment in .venv first.
+# make docs   the API's pages, from the docstrings, in out/api, and the picture of the closed loop's diagram
+# Each makes its own environment in .venv first.
 
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test
+.PHONY: demo docs test
 
 demo: .venv/installed
 	rm -rf out/demo
@@ -16,6 +17,10 @@ test: .venv/installed
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 --dist loadfile
+
+docs: .venv/installed
+	.venv/bin/pdoc -d google drake_clutter -o out/api
+	.venv/bin/python -m drake_clutter.reports.diagram_picture docs/images/closed_loop.svg
 
 .venv/locked: requirements.lock
 	$(PYTHON) -m venv --clear .venv

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from conftest import resting, rng, scene_of
 from PIL import Image
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, TILE, write_contact_sheet
+from drake_clutter.reports.diagram_picture import connections, draw_diagram
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
@@ -195,6 +198,20 @@ def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> N
 def test_a_contact_sheet_holds_at_least_one_and_not_too_many(tmp_path: Path, count: int) -> None:
     with pytest.raises(ValueError, match="allowed are 1 to 48"):
         write_contact_sheet(tmp_path / "sheet.png", [(np.zeros((4, 4, 3), np.uint8), "", True)] * count)
+
+
+def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> None:
+    builder = DiagramBuilder()
+    there, back = builder.AddNamedSystem("there", PassThrough(1)), builder.AddNamedSystem("back", ZeroOrderHold(0.1, 1))
+    builder.Connect(there.get_output_port(), back.get_input_port())
+    builder.Connect(back.get_output_port(), there.get_input_port())
+    diagram = builder.Build()
+    ports = {"ports": ["y → u"]}
+    assert list(connections(diagram).edges(data=True)) == [("there", "back", ports), ("back", "there", ports)]
+    draw_diagram(diagram, tmp_path / "loop.svg")
+    assert {"there", "back", "PassThrough", "ZeroOrderHold", "y → u"} <= set(
+        re.findall(r">([^<]+)</text>", (tmp_path / "loop.svg").read_text())
+    )
 
 
 def test_humanised() -> None:

@@ -1,0 +1,81 @@
+"""A picture of a Diagram: its systems along their longest loop, and what runs between them.
+
+python -m drake_clutter.reports.diagram_picture docs/images/closed_loop.svg
+"""
+
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import networkx as nx
+import numpy as np
+from matplotlib.patches import Rectangle
+from pydrake.systems.framework import Diagram
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.tasks.exploration import Decision
+
+_WIDTH, _HEIGHT = 4.3, 1.0
+"""Of a system's box, in the units of the picture."""
+_AWAY = 0.13
+"""By which the arrow of one direction keeps away from that of the other."""
+
+
+def connections(diagram: Diagram) -> nx.DiGraph:
+    """Systems by name; on an edge `ports`, what runs along it: the output ports' names, and the inputs' if they have others."""
+    found = defaultdict[tuple[str, str], list[str]](list)
+    for (reader, to), (writer, of) in diagram.connection_map().items():
+        output, input_ = writer.get_output_port(of).get_name(), reader.get_input_port(to).get_name()
+        found[writer.get_name(), reader.get_name()].append(output if output == input_ else f"{output} → {input_}")
+    graph = nx.DiGraph()
+    graph.add_nodes_from(system.get_name() for system in diagram.GetSystems())
+    graph.add_edges_from((a, b, {"ports": sorted(ports)}) for (a, b), ports in found.items())
+    return graph
+
+
+def draw_diagram(diagram: Diagram, path: Path) -> None:
+    """Draws a diagram to a file of a kind that Matplotlib knows."""
+    graph = connections(diagram)
+    loop = max(nx.simple_cycles(graph), key=len)
+    order = [*loop, *(name for name in graph if name not in loop)]
+    angles = np.pi / 2 - 2 * np.pi * np.arange(len(order)) / len(order)
+    at = {name: np.array([6.2 * np.cos(a), 3.6 * np.sin(a)]) for name, a in zip(order, angles, strict=True)}
+    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "drake_clutter", "font.size": 15})
+    figure, axes = plt.subplots(figsize=(15, 9), layout="constrained")
+    kinds = {system.get_name(): type(system).__name__ for system in diagram.GetSystems()}
+    for name, (x, y) in at.items():
+        corner = (x - _WIDTH / 2, y - _HEIGHT / 2)
+        axes.add_patch(Rectangle(corner, _WIDTH, _HEIGHT, facecolor="#e8eef7", edgecolor="#30507a", linewidth=2, zorder=2))
+        axes.text(x, y + 0.17, kinds[name], ha="center", va="center", weight="bold", zorder=3)
+        axes.text(x, y - 0.22, name, ha="center", va="center", size=12, color="#444444", zorder=3)
+    for a, b, ports in graph.edges(data="ports"):
+        way = at[b] - at[a]
+        aside = _AWAY * np.array([way[1], -way[0]]) / np.linalg.norm(way) if graph.has_edge(b, a) else np.zeros(2)
+        start, end = _at_box(at[a], way) + aside, _at_box(at[b], -way) + aside
+        arrow = {"arrowstyle": "-|>", "linewidth": 2, "color": "#30507a", "mutation_scale": 20, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", end, start, arrowprops=arrow, zorder=1)
+        middle = (start + end) / 2 + 2.2 * aside
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
+        axes.text(middle[0], middle[1], "\n".join(ports), ha="center", va="center", size=11, bbox=box, zorder=2)
+    axes.set(xlim=(-9, 9), ylim=(-4.8, 4.8), aspect="equal")
+    axes.axis("off")
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+    plt.close(figure)
+
+
+def _at_box(middle: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Where a line from the middle of a box leaves it."""
+    with np.errstate(divide="ignore"):
+        scale = np.min(np.array([_WIDTH, _HEIGHT]) / 2 / np.abs(way))
+    return np.asarray(middle + scale * way)
+
+
+if __name__ == "__main__":
+    empty = ClosedLoop(Scene((), 0.7), lambda *_: Decision(None), max_moves=1, seed=0, world=ClutterConfig())
+    draw_diagram(empty.diagram, Path(sys.argv[1]))
