@@ -16,7 +16,6 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
-from calibrate import commit
 from rich.console import Console
 from rich.progress import track
 
@@ -30,6 +29,7 @@ from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
@@ -193,7 +193,7 @@ def moves(
     good = sum(t.result == "carried out" for t in fair)
     fields = {
         "command": f"benchmarks/arm.py moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}",
-        "commit": commit(),
+        "commit": git_commit(),
         "arm": asdict(ArmConfig()),
         "planner": asdict(PlannerConfig()),
         "results": Counter(t.result for t in trials),
@@ -271,7 +271,7 @@ def parts(
         timed_as("simulation, run", simulation.run)
     fields = {
         "command": f"benchmarks/arm.py parts --count {count} --seed {seed}",
-        "commit": commit(),
+        "commit": git_commit(),
         "seconds": {name: quantiles(values) for name, values in spent.items()},
     }
     write_json(out, fields)
@@ -312,7 +312,7 @@ def holds(
                     "wall_s": quantiles(walls),
                 }
             )
-    fields = {"command": f"benchmarks/arm.py holds --count {count} --seed {seed}", "commit": commit(), "rows": rows}
+    fields = {"command": f"benchmarks/arm.py holds --count {count} --seed {seed}", "commit": git_commit(), "rows": rows}
     write_json(out, fields)
     console.print_json(data=fields)
 

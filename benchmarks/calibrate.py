@@ -4,7 +4,6 @@ python benchmarks/calibrate.py --count 1000 --workers 2 --out benchmarks/results
 """
 
 import json
-import subprocess
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,16 +16,12 @@ from rich.table import Table
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, summarise
 from drake_clutter.config import config_yaml, load_config
 from drake_clutter.files import InputError, write_json
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 
 PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
 """Stability rate and mean hidden objects of RG by nodes (Table I)."""
 THRESHOLDS = (0.10, 0.20, 0.25, 0.30, 0.35, 0.40)
-
-
-def commit() -> str:
-    """The commit that is checked out, marked if files differ from it."""
-    return subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True).stdout.strip()
 
 
 class _Size:
@@ -71,7 +66,7 @@ def main(
         shares = [m.verdict.visible_share.values() for m in made if m.verdict.stable]
         row["hidden_by_threshold"] = {str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS}
         failures = sum((m.layout_failures for m in made), start=type(made[0].layout_failures)())
-        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start, "commit": commit()}
+        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start, "commit": git_commit()}
         rows.append(row)
         if out is not None:
             write_json(out, head | {"rows": rows})

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import typer
-from calibrate import commit
 from rich.console import Console
 from rich.progress import track
 
@@ -22,6 +21,7 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, config_yaml
 from drake_clutter.files import InputError, write_text
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene
@@ -131,7 +131,7 @@ def _records(
     """The head with the commit at which it was begun, then a record per item; what the file lacks is made and added."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
-        write_text(path, json.dumps(head | {"commit": commit()}) + "\n")
+        write_text(path, json.dumps(head | {"commit": git_commit()}) + "\n")
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     if {key: lines[0].get(key) for key in head} != head:
         raise InputError(f"{path}: holds the results of another config; give another folder")

@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from calibrate import commit
 from drake_verdicts import (
     BATCHES,
     MOVES,
@@ -38,6 +37,7 @@ from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.resources import git_commit
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Move, MoveResult
@@ -264,7 +264,7 @@ def main(
     by_index = {record["index"]: record for record in sides[first][1:]}
     of_moves = {"drake_commit": moves[0]["commit"]} | compare_moves(first, moves[1:], by_index)
     result = {
-        "commit": commit(),
+        "commit": git_commit(),
         "config": sides[first][0]["config"],
         "scene_agreement": {f"{r['objects']}, {r['nodes']} nodes": r["agreement"] for r in agreement},
         "false_stable_rate": {f"{r['objects']}, {r['nodes']} nodes": r["false_stable_rate"] for r in agreement},

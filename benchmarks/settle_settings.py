@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from calibrate import commit
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -19,6 +18,7 @@ from drake_clutter.catalogue import Rest, Shape, load_catalogue
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
@@ -99,7 +99,14 @@ def main(
         table.add_row(f"on a {kind} of lying markers", "", f"{sum(fates)} of {len(fates)}")
     Console().print(table)
     if out is not None:
-        result = {"count": count, "nodes": nodes, "seed": seed, "commit": commit(), "settings": rows, "on_lying_markers": lying}
+        result = {
+            "count": count,
+            "nodes": nodes,
+            "seed": seed,
+            "commit": git_commit(),
+            "settings": rows,
+            "on_lying_markers": lying,
+        }
         write_json(out, result)
 
 

@@ -24,7 +24,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pybullet
 import typer
-from calibrate import commit
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -36,6 +35,7 @@ from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import write_json
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import Pose, Scene, jittered, tilt_between
 from drake_clutter.scenes.seams import CannotJudge
@@ -370,7 +370,14 @@ def main(
         path.parent.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     packages = {name: version(name) for name in ("drake", "pybullet", "numba", "numpy")}
-    result: Row = {"config": config_yaml(CONFIG), "seed": seed, "count": count, "nodes": NODES, "commit": commit(), "cpu": cpu()}
+    result: Row = {
+        "config": config_yaml(CONFIG),
+        "seed": seed,
+        "count": count,
+        "nodes": NODES,
+        "commit": git_commit(),
+        "cpu": cpu(),
+    }
     result |= {"versions": {"python": platform.python_version()} | packages, "notes": NOTES}
 
     fast, drake = FastJudge(CONFIG), DrakeJudge(CONFIG)

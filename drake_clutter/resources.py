@@ -1,5 +1,6 @@
-"""Finds the files that ship with drake_clutter, whether it is installed from a wheel or editable."""
+"""Finds the files that ship with drake_clutter, whether it is installed from a wheel or editable, and its commit."""
 
+import subprocess
 from pathlib import Path
 
 _PACKAGE_DIR = Path(__file__).resolve().parent
@@ -19,3 +20,14 @@ def shipped_path(relative: str) -> Path:
     if not path.exists():
         raise FileNotFoundError(f"{relative} is not shipped with drake_clutter (looked in {root})")
     return path
+
+
+def git_commit() -> str:
+    """The commit that is checked out around this package, marked if files differ from it; "unknown" outside of a checkout."""
+    try:
+        told = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True, cwd=_PACKAGE_DIR, timeout=10
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return told.stdout.strip()

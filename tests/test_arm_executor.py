@@ -10,7 +10,7 @@ import pytest
 from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
-from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried
+from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
 from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
 from drake_clutter.arm.plan import Plan
@@ -80,6 +80,16 @@ def test_without_a_seal_nothing_is_lifted(plan: Plan) -> None:
     carried = run(plan, ArmConfig(suction=SuctionConfig(unevenness=-1.0)))
     assert not carried.sealed
     assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
+
+
+@pytest.mark.parametrize(("xy", "result"), [((0.2, -0.2), MoveResult.PLACED), ((0.2, 0.0), MoveResult.DROPPED)])
+def test_what_comes_off_where_it_is_put_down_is_placed(
+    xy: tuple[float, float], result: MoveResult, config: ClutterConfig
+) -> None:
+    """The shock of touching down may break the seal, a moment before the vacuum is switched off."""
+    after = SCENE.at({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
+    outcome = judged(SCENE, after, "sugar_box", PLACE, True, config.settle)
+    assert (outcome.result, outcome.instability) == (result, None)
 
 
 def test_the_schedule(plan: Plan) -> None:

@@ -145,13 +145,15 @@ def test_the_planner_answers_each_request_once() -> None:
         asked.append(1)
         return plan if len(asked) == 1 else NO_SEAL
 
-    planner = MovePlanner(plan=answer, seed=0)
+    planner = MovePlanner(plan=answer, seed=0, latency=0.2)
     simulator = Simulator(planner)
     context = simulator.get_mutable_context()
     planner.GetInputPort("request").FixValue(context, None)
     simulator.AdvanceTo(0.2)
     assert asked == []
     planner.GetInputPort("request").FixValue(context, request)
+    simulator.AdvanceTo(0.4)
+    assert asked == []
     simulator.AdvanceTo(0.5)
     assert asked == [1]
     found: Answer = planner.GetOutputPort("answer").Eval(context)

@@ -29,7 +29,7 @@ from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
-from drake_clutter.learning.checkpoint import git_commit
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set

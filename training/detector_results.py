@@ -22,11 +22,12 @@ from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import Catalogue, load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
-from drake_clutter.learning.checkpoint import git_commit, load_checkpoint
+from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import ImageSet, LabelledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.simulation.camera import OverheadCamera

@@ -29,8 +29,7 @@ from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, told_in_one_line, write_json
-from drake_clutter.learning.checkpoint import git_commit
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd

@@ -28,7 +28,7 @@ from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
-from drake_clutter.learning.checkpoint import git_commit
+from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.seams import CannotJudge
 

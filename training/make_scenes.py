@@ -26,7 +26,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.grammar import canonical_form
-from drake_clutter.learning.checkpoint import git_commit
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set

@@ -245,15 +245,18 @@ def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: b
         pick: what was picked; X_TO_place: where it was to be let go; came_off: whether it came off the cup on the way.
         config: the limits.
     """
-    others = [o for o in before.at({pick: X_TO_place}).objects if o.name != pick or not came_off]
+    put = before.at({pick: X_TO_place})
+    # What comes off the cup only as it touches down, and stays there, has been put down.
+    dropped = came_off and worst_fall([put[pick]], after, config) is not None
+    others = [o for o in put.objects if o.name != pick or not dropped]
     instability = worst_fall(others, after, config)
-    if instability is None and not came_off:
+    if instability is None and not dropped:
         moved = {o.name for o in before.objects if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED} | {pick}
         for group in touching_groups(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):
                 after = after.at(settle(group, before.tray_side, config).poses)
         instability = worst_fall(others, after, config)
-    result = MoveResult.DROPPED if came_off else MoveResult.PLACED
+    result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
         result = MoveResult.COLLAPSED
     return Outcome(result, after, instability, released=X_TO_place)

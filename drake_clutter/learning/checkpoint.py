@@ -1,7 +1,6 @@
 """Trained networks in files: the weights as safetensors, and beside them a JSON with what made them."""
 
 import json
-import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,15 +79,3 @@ def optimizer_from(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
             number, _, moment = rest.partition(".")
             moments.setdefault(int(number), {})[moment] = value
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
-
-
-def git_commit() -> str:
-    """The commit that is checked out around this package, marked if files differ from it; "unknown" outside of a checkout."""
-    here = Path(__file__).resolve().parent
-    try:
-        told = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True, cwd=here, timeout=10
-        )
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return told.stdout.strip()

@@ -14,7 +14,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from drake_clutter.config import config_yaml
 from drake_clutter.files import InputError, output_directory, write_json, write_text
-from drake_clutter.learning.checkpoint import git_commit, save_checkpoint
+from drake_clutter.learning.checkpoint import save_checkpoint
+from drake_clutter.resources import git_commit
 
 CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
 

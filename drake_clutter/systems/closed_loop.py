@@ -30,6 +30,8 @@ from drake_clutter.systems.scene_perception import LabelPerception, Perceive, Sc
 from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
 
+LATENCY = 1.15
+"""s, from an image to the plan: 0.15 for perception, 1 for planning."""
 PATIENCE = 1.0
 """s, after a plan's end, for which what has fallen is followed."""
 
@@ -110,7 +112,7 @@ class ClosedLoop:
             builder, choose=choose, track=tracked if self._tracks else None, max_moves=max_moves, seed=seed
         )
         self._ways = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, camera.altitude)
-        self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed)
+        self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed, latency=LATENCY)
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=self._arm)
         for source, target, ports in (
             (self.station, sensor, {"query": "geometry_query"}),
@@ -205,6 +207,7 @@ class ClosedLoop:
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
         outcome = judged(before, after, picked, plan.X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - plan.X_TO_place.p)[:2]))
-        detail = "came off the cup" if came_off else f"{1000 * error:.1f} mm from where it was to be"
+        detail = "came off the cup" if came_off else "put down"
+        detail += f", {1000 * error:.1f} mm from where it was to be"
         # The simulation goes on from where things are in it.
         return self.task.note(move, replace(outcome, scene=after, motion=motion, detail=detail), decision)

@@ -42,29 +42,41 @@ class MovePlanner(LeafSystem):
     Output ports: answer, abstract, the latest `Answer`; plan, abstract, the latest `Plan` or None.
     """
 
-    def __init__(self, *, plan: Planner, seed: int) -> None:
-        """With what plans; `seed` of its chances."""
+    def __init__(self, *, plan: Planner, seed: int, latency: float) -> None:
+        """With what plans.
+
+        Args:
+            plan: the function.
+            seed: of its chances.
+            latency: s, from a request to its answer, whatever the computer really takes.
+        """
         super().__init__()
-        self._plan, self._seed = plan, seed
+        self._plan, self._seed, self._latency = plan, seed, latency
         self._request = self.DeclareAbstractInputPort("request", AbstractValue.Make(None))
         self._answer = self.DeclareAbstractState(AbstractValue.Make(Answer()))
         self._latest = self.DeclareAbstractState(AbstractValue.Make(None))
+        self._asked = self.DeclareDiscreteState([0.0, 0.0])  # number of the request, and when it came, s
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, PERIOD / 2, self._update)
         of = {self.all_state_ticket()}
         self.DeclareAbstractOutputPort("answer", lambda: AbstractValue.Make(Answer()), self._calc_answer, of)
         self.DeclareAbstractOutputPort("plan", lambda: AbstractValue.Make(None), self._calc_plan, of)
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, *, plan: Planner, seed: int) -> "MovePlanner":
+    def AddToBuilder(builder: DiagramBuilder, *, plan: Planner, seed: int, latency: float) -> "MovePlanner":
         """Adds one."""
-        system: MovePlanner = builder.AddSystem(MovePlanner(plan=plan, seed=seed))
+        system: MovePlanner = builder.AddSystem(MovePlanner(plan=plan, seed=seed, latency=latency))
         system.set_name("move_planner")
         return system
 
     def _update(self, context: Context, state: State) -> EventStatus:
         answer: Answer = context.get_abstract_state(self._answer).get_value()
-        request = self._request.Eval(context)
-        if request is not None and request.number != answer.number:
+        request, (number, since) = self._request.Eval(context), context.get_discrete_state(self._asked).value()
+        if request is None or request.number == answer.number:
+            return EventStatus.DidNothing()
+        if request.number != number:
+            since = context.get_time()
+            state.get_mutable_discrete_state(self._asked).set_value([request.number, since])
+        if context.get_time() >= since + self._latency - 1e-9:
             found = self._plan(request, item_rng(self._seed, request.number))
             if isinstance(found, Plan):
                 state.get_mutable_abstract_state(int(self._latest)).set_value(found)
