@@ -1,5 +1,6 @@
 """`drake-clutter evaluate`: explorers on scenes at rest that hide something."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -11,6 +12,7 @@ from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
@@ -49,7 +51,7 @@ def evaluate(
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
     ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Plays every agent on every scene and writes the rows, every episode, and what is needed to repeat them, as JSON."""
+    """Plays every agent on every scene and writes the rows, every episode, and commit and hashes of the scenes, as JSON."""
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; give a file in one that exists")
     for agent in agents:
@@ -59,6 +61,8 @@ def evaluate(
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = list(progress(played, len(episodes)))
     rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]
+    files = sorted({path for path, _ in scenes})
     fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
+    fields |= {"commit": git_commit(), "scenes": {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows
