@@ -1,5 +1,6 @@
 """The commands as a user calls them, on small scenes."""
 
+import hashlib
 import json
 import os
 import signal
@@ -125,7 +126,10 @@ def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--out", alone)
     run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--workers", "2", "--out", together)
     assert alone.read_bytes() == together.read_bytes()
-    random, largest_first = json.loads(alone.read_text())["rows"]
+    written = json.loads(alone.read_text())
+    files = [tmp_path / "scenes/one.yaml", tmp_path / "scenes/two.yaml"]
+    assert written["scenes"] == {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    random, largest_first = written["rows"]
     assert random["agent"] == "random"
     assert largest_first["success_rate"] == 1.0
     assert largest_first["moves_mean"] == 1.0
