@@ -13,6 +13,7 @@ from drake_clutter.perception.image_set import LabelledImage
 from drake_clutter.perception.segmentation import (
     SegmentationNetwork,
     Window,
+    class_weights,
     coarse,
     gathered,
     loss,
@@ -63,8 +64,27 @@ def test_points_are_what_the_camera_projects() -> None:
     image.depth[WINDOW.rows.start, WINDOW.columns.start] = 0.0
     assert np.isnan(points(image.depth, CAMERA, WINDOW)[0, 0]).all()
     given = network_input(points(image.depth, CAMERA, WINDOW), None)
-    assert given.shape == (2, WINDOW.side, WINDOW.side)
-    assert given[:, 0, 0] == pytest.approx([0.0, 0.0])
+    assert given.shape == (4, WINDOW.side, WINDOW.side)
+    assert given[:2, 0, 0] == pytest.approx([0.0, 0.0])
+
+
+def test_slopes_are_given_and_holes_are_as_high_as_what_is_beside_them() -> None:
+    x, y = np.meshgrid(np.arange(40) * 0.0025, np.arange(40) * 0.0025)
+    points_T = np.stack([x, y, 0.5 * x], axis=-1)
+    points_T[10:14, 20:24, 2] = np.nan
+    height, known, along_rows, along_columns = network_input(points_T, None)
+    assert not known[12, 22]
+    assert height[12, 22] == pytest.approx(height[12, 19], rel=0.15)
+    assert along_columns[30, 20] == pytest.approx(np.arctan(0.5), abs=1e-3)
+    assert along_rows[30, 20] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_is_rare_weighs_more_and_the_mean_pixel_one() -> None:
+    kind = np.array([0] * 81 + [1] * 9 + [2] + [-1] * 7)
+    weights = class_weights([kind], 2).numpy()
+    assert weights[1] / weights[0] == pytest.approx(3.0)
+    assert weights[2] / weights[0] == pytest.approx(9.0)
+    assert weights[kind[kind >= 0]].mean() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -107,7 +127,7 @@ def test_segments_are_masks_in_the_image() -> None:
 @pytest.mark.parametrize("looks_at_color", [False, True])
 def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
     network = SegmentationNetwork(CLASSES, looks_at_color).eval()
-    given = torch.randn(2, 5 if looks_at_color else 2, 64, 64)
+    given = torch.randn(2, 7 if looks_at_color else 4, 64, 64)
     logits, votes = network(given)
     assert (logits.shape, votes.shape) == ((2, 3, 32, 32), (2, 3, 32, 32))
     assert torch.allclose(network(given[:1])[0], logits[:1], atol=1e-5), "one by one as in a batch"
@@ -122,7 +142,7 @@ def test_the_loss_leaves_out_what_is_not_known() -> None:
     to_middle = torch.full((1, 3, 2, 2), torch.nan)
     to_middle[0, :, 0, 0] = 0.1
     logits = torch.nn.functional.one_hot(kind, 3).permute(0, 3, 1, 2) * 50.0
-    of_classes, of_votes = loss(logits, torch.zeros(1, 3, 2, 2), kind, to_middle)
+    of_classes, of_votes = loss(logits, torch.zeros(1, 3, 2, 2), kind, to_middle, torch.ones(3))
     assert float(of_classes) == pytest.approx(0.0, abs=1e-6)
     assert float(of_votes) == pytest.approx(0.3)
 

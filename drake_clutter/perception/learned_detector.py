@@ -6,13 +6,20 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import CameraConfig
 from drake_clutter.learning.checkpoint import Checkpoint
 from drake_clutter.perception.pose_fit import PoseFitter
-from drake_clutter.perception.segmentation import SegmentationNetwork, Window, coarse, network_input, points, segments
+from drake_clutter.perception.segmentation import (
+    SegmentationNetwork,
+    Window,
+    coarse,
+    network_input,
+    points,
+    segments,
+    without_holes,
+)
 from drake_clutter.scenes.seams import Detection, Observation
 
 LEAST_SCORE = 0.3
@@ -52,13 +59,4 @@ class LearnedDetector:
             if fitted is not None and fitted.score >= LEAST_SCORE:
                 counted[segment.name] += 1
                 found.append(Detection(f"{segment.name}_{counted[segment.name]}", object_class, fitted.X_TO, segment.mask))
-        return Observation(without_holes(depth), tuple(found), self._camera, self._tray_side)
-
-
-def without_holes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The depth (height, width), where none is measured that of the nearest pixel of which it is."""
-    holes = ~(np.isfinite(depth) & (depth > 0))
-    if not holes.any() or holes.all():
-        return depth
-    nearest = distance_transform_edt(holes, return_distances=False, return_indices=True)
-    return np.asarray(depth[tuple(nearest)])
+        return Observation(without_holes(np.where(depth > 0, depth, np.nan)), tuple(found), self._camera, self._tray_side)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor, nn
 
 from drake_clutter.config import CameraConfig
@@ -30,6 +31,8 @@ _HIGHEST = 0.5
 _WIDTHS = (24, 48, 96, 128)
 _HEIGHT_UNIT, _VOTE_UNIT = 0.25, 0.05
 """m, in which the network is given heights, and answers with votes."""
+_PIXEL = 0.0025
+"""m, about, from pixel to pixel: for slopes."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +78,19 @@ def coarse(array: NDArray[Element]) -> NDArray[Element]:
     return array[::COARSE, ::COARSE]
 
 
+def without_holes(image: NDArray[np.floating]) -> NDArray[np.floating]:
+    """An image (height, width), where it is not finite the value of the nearest pixel that is."""
+    holes = ~np.isfinite(image)
+    if not holes.any() or holes.all():
+        return image
+    nearest = distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return np.asarray(image[tuple(nearest)])
+
+
 def network_input(points_T: NDArray[np.floating], color: NDArray[np.number] | None) -> NDArray[np.float32]:
-    """(channels, side, side) what the network is given: heights, where they are known, and colour if it looks at that.
+    """(channels, side, side) what the network is given: heights, where they are known, slopes, and colour if it looks at that.
+
+    Slopes are given because a few millimetres, which tell a lid from a wall, are nothing beside a stack's height.
 
     Args:
         points_T: see `points`.
@@ -84,7 +98,9 @@ def network_input(points_T: NDArray[np.floating], color: NDArray[np.number] | No
     """
     height = points_T[..., 2]
     known = np.isfinite(height)
-    channels = [np.where(known, np.clip(height, -0.1, 0.9), 0.0) / _HEIGHT_UNIT, known]
+    filled = np.clip(np.nan_to_num(without_holes(height)), -0.1, 0.9)
+    slopes = np.gradient(gaussian_filter(filled, 1.0))
+    channels = [filled / _HEIGHT_UNIT, known, *(np.arctan(slope / _PIXEL) for slope in slopes)]
     if color is not None:
         channels += [color[..., k] / 127.5 - 1.0 for k in range(3)]
     return np.stack(channels).astype(np.float32)
@@ -106,7 +122,7 @@ class SegmentationNetwork(nn.Module):
     def __init__(self, classes: Sequence[str], looks_at_color: bool) -> None:
         super().__init__()
         self.classes, self.looks_at_color = tuple(classes), looks_at_color
-        channels = COARSE**2 * (5 if looks_at_color else 2)
+        channels = COARSE**2 * (7 if looks_at_color else 4)
         self.into = nn.Sequential(nn.PixelUnshuffle(COARSE), _block(channels, _WIDTHS[0]))
         steps = list(pairwise(_WIDTHS))
         self.down = nn.ModuleList(nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in steps)
@@ -140,15 +156,30 @@ class SegmentationNetwork(nn.Module):
         return network.eval()
 
 
-def loss(logits: Tensor, votes: Tensor, kind: Tensor, to_middle: Tensor) -> tuple[Tensor, Tensor]:
+def class_weights(kinds: Sequence[NDArray[np.int64]], classes: int) -> Tensor:
+    """(1 + classes,) of the cross entropy: one over the root of a class's share of the pixels, and one on the mean of pixels.
+
+    With equal weights nothing is learned for long but the tray, nine tenths of an image, and then the largest boxes.
+
+    Args:
+        kinds: of images, see `loss`.
+        classes: how many there are, beside that of no object.
+    """
+    shown = np.concatenate([kind[kind >= 0] for kind in kinds])
+    share = np.maximum(np.bincount(shown, minlength=1 + classes) / max(1, len(shown)), 1e-4)
+    return torch.from_numpy(share**-0.5 / (share**0.5).sum()).float()
+
+
+def loss(logits: Tensor, votes: Tensor, kind: Tensor, to_middle: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Cross entropy of the classes, and the mean error of the votes, m.
 
     Args:
         logits, votes: see `SegmentationNetwork.forward`.
         kind: (B, h, w) 0 where there is no object, -1 where it is not known.
         to_middle: (B, 3, h, w) m, from the pixel's point to the object's middle; NaN where it is not known.
+        weights: (1 + classes,) of the classes.
     """
-    of_classes = nn.functional.cross_entropy(logits, kind, ignore_index=-1)
+    of_classes = nn.functional.cross_entropy(logits, kind, weights, ignore_index=-1)
     known = torch.isfinite(to_middle).all(dim=1) & (kind > 0)
     error = (votes - torch.nan_to_num(to_middle)).abs().sum(dim=1)[known]
     return of_classes, error.mean() if len(error) else votes.sum() * 0

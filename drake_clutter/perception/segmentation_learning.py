@@ -16,11 +16,21 @@ from drake_clutter.config import CameraConfig
 from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import LabelledImage
-from drake_clutter.perception.segmentation import SegmentationNetwork, Window, coarse, loss, network_input, points
+from drake_clutter.perception.segmentation import (
+    SegmentationNetwork,
+    Window,
+    class_weights,
+    coarse,
+    loss,
+    network_input,
+    points,
+)
 from drake_clutter.runner import item_rng
 
 RISING = 0.1
 """Share of the steps in which the learning rate rises."""
+_COUNTED = 200
+"""Images, at most, whose pixels are counted for the weights of the classes."""
 
 
 @dataclass
@@ -38,7 +48,7 @@ class SegmentationConfig:
     batch: int = 8
     learning_rate: float = 3e-3
     weight_decay: float = 1e-4
-    vote_weight: float = 20.0
+    vote_weight: float = 5.0
 
 
 class Example(NamedTuple):
@@ -107,6 +117,8 @@ class SegmentationLearner:
         self.network = network.to(device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+        counted = [example(read(k), network.classes, camera, self._window, None, False).kind for k in range(min(count, _COUNTED))]
+        self._weights = class_weights(counted, len(network.classes)).to(device)
         self._readers = ThreadPoolExecutor(1)
         self._ahead = {0: self._readers.submit(self._batch, 0)}
 
@@ -134,7 +146,7 @@ class SegmentationLearner:
         self.network.train()
         image, kind, to_middle = (torch.from_numpy(array).to(self._device) for array in batch)
         logits, votes = self.network(image.to(memory_format=torch.channels_last))
-        of_classes, of_votes = loss(logits, votes, kind, to_middle)
+        of_classes, of_votes = loss(logits, votes, kind, to_middle, self._weights)
         total: Tensor = of_classes + self._config.vote_weight * of_votes
         for group in self._optimizer.param_groups:
             group["lr"] = self.learning_rate
