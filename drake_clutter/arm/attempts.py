@@ -124,8 +124,9 @@ class Attempts:
         objects: Sequence[SceneObject],
         picked: SceneObject,
         X_TO_place: Pose,
+        tops: Sequence[float] = (),
     ) -> None:
-        """Nothing tried yet; `reach` gives the branches for poses X_TG (..., 4, 4)."""
+        """Nothing tried yet; `reach` gives the branches for poses X_TG (..., 4, 4), `tops` are of what else there is, m."""
         self._arm, self._config, self._reach, self._scene, self._picked = arm, config, reach, scene, picked
         self._X_TO, self._X_TO_place, self._place = matrix(picked.X_TO), matrix(X_TO_place), X_TO_place
         self.count, self.furthest = 0, NoPlan(PlanFailure.UNREACHABLE, "the grasp")
@@ -133,7 +134,7 @@ class Attempts:
         placed = replace(picked, X_TO=X_TO_place)
         others = [o for o in objects if o is not picked]
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
-        tops = sorted({round(o.top, 3) for o in others if o.top > bottom})
+        tops = sorted({round(top, 3) for top in (*tops, *(o.top for o in others)) if top > bottom})
         self._bottoms = [bottom + self._config.rise] + [top + self._config.rise for top in tops if top > bottom]
         self._home = np.array(arm.home)
 

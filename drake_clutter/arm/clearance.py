@@ -5,14 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SignedDistancePair
-from pydrake.math import RigidTransform
+from pydrake.geometry import Box, CollisionFilterDeclaration, GeometrySet, SignedDistancePair
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -43,13 +45,23 @@ class ClearanceScene:
     """
 
     def __init__(
-        self, config: ArmConfig, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
+        self,
+        config: ArmConfig,
+        objects: Sequence[tuple[str, ObjectClass]],
+        tray_side: float,
+        camera_altitude: float,
+        unseen: Sequence[UnseenBlock] = (),
     ) -> None:
-        """Makes a plant of the arm and named objects."""
+        """Makes a plant of the arm, named objects, and space that must be taken for full."""
         builder = DiagramBuilder()
         made = add_scene_plant(builder, objects, tray_side, 0.0, visuals=False)
         self.plant, self._bodies = made.plant, made.bodies
         self._arm: Arm = add_arm(made.plant, made.scene_graph, config, camera_altitude, compliant=False, visuals=False)
+        for k, block in enumerate(unseen):
+            X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.middle)
+            made.plant.RegisterCollisionGeometry(
+                made.plant.world_body(), X_TB, Box(*block.size), f"unseen_{k}", CoulombFriction(1.0, 1.0)
+            )
         made.plant.Finalize()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()

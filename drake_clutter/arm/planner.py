@@ -5,7 +5,7 @@ Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked obje
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +18,8 @@ from drake_clutter.arm.paths import Payload
 from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import EPICK_MASS, greatest_acceleration, unevenness
-from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.scenes.unseen import UnseenBlock
 
 Floats = NDArray[np.float64]
 
@@ -31,32 +31,43 @@ class PickPlacePlanner:
         self.config, self.planner = config, planner
         self.tray_side, self._camera_altitude = tray_side, camera_altitude
         self._X_BT, self._X_GF = inverse(config.X_TB), inverse(config.X_FG)
-        self._scenes: dict[tuple[tuple[str, ObjectClass], ...], ClearanceScene] = {}
+        self._scenes: dict[Hashable, ClearanceScene] = {}
 
-    def clearance_scene(self, objects: Sequence[SceneObject]) -> ClearanceScene:
+    def clearance_scene(self, objects: Sequence[SceneObject], unseen: Sequence[UnseenBlock] = ()) -> ClearanceScene:
         """The objects and the arm; the latest of each set of objects is kept."""
-        key = tuple((o.name, o.object_class) for o in objects)
+        named = tuple((o.name, o.object_class) for o in objects)
+        key = named, tuple(unseen)
         if key not in self._scenes:
             self._scenes.clear()
-            self._scenes[key] = ClearanceScene(self.config, key, self.tray_side, self._camera_altitude)
+            self._scenes[key] = ClearanceScene(self.config, named, self.tray_side, self._camera_altitude, unseen)
         scene = self._scenes[key]
         scene.put(objects)
         return scene
 
-    def plan(self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose) -> Plan | NoPlan:
+    def plan(
+        self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose, unseen: Sequence[UnseenBlock] = ()
+    ) -> Plan | NoPlan:
         """Plans to carry an object to a pose that differs by a shift and a turn about the vertical.
 
         Args:
             objects: all that is known to stand around, the picked one included.
             pick: its name.
             X_TO_place: where it is let go.
+            unseen: space that must be taken for full, where not all is known.
         """
         begun = time.perf_counter()
         picked = next(o for o in objects if o.name == pick)
-        found = self._plan(objects, picked, X_TO_place, begun)
+        found = self._plan(objects, picked, X_TO_place, unseen, begun)
         return replace(found, seconds=time.perf_counter() - begun)
 
-    def _plan(self, objects: Sequence[SceneObject], picked: SceneObject, X_TO_place: Pose, begun: float) -> Plan | NoPlan:
+    def _plan(
+        self,
+        objects: Sequence[SceneObject],
+        picked: SceneObject,
+        X_TO_place: Pose,
+        unseen: Sequence[UnseenBlock],
+        begun: float,
+    ) -> Plan | NoPlan:
         if carried := rests_on(picked, objects):
             return NoPlan(PlanFailure.CARRIES_OTHERS, ", ".join(carried))
         grasps = self._grasps(picked)
@@ -64,11 +75,12 @@ class PickPlacePlanner:
             return grasps
         if self.config.over_tray(self.tray_side):
             return NoPlan(PlanFailure.IN_COLLISION, "pedestal and tray")
-        scene = self.clearance_scene(objects)
+        scene = self.clearance_scene(objects, unseen)
         if hit := scene.close(np.array(self.config.home), self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
             return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
-        attempt = Attempts(self.config, self.planner, self.reach, scene, objects, picked, X_TO_place)
+        tops = [block.top for block in unseen]
+        attempt = Attempts(self.config, self.planner, self.reach, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
             for q_pick, q_place, branch, yaw in attempt.ends(grasp):
                 if attempt.count >= self.planner.attempts:

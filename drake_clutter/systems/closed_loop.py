@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import MakeRenderEngineVtk
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.sensors import RgbdSensor
+from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
 
 from drake_clutter.arm.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
 from drake_clutter.arm.attempts import PlannerConfig
@@ -23,6 +24,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
 from drake_clutter.systems.move_planner import Answer, MovePlanner
@@ -133,6 +135,15 @@ class ClosedLoop:
         self.vacuum = Vacuum(self.station, self._suction)
         self.task = ExplorationTask(scene, _Elsewhere(), LabelDetector(camera), world.exploration, max_moves)
         self._planning = 0.0
+        self._empty = self._empty_cell(sensor)
+
+    def _empty_cell(self, sensor: RgbdSensor) -> NDArray[np.float32]:
+        """(height, width) m, the depth of the cell as it is without objects: they are below the floor, where nobody sees them."""
+        root = self.diagram.CreateDefaultContext()
+        below = [replace(o, X_TO=o.X_TO.moved((0.0, 0.0, -10.0))) for o in self._start.objects]
+        self.station.set_scene(root, np.array(self._arm.home), below)
+        image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root))
+        return np.asarray(image.data[..., 0].copy())
 
     def _suction(self, root: Context) -> bool:
         context = self.executor.GetMyContextFromRoot(root)
@@ -142,7 +153,8 @@ class ClosedLoop:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
         if X_TO is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
-        found = self._ways.plan(request.known, request.move.pick, X_TO)
+        unseen = unseen_blocks(request.known, request.observation, self._empty)
+        found = self._ways.plan(request.known, request.move.pick, X_TO, unseen)
         self._planning += found.seconds
         return found
 

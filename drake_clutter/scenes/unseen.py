@@ -1,0 +1,89 @@
+"""Space that nobody has seen into: for a planner that knows only K_t, whatever may be there is."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+from trimesh.bounds import oriented_bounds_2D
+
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.seams import Observation
+
+_FLAT = 0.012
+"""m; nothing lies hidden under less, and what is no higher above the tray is noise."""
+_NEAR_KNOWN = 0.008
+"""m, from a known object; what is seen there is taken for its surface."""
+_FEWEST = 12
+"""Of the pixels looked at, for something that nobody has told the name of; fewer are noise at edges."""
+_HIGHEST = 0.98
+"""Quantile of the heights of what is seen of something nameless: single pixels beyond are noise."""
+_EVERY = 2
+"""Pixels, each way, of which one is looked at."""
+
+
+@dataclass(frozen=True)
+class UnseenBlock:
+    """An upright block on the tray's floor that may be full.
+
+    Attributes:
+        middle: (3,) m, in T. size: (3,) m. yaw: rad, about T's vertical.
+    """
+
+    middle: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+
+    @property
+    def top(self) -> float:
+        """m above the tray's floor."""
+        return self.size[2]
+
+    @staticmethod
+    def under(points_T: NDArray[np.floating], top: float) -> "UnseenBlock":
+        """From the floor up to `top`, m, on the least rectangle around points (N, 2 or more) m."""
+        to_middle, (length, width) = oriented_bounds_2D(points_T[:, :2])  # type: ignore[no-untyped-call]
+        x, y = np.linalg.inv(to_middle)[:2, 2]
+        yaw = -math.atan2(to_middle[1, 0], to_middle[0, 0])
+        return UnseenBlock((float(x), float(y), top / 2), (float(length), float(width), top), yaw)
+
+
+def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> tuple[UnseenBlock, ...]:
+    """What lies in the shadow of known objects, and under what is seen but belongs to none of them.
+
+    Args:
+        known: K_t, where they are now.
+        observation: the latest.
+        empty: (height, width) m, the depth that the camera shows of the cell with nothing on the tray, the arm at home.
+    """
+    lower = [float(o.bounds_T[0][2]) for o in known]
+    shadows = [UnseenBlock.under(o.corners_T, z) for o, z in zip(known, lower, strict=True) if z > _FLAT]
+    return (*shadows, *_nameless(known, observation, empty))
+
+
+def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> list[UnseenBlock]:
+    camera = observation.camera
+    z, floor = observation.depth[::_EVERY, ::_EVERY], empty[::_EVERY, ::_EVERY]
+    row, column = (_EVERY * index for index in np.indices(z.shape))
+    measured = np.isfinite(z) & (z > 0)
+    z = np.where(measured, z, floor)
+    x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
+    y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length
+    left = measured & (z < floor - _FLAT) & (np.maximum(np.abs(x), np.abs(y)) < observation.tray_side / 2)
+    height = camera.altitude - z
+    for o in known:
+        where = np.nonzero(left)
+        p_TP = np.column_stack([x[where], y[where], height[where]])
+        p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
+        own = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2 + _NEAR_KNOWN).all(axis=1)
+        left[where[0][own], where[1][own]] = False
+    parts, count = label(left)
+    blocks = []
+    for k in range(1, count + 1):
+        mine = parts == k
+        points_T = np.column_stack([x[mine], y[mine]])
+        if len(points_T) >= _FEWEST and np.ptp(points_T, axis=0).min() > 0:
+            blocks.append(UnseenBlock.under(points_T, float(np.quantile(height[mine], _HIGHEST))))
+    return blocks

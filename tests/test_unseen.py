@@ -1,0 +1,89 @@
+"""Space that must be taken for full: shadows of what is known, and what is seen but known by no name."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import resting, scene_of
+
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.kinematics import forward_kinematics
+from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import CameraConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.scenes.seams import Observation
+from drake_clutter.scenes.unseen import UnseenBlock, unseen_blocks
+
+CAMERA = CameraConfig()
+EMPTY = LabelDetector(CAMERA).look(scene_of()).observation.depth
+LOWER = resting("sugar_box", Orientation.FLAT_0)
+UPPER = resting("cracker_box", Orientation.FLAT_0, floor=LOWER.top)
+
+
+def seen(objects: Sequence[SceneObject]) -> Observation:
+    return LabelDetector(CAMERA).look(scene_of(*objects)).observation
+
+
+def test_a_block_is_the_least_upright_one() -> None:
+    turn = 0.3
+    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    corners = np.array([[0.1, 0.02], [-0.1, 0.02], [-0.1, -0.02], [0.1, -0.02]]) @ R.T + [0.2, -0.1]
+    block = UnseenBlock.under(corners, 0.06)
+    assert block.middle == pytest.approx((0.2, -0.1, 0.03))
+    assert sorted(block.size[:2]) == pytest.approx([0.04, 0.2])
+    assert (block.size[2], block.top) == (0.06, 0.06)
+    long_axis = block.yaw if block.size[0] > block.size[1] else block.yaw + math.pi / 2
+    assert math.sin(long_axis - turn) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_nothing_is_unseen_where_all_is_known() -> None:
+    assert unseen_blocks([], seen([]), EMPTY) == (), "the rim belongs to the empty cell"
+    assert unseen_blocks([LOWER], seen([LOWER]), EMPTY) == ()
+
+
+def test_what_is_known_has_a_shadow_down_to_the_floor() -> None:
+    (shadow,) = unseen_blocks([UPPER], seen([LOWER, UPPER]), EMPTY)
+    assert shadow.top == pytest.approx(LOWER.top, abs=1e-3)
+    assert sorted(shadow.size[:2]) == pytest.approx(sorted(np.ptp(UPPER.corners_T, axis=0)[:2]), abs=1e-6)
+
+
+def test_what_is_seen_but_not_known_is_taken_for_full() -> None:
+    stranger = replace(resting("tomato_soup_can", xy=(0.2, 0.1)), name="stranger")
+    (block,) = unseen_blocks([LOWER], seen([LOWER, stranger]), EMPTY)
+    assert block.top == pytest.approx(stranger.top, abs=2e-3)
+    assert block.middle[:2] == pytest.approx((0.2, 0.1), abs=5e-3)
+
+
+def test_noise_is_nothing() -> None:
+    observation = seen([LOWER])
+    noisy = observation.depth + np.random.default_rng(0).normal(0, 0.0025, EMPTY.shape).astype(np.float32)
+    noisy[100, 100] = 1.0  # a single wrong pixel
+    noisy[200:210, 150:160] = 0.0  # not measured
+    assert unseen_blocks([LOWER], replace(observation, depth=noisy), EMPTY) == ()
+
+
+def highest(plan: Plan) -> float:
+    """m, of the cup while it carries."""
+    arm, carry = ArmConfig(), plan.phases[1]
+    ways = (carry.trajectory.value(time).ravel() for time in np.linspace(0, carry.duration, 40))
+    return max(float((arm.X_TB @ forward_kinematics(q) @ arm.X_FG)[2, 3]) for q in ways)
+
+
+def test_plans_keep_clear_of_what_is_unseen() -> None:
+    planner = PickPlacePlanner(ArmConfig(), PlannerConfig(optimise=False), 0.70, CAMERA.altitude)
+    place = Pose((0.2, -0.2, LOWER.X_TO.translation[2] + 0.001), LOWER.X_TO.quaternion)
+    between = UnseenBlock((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)
+    low, high = (planner.plan([LOWER], LOWER.name, place, unseen) for unseen in ((), (between,)))
+    assert isinstance(low, Plan)
+    assert isinstance(high, Plan)
+    assert highest(high) > highest(low) + 0.05, "it is carried over the block"
+    there = UnseenBlock((0.2, -0.2, 0.1), (0.2, 0.2, 0.2), 0.0)
+    blocked = planner.plan([LOWER], LOWER.name, place, (there,))
+    assert isinstance(blocked, NoPlan)
+    assert blocked.reason is PlanFailure.IN_COLLISION
