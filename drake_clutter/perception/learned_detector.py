@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import CameraConfig
 from drake_clutter.learning.checkpoint import Checkpoint
-from drake_clutter.perception.pose_fit import PoseFitter
+from drake_clutter.perception.explaining import Explanation, chosen, explanation
+from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
 from drake_clutter.perception.segmentation import (
+    Segment,
     SegmentationNetwork,
     Window,
     coarse,
@@ -24,6 +26,10 @@ from drake_clutter.scenes.seams import Detection, Observation
 
 LEAST_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""
+SURE_SCORE, CLAIMED = 0.6, 0.7
+"""A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
+LEAST_SHARE = 0.2
+"""Of the pixels that an object would cover alone, that must be seen of it."""
 
 
 class LearnedDetector:
@@ -52,11 +58,31 @@ class LearnedDetector:
             logits, votes = network(torch.from_numpy(given)[None].to(memory_format=torch.channels_last))
             kind = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf).argmax(dim=0).numpy()
         votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
+        fitted, explained = self._fitted(segments(kind, votes_T, self._radii, network.classes, window, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
-        for segment in segments(kind, votes_T, self._radii, network.classes, window, depth.shape):
-            object_class = self._classes[segment.name]
-            fitted = self._fitter.fit(object_class, segment.mask, depth, segment.p_TO)
-            if fitted is not None and fitted.score >= LEAST_SCORE:
-                counted[segment.name] += 1
-                found.append(Detection(f"{segment.name}_{counted[segment.name]}", object_class, fitted.X_TO, segment.mask))
+        for k in chosen(explained, [pose.score for _, pose in fitted], depth.shape, LEAST_SHARE):
+            object_class, pose = fitted[k]
+            counted[object_class.name] += 1
+            mask = np.zeros(depth.shape, bool)
+            mask[explained[k].window] = explained[k].seen
+            found.append(Detection(f"{object_class.name}_{counted[object_class.name]}", object_class, pose.X_TO, mask))
         return Observation(without_holes(np.where(depth > 0, depth, np.nan)), tuple(found), self._camera, self._tray_side)
+
+    def _fitted(
+        self, found: Sequence[Segment], depth: NDArray[np.float32]
+    ) -> tuple[list[tuple[ObjectClass, FittedPose]], list[Explanation]]:
+        """Poses of segments, the largest first, and what each explains; what a sure pose has explained already is left out."""
+        fitted, explained = list[tuple[ObjectClass, FittedPose]](), list[Explanation]()
+        claimed = np.zeros(depth.shape, bool)
+        for segment in sorted(found, key=lambda s: -np.count_nonzero(s.mask)):
+            if claimed[segment.mask].mean() > CLAIMED:
+                continue
+            object_class = self._classes[segment.name]
+            pose = self._fitter.fit(object_class, segment.mask, depth, segment.p_TO)
+            if pose is None or pose.score < LEAST_SCORE:
+                continue
+            fitted.append((object_class, pose))
+            explained.append(explanation(object_class, pose.X_TO, depth, self._camera))
+            if pose.score >= SURE_SCORE:
+                claimed[explained[-1].window] |= explained[-1].seen
+        return fitted, explained

@@ -69,30 +69,54 @@ def _cylinder_distance(h, e, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
-    """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
-    height, width = view.depth.shape
-    middle_u, middle_v, focal = width / 2 - 1, height / 2 - 1, view.focal_length
-    row, row_end, column, column_end = view.window
+def distance_along(cylinder, h, e, x, y, z):  # type: ignore[no-untyped-def]
+    """Likewise to a cylinder or a box."""
+    return _cylinder_distance(h, e, x, y, z) if cylinder else _box_distance(h, e, x, y, z)
+
+
+@njit(cache=True)
+def eye_in(R, p, altitude):  # type: ignore[no-untyped-def]
+    """Where the camera is in O, of a pose R (3, 3), p (3,) m."""
+    return (
+        -R[0, 0] * p[0] - R[1, 0] * p[1] + R[2, 0] * (altitude - p[2]),
+        -R[0, 1] * p[0] - R[1, 1] * p[1] + R[2, 1] * (altitude - p[2]),
+        -R[0, 2] * p[0] - R[1, 2] * p[1] + R[2, 2] * (altitude - p[2]),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def image_bounds(half, R, p, shape, altitude, focal):  # type: ignore[no-untyped-def]
+    """First row, end row, first column, end column of the pixels that a box of half sizes (3,) m falls on; none if too close."""
+    height, width = shape
+    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    top, bottom, left, right = height, 0, width, 0
     for corner in range(8):
         x = half[0] if corner & 1 else -half[0]
         y = half[1] if corner & 2 else -half[1]
         z = half[2] if corner & 4 else -half[2]
-        away = view.altitude - p[2] - R[2, 0] * x - R[2, 1] * y - R[2, 2] * z
+        away = altitude - p[2] - R[2, 0] * x - R[2, 1] * y - R[2, 2] * z
         if away < 0.05:
-            return 0.0
+            return 0, 0, 0, 0
         u = middle_u + focal * (p[0] + R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / away
         v = middle_v - focal * (p[1] + R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / away
-        row, row_end = min(row, math.floor(v)), max(row_end, math.ceil(v) + 1)
-        column, column_end = min(column, math.floor(u)), max(column_end, math.ceil(u) + 1)
-    row, row_end, column, column_end = max(row, 0), min(row_end, height), max(column, 0), min(column_end, width)
-    window = view.window
+        top, bottom = min(top, math.floor(v)), max(bottom, math.ceil(v) + 1)
+        left, right = min(left, math.floor(u)), max(right, math.ceil(u) + 1)
+    top, left = min(max(top, 0), height), min(max(left, 0), width)
+    return top, max(top, min(bottom, height)), left, max(left, min(right, width))
+
+
+@njit(cache=True, error_model="numpy")
+def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
+    """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
+    height, width = view.depth.shape
+    middle_u, middle_v, focal, window = width / 2 - 1, height / 2 - 1, view.focal_length, view.window
+    top, bottom, left, right = image_bounds(half, R, p, view.depth.shape, view.altitude, focal)
+    if top == bottom or left == right:
+        return 0.0
+    row, row_end = min(window[0], top), max(window[1], bottom)
+    column, column_end = min(window[2], left), max(window[3], right)
     stride = max(1, round(math.sqrt((window[1] - window[0]) * (window[3] - window[2]) / rays)))
-    e = (
-        -R[0, 0] * p[0] - R[1, 0] * p[1] + R[2, 0] * (view.altitude - p[2]),
-        -R[0, 1] * p[0] - R[1, 1] * p[1] + R[2, 1] * (view.altitude - p[2]),
-        -R[0, 2] * p[0] - R[1, 2] * p[1] + R[2, 2] * (view.altitude - p[2]),
-    )
+    e = eye_in(R, p, view.altitude)
     h = (half[0], half[1], half[2])
     ax, ay, az = R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal
     speaks_for, against = 0.0, 0.0
@@ -103,10 +127,7 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
         bx, by, bz = R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2]
         for u in range(column - column % stride + (v // stride) % stride, column_end, stride):
             x = u - middle_u
-            if cylinder:
-                away = _cylinder_distance(h, e, bx + ax * x, by + ay * x, bz + az * x)
-            else:
-                away = _box_distance(h, e, bx + ax * x, by + ay * x, bz + az * x)
+            away = distance_along(cylinder, h, e, bx + ax * x, by + ay * x, bz + az * x)
             seen, ours = view.depth[v, u], view.mask[v, u]
             if away == np.inf:
                 against += 1.0 if ours else 0.0

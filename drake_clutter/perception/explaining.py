@@ -1,0 +1,124 @@
+"""Which of many fitted poses are really there: those that together explain the image best.
+
+A segment that fell apart gives several poses of one object, and a wrong class may fit a part of a face as well as the right one
+fits all of it. Both explain what another pose explains better: poses are taken greedily, that with most pixels to itself first.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.config import CameraConfig
+from drake_clutter.perception.pose_score import distance_along, eye_in, image_bounds
+from drake_clutter.scenes.scene import Pose
+
+_AGREES = 0.008
+"""m along the optical axis, within which a pose is said to be seen."""
+_UNDECIDED, _SEEN, _SEEN_PAST = 0, 1, 2
+_OWN = 0.5
+"""Of the pixels of a pose that agree, the share that no better pose has claimed; with fewer it is no object."""
+_PAST = 0.25
+"""Of the pixels that speak for or against a pose, the share that the camera may see past it."""
+_FEWEST = 25
+"""Pixels of its own."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What of the image a pose explains.
+
+    Attributes:
+        top, left: pixel where `seen` begins.
+        seen: (rows, columns) bool, where the depth is as it should be.
+        past: pixels where the camera sees past it.
+        alone: pixels that it would cover if nothing stood before it.
+    """
+
+    top: int
+    left: int
+    seen: NDArray[np.bool_]
+    past: int
+    alone: int
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the image that `seen` is of."""
+        return slice(self.top, self.top + self.seen.shape[0]), slice(self.left, self.left + self.seen.shape[1])
+
+
+@njit(cache=True, error_model="numpy")
+def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ignore[no-untyped-def]
+    """(rows, columns) int8 what the pixels within bounds say of a pose, and how many it covers."""
+    top, bottom, left, right = bounds
+    middle_u, middle_v = depth.shape[1] / 2 - 1, depth.shape[0] / 2 - 1
+    said = np.zeros((bottom - top, right - left), np.int8)
+    e, h, alone = eye_in(R, p, altitude), (half[0], half[1], half[2]), 0
+    for v in range(top, bottom):
+        y = (middle_v - v) / focal
+        for u in range(left, right):
+            x = (u - middle_u) / focal
+            rx = R[0, 0] * x + R[1, 0] * y - R[2, 0]
+            ry = R[0, 1] * x + R[1, 1] * y - R[2, 1]
+            rz = R[0, 2] * x + R[1, 2] * y - R[2, 2]
+            away = distance_along(cylinder, h, e, rx, ry, rz)
+            if away == np.inf:
+                continue
+            alone += 1
+            seen = depth[v, u]
+            if not 0.05 < seen < 50.0:
+                continue
+            if seen > away + _AGREES:
+                said[v - top, u - left] = _SEEN_PAST
+            elif seen > away - _AGREES:
+                said[v - top, u - left] = _SEEN
+    return said, alone
+
+
+def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: CameraConfig) -> Explanation:
+    """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
+    half, R, p = np.asarray(object_class.size) / 2, np.ascontiguousarray(X_TO.rotation), np.asarray(X_TO.p, float)
+    depth = np.ascontiguousarray(depth, np.float32)
+    bounds = image_bounds(half, R, p, depth.shape, camera.altitude, camera.focal_length)
+    cylinder = object_class.shape is Shape.CYLINDER
+    said, alone = _compared(cylinder, half, R, p, depth, bounds, camera.altitude, camera.focal_length)
+    return Explanation(bounds[0], bounds[2], said == _SEEN, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
+
+
+def chosen(explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], least_share: float) -> list[int]:
+    """The numbers of those that are taken for objects, the surest first.
+
+    Args:
+        explanations: of poses.
+        scores: 0 to 1, how well each fits the segment that it was fitted to: a pixel of a pose that does counts for more.
+        shape: of the image.
+        least_share: of the pixels that an object would cover alone, that must be seen.
+    """
+    claimed = np.zeros(shape, bool)
+    left = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
+    found = list[int]()
+    # What a pose has to itself only becomes less: the first whose number is still right is the best.
+    own = dict.fromkeys(left, math.inf)
+    while own:
+        best = max(own, key=lambda k: (own[k], -k))
+        e = explanations[best]
+        mine = int(np.count_nonzero(e.seen & ~claimed[e.window])) - e.past
+        if mine < max(_FEWEST, _OWN * np.count_nonzero(e.seen)):
+            del own[best]
+            continue
+        if scores[best] * mine < own[best]:
+            own[best] = scores[best] * mine
+            continue
+        del own[best]
+        claimed[e.window] |= e.seen
+        found.append(best)
+    return found
+
+
+def _plausible(e: Explanation, least_share: float) -> bool:
+    seen = int(np.count_nonzero(e.seen))
+    return seen >= max(1.0, least_share * e.alone) and e.past <= _PAST * (seen + e.past)
