@@ -16,6 +16,7 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.seams import MoveResult, Observation
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.systems.teleported_loop import carried, explore_images
+from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.exploration import Decision, EpisodeEnd
 
 COVERED = scene_of(resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028))
@@ -37,18 +38,19 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
         names.extend(o.name for o in known)
         return agent.choose(observation, *others)
 
-    task = explore_images(COVERED, choose, lambda *_: sees, max_moves=3, seed=0, world=config)
+    task, known = explore_images(COVERED, choose, lambda *_: sees, max_moves=3, seed=0, world=config)
     (step,) = task.steps
     assert names == ["cracker_box_1"], "a name of its own"
     assert (step.move.pick, task.end) == ("cracker_box", EpisodeEnd.ALL_FOUND)
     assert step.outcome.released is not None
     off = task.scene["cracker_box"].X_TO.p - step.outcome.released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
+    assert recognised(known, COVERED.objects) == ("cracker_box",), "it has looked again, and was shown the same"
 
 
 def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
     sees = seen_but_shifted(COVERED, config, 0.0)
-    task = explore_images(COVERED, lambda *_: Decision(None), lambda *_: sees, max_moves=3, seed=0, world=config)
+    task, _ = explore_images(COVERED, lambda *_: Decision(None), lambda *_: sees, max_moves=3, seed=0, world=config)
     assert (task.steps, task.end) == ([], None)
 
 
@@ -63,6 +65,7 @@ def test_carried() -> None:
 def test_rows_of_the_results() -> None:
     script = training_script("closed_loop_results")
     episode = {"hidden": 2, "found": 2, "moves": 4, "robot": 60.0, "wall": 9.0, "not_planned": {}, "results": {}, "arm_can": True}
+    episode |= {"objects": 5, "known": 6, "recognised": 4}
     episodes = [
         episode | {"ended": "all found"},
         episode | {"ended": "all found", "arm_can": False},
@@ -74,6 +77,7 @@ def test_rows_of_the_results() -> None:
     row = script.row_of(script.ROWS[0], episodes)
     assert (row["success"], row["arm_can"], row["success_of_arm_can"]) == (2 / 6, 4 / 6, 1 / 4)
     assert (row["found_of_hidden"], row["moves_of_successes"], row["robot_minutes"]) == (0.5, 4, 1)
+    assert (row["list_recall"], row["list_precision"]) == (8 / 10, 8 / 12)
     assert (row["dropped"], row["not_planned"]) == (1, {"no seal": 3})
     held, refused = "what is left lies behind what no cup holds", "moves that the arm cannot plan"
     assert row["failed_of"] == {"collapsed": 1, refused: 1, held: 1, "exception": 1}

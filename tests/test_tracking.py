@@ -8,7 +8,7 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import CameraConfig
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
-from drake_clutter.systems.tracking import tracked
+from drake_clutter.systems.tracking import recognised, tracked
 
 CLASSES, CAMERA = load_catalogue().classes, CameraConfig()
 CAN = "tomato_soup_can"
@@ -58,3 +58,10 @@ def test_what_is_gone_and_not_in_view_is_lost() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
     assert tracked(known, image(at(0.2, 0.2), top=0.0)).lost == (f"{CAN}_1",)
     assert tracked(known, image(at(0.2, 0.2), top=0.1)).lost == ()
+
+
+def test_each_object_is_recognised_once_and_as_what_it_is() -> None:
+    there = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
+    box = replace(at(0.2, 0.2), name="box", object_class=CLASSES["sugar_box"])
+    assert recognised([at(0.01, 0), at(0.02, 0), box], there) == (f"{CAN}_1",)
+    assert recognised([], there) == ()

@@ -4,8 +4,9 @@
     python training/closed_loop_results.py runs/closed_loop --only arm --count 20 --out runs/part.json
 
 Every episode is a file; a run that was stopped goes on with what is missing. An episode that ends in an exception is counted as
-one. `arm_can` says of a scene that nothing hidden stays behind objects that no cup holds, or that carry such: more than that no
-arm finds.
+one. An episode is a success when a referee, who knows the truth, has seen every object in view; `list_recall` and
+`list_precision` say how right the agent's own list of objects then is: class, and place within 4 cm. `arm_can` says of a scene
+that nothing hidden stays behind objects that no cup holds, or that carry such: more than that no arm finds.
 """
 
 import json
@@ -31,12 +32,13 @@ from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
-from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.scenes.seams import CannotJudge, MoveResult
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.systems.teleported_loop import explore_images
+from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
@@ -96,22 +98,27 @@ class Player:
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
         told["arm_can"] = not self._never_found_by_arm(scene, scenario)
         try:
-            task, robot, end = self._played(scene, scenario, row.motion)
+            task, known, robot, end = self._played(scene, scenario, row.motion)
         except Exception as error:  # whatever it is, it is a result
             told |= {"ended": "exception", "exception": repr(error)}
         else:
-            told |= told_of(task) | {"robot": robot, "ended": task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value}
+            told |= told_of(task, known) | {
+                "robot": robot,
+                "ended": task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value,
+            }
         write_json(asked.path, told | {"wall": time.perf_counter() - begun})
 
-    def _played(self, scene: Scene, scenario: Scenario, motion: str) -> tuple[ExplorationTask, float, str]:
+    def _played(
+        self, scene: Scene, scenario: Scenario, motion: str
+    ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float, str]:
         perceive, choose = perception_of(scenario, scene.tray_side), self._policy(scenario.agent)
         options: dict[str, Any] = {"max_moves": scenario.max_moves, "seed": scenario.seed, "world": scenario.world}
         if motion == "arm":
             loop = ClosedLoop(scene, choose, perceive=perceive, arm=scenario.arm, **options)
             timing = loop.run()
-            return loop.task, timing.robot, timing.end
+            return loop.task, loop.known, timing.robot, timing.end
         assert perceive is not None, "labels with settle are not in the rows"
-        return explore_images(scene, choose, perceive, **options), 0.0, ""
+        return *explore_images(scene, choose, perceive, **options), 0.0, ""
 
     def _never_found_by_arm(self, scene: Scene, scenario: Scenario) -> tuple[str, ...]:
         """What stays hidden behind what no cup holds, and what carries that."""
@@ -125,7 +132,7 @@ class Player:
         return self._search.never_found(scene, [d.name for d in in_view], fixed)
 
 
-def told_of(task: ExplorationTask) -> dict[str, Any]:
+def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:
     """What is kept of an episode."""
     results = Counter(step.outcome.result for step in task.steps)
     reasons = Counter(s.outcome.detail.split(":")[0] for s in task.steps if s.outcome.result is MoveResult.NOT_PLANNED)
@@ -135,6 +142,9 @@ def told_of(task: ExplorationTask) -> dict[str, Any]:
         "found": len(task.found),
         "found_after": np.cumsum([len(step.newly_found) for step in task.steps], dtype=int).tolist(),
         "moves": len(task.steps),
+        "objects": len(task.scene.objects),
+        "known": len(known),
+        "recognised": len(recognised(known, task.scene.objects)),
         "results": {result.value: count for result, count in results.items()},
         "not_planned": dict(reasons),
         "collapse": f"{task.steps[-1].move}: {worst.instability}; {worst.detail}" if worst else "",
@@ -171,6 +181,11 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     told["found_of_hidden"] = sum(e["found"] for e in played) / max(1, sum(e["hidden"] for e in played))
     moves = [e["moves"] for e, success in zip(episodes, won, strict=True) if success]
     told["moves_of_successes"] = float(np.mean(moves)) if moves else None
+    # Of the list of objects that the agent has at the end of a success.
+    lists = [e for e in played if e["ended"] == EpisodeEnd.ALL_FOUND.value]
+    right = sum(e["recognised"] for e in lists)
+    told["list_recall"] = right / max(1, sum(e["objects"] for e in lists))
+    told["list_precision"] = right / max(1, sum(e["known"] for e in lists))
     told["robot_minutes"] = float(np.median([e["robot"] for e in played])) / 60
     told["wall_seconds"] = float(np.median([e["wall"] for e in played]))
     told["not_planned"] = dict(sum((Counter(e["not_planned"]) for e in played), Counter[str]()))

@@ -162,6 +162,11 @@ class ClosedLoop:
         state: AgentState = self.agent.GetOutputPort("state").Eval(self.agent.GetMyContextFromRoot(root))
         return state
 
+    @property
+    def known(self) -> tuple[SceneObject, ...]:
+        """K_t, as the agent has it now."""
+        return self._agent_state(self.simulator.get_context()).known
+
     def run(self, report: Callable[[Step], None] = lambda _: None, *, record: bool = False) -> Timing:
         """Simulates until all is found, the pile has collapsed, or the agent has ended; `report` is called after each move."""
         begun_at = time.perf_counter()

@@ -175,13 +175,17 @@ class ExplorationAgent(LeafSystem):
                 return replace(now.placed(answer.plan.X_TO_place), look_at=time + self._rest)
         return now
 
-    def decided(self, now: AgentState, observation: Observation) -> AgentState:
-        """After a look: with a request for a move, or done."""
+    def looked(self, now: AgentState, observation: Observation) -> tuple[AgentState, Observation]:
+        """After a look: what is known then, and what was seen in the names of what is known."""
         if self._track is not None:
             observation, lost = self._track(now.known, observation)
             # What is lost is no longer known: wherever it is, it will be found again as another.
             now = replace(now, known=tuple(o for o in now.known if o.name not in lost), lost=(*now.lost, *lost))
-        now = replace(now, known=seen(now.known, observation))
+        return replace(now, known=seen(now.known, observation)), observation
+
+    def decided(self, now: AgentState, observation: Observation) -> AgentState:
+        """After a look: with a request for a move, or done."""
+        now, observation = self.looked(now, observation)
         number = len(now.tried) + 1
         if number > self._max_moves:
             return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)

@@ -10,8 +10,8 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.seams import MoveResult, Outcome
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.seams import MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase
@@ -29,19 +29,23 @@ def explore_images(
     seed: int,
     world: ClutterConfig,
     report: Callable[[Step], None] = lambda _: None,
-) -> ExplorationTask:
-    """Plays an episode on a scene at rest; the task is the book of a referee who knows the truth.
+) -> tuple[ExplorationTask, tuple[SceneObject, ...]]:
+    """Plays an episode on a scene at rest: the book of a referee who knows the truth, and what the agent knows at the end.
 
     Arguments: as of `ClosedLoop`.
     """
     executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.camera)
     task = ExplorationTask(scene, executor, LabelDetector(world.camera), world.exploration, max_moves)
     agent, state = ExplorationAgent(choose=choose, track=tracked, max_moves=max_moves, seed=seed), AgentState()
-    while task.end is None:
+
+    def seen() -> Observation:
         images = camera.render(task.scene)
-        state = agent.decided(state, perceive(images.depth, images.color, ()))
+        return perceive(images.depth, images.color, ())
+
+    while task.end is None:
+        state = agent.decided(state, seen())
         if state.phase is Phase.DONE or state.request is None:
-            break
+            return task, state.known
         request, rng = state.request, item_rng(seed, state.request.number, 1)
         move, decision = request.truly(task.scene.objects)
         X_TO = choose_placement(request.observation, request.move, world.exploration, rng)
@@ -53,7 +57,7 @@ def explore_images(
         outcome = executor.put(task.scene, move.pick, carried(believed, X_TO, nearest(task.scene.objects, believed).X_TO), rng)
         state = state.placed(X_TO)
         report(task.note(move, replace(outcome, released=X_TO), decision))
-    return task
+    return task, agent.looked(state, seen())[0].known
 
 
 def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:

@@ -60,7 +60,17 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
     return Tracked(replace(observation, detections=detections), tuple(lost))
 
 
-def _matched(known: Sequence[SceneObject], seen: Sequence[Detection], within: float) -> dict[int, int]:
+def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> tuple[str, ...]:
+    """The names of those objects that are among the known: each is one of its class, not far from where it is known to be."""
+    found = list[str]()
+    for object_class in {o.object_class for o in known}:
+        there = [o for o in objects if o.object_class is object_class]
+        pairs = _matched([o for o in known if o.object_class is object_class], there, NEAR)
+        found += [there[k].name for k in pairs.values()]
+    return tuple(o.name for o in objects if o.name in found)
+
+
+def _matched(known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float) -> dict[int, int]:
     """Indices of the seen by those of the known, no further apart than `within`, m."""
     if not known or not seen:
         return {}
