@@ -1,0 +1,218 @@
+"""Writes docs/results.md, every number of it from the files in training/results and benchmarks/results, and the learning curves.
+
+    python training/results_page.py
+
+A table has the rows that have been measured so far; what is missing is not there.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import typer
+
+from drake_clutter.files import told_in_one_line, write_text
+
+ROOT = Path(__file__).parents[1]
+RESULTS, CALIBRATION = ROOT / "training/results", ROOT / "benchmarks/results/calibration.json"
+PAGE, CURVES = ROOT / "docs/results.md", ROOT / "docs/images/learning_curves.png"
+PAPER_GENERATORS = {
+    ("random", "ycb7"): {10: (1.13, 0.84), 15: (1.64, 0.64), 20: (2.18, 0.55), 25: (2.51, 0.41)},
+    ("sg", "ycb7"): {10: (2.12, 0.99), 15: (2.41, 0.99), 20: (2.46, 0.93), 25: (3.01, 0.81)},
+    ("sg-star", "ycb7"): {10: (4.62, 0.97), 15: (5.88, 0.85), 20: (6.67, 0.97), 25: (7.45, 0.88)},
+    ("random", "pantry14"): {25: (2.44, 0.09)},
+    ("sg-14", "pantry14"): {25: (6.03, 0.70)},
+}
+"""Table I of the paper and its text: objects hidden and stability, by agent, object set, and nodes (SPEC section 5)."""
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Or nothing."""
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def with_interval(row: dict[str, Any], name: str, interval: str, digits: int = 2) -> str:
+    """A figure and its interval."""
+    if row.get(name) is None or row.get(interval) is None:
+        return number(row.get(name), digits)
+    low, high = row[interval]
+    return f"{row[name]:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def read(name: str) -> dict[str, Any]:
+    """A file of results; {} if it is not there."""
+    path = RESULTS / name
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    return found
+
+
+def generator_row(row: dict[str, Any], source: str) -> list[str]:
+    """Of Table I."""
+    hidden, stable = PAPER_GENERATORS.get((row["agent"], row["objects"]), {}).get(row["nodes"], (None, None))
+    if row.get("temperature") is not None:
+        hidden = stable = None
+    name = row["agent"] if row.get("temperature") is None else f"{row['agent']} at {row['temperature']:g}"
+    told = [name, row["objects"], str(row["nodes"]), str(row["count"])]
+    told += [with_interval(row, "stability_rate", "stability_ci95"), number(stable)]
+    told += [with_interval(row, "hidden_mean", "hidden_ci95", 1), number(hidden)]
+    told += [with_interval(row, "solvable_share", "solvable_ci95"), number(row.get("distinct_share"))]
+    told += [number(row.get("mean_stacks"), 1), number(row.get("balanced_share"))]
+    return [*told, number(row.get("class_entropy")), number(row.get("false_stable_of_called_stable"), 3), source]
+
+
+def generators() -> str:
+    """Table I, the trade-off and the seeds."""
+    rows = list(read("table1.json").get("rows", []))
+    told = [generator_row(row, f"`table1.json`, {row['commit']}") for row in rows]
+    measured = {(row["agent"], row["objects"], row["nodes"]) for row in rows}
+    earlier = json.loads(CALIBRATION.read_text())
+    for row in earlier["rows"]:
+        row = {"agent": "random", "objects": earlier["objects"], "count": earlier["count"], **row}
+        if ("random", row["objects"], row["nodes"]) not in measured:
+            told.append(generator_row(row, "`calibration.json`"))
+    head = ["agent", "objects", "nodes", "scenes", "stable", "paper", "hidden", "paper", "solvable", "distinct", "stacks"]
+    head += ["balanced", "class bits", "fast judge wrong", "from"]
+    seeds = []
+    for path in sorted(RESULTS.glob("sg_star_seed_*.json")):
+        held = json.loads(path.read_text())
+        last = held["history"][-1]
+        figures = [number(last[name], digits) for name, digits in (("stable", 3), ("hidden", 1), ("stacks", 2), ("balanced", 2))]
+        rate = last["step"] / last["seconds"]
+        seeds.append([path.stem.rsplit("_", 1)[1], str(last["step"]), number(held["minutes"], 0), number(rate, 0), *figures])
+    return f"""## Table I: scenes that hide things
+
+Drake settles and sees every scene. Hidden and solvable are of the stable ones; intervals are 95 %. *Balanced*: no stack holds
+more than 60 % of the objects. *Fast judge wrong*: of the scenes that it calls stable, the share that falls in Drake.
+`python training/generator_results.py runs/table1`
+
+{table(head, told)}
+The training of SG*, by seed; figures of 256 scenes by the fast judge at the training's temperature, 0.25, where what is too high
+or does not come apart counts as unstable, too. Seed 0 is the shipped one, sampled at 0.28.
+
+{table(["seed", "steps", "minutes", "steps/s", "stable", "hidden", "stacks", "balanced"], seeds)}
+![Learning curves of SG*](images/learning_curves.png)
+"""
+
+
+def explorers() -> str:
+    """Tables II and III."""
+    rows = list(read("table2.json").get("rows", []))
+    held = {(row["set"], row["agent"]) for row in rows}
+    for name in ("explorers_100.json", "explorers_14.json"):
+        rows += [row for row in read(name).get("rows", []) if (row["set"], row["agent"]) not in held]
+    told = []
+    for row in rows:
+        cells = [row["set"], row["agent"], str(row["episodes"]), number(row["hidden"], 1)]
+        for limit in ("within_10", "within_20"):
+            cells += [with_interval(row[limit], "success", "success_ci95"), number(row[limit]["found"], 1)]
+        solvable = row.get("solvable") or {}
+        cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
+        cells += [
+            number(row["within_20"]["collapsed"]),
+            number(row["moves_of_successes"], 1),
+            number(row.get("moves_to_ceiling")),
+        ]
+        told.append(cells)
+    head = ["set", "agent", "episodes", "hidden", "success in 10", "found", "success in 20", "found", "of solvable", "of hidden"]
+    return f"""## Tables II and III: explorers
+
+Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
+*to ceiling*: moves on the scenes that both solve, to those of full knowledge. `python training/explorer_results.py runs/table2`
+
+{table([*head, "collapsed", "moves", "to ceiling"], told)}
+![What was found over the moves](images/explorers.png)
+"""
+
+
+def closed_loop() -> str:
+    """The loop's table."""
+    told = []
+    for path in sorted(RESULTS.glob("closed_loop*.json")):
+        held = json.loads(path.read_text())
+        for row in held["rows"]:
+            cells = [row["scenes"], row["perception"], row["motion"], str(row["episodes"])]
+            cells += [with_interval(row, "success", "success_ci95"), number(row["arm_can"])]
+            cells += [with_interval(row, "success_of_arm_can", "success_of_arm_can_ci95"), number(row["found_of_hidden"])]
+            cells += [number(row.get("list_recall")), number(row.get("list_precision")), number(row["moves_of_successes"], 1)]
+            failures = ", ".join(f"{count} {reason}" for reason, count in row["failed_of"].items())
+            minutes = number(row["robot_minutes"], 1) if row["motion"] == "arm" else ""
+            told.append([*cells, minutes, number(row["wall_seconds"], 0), failures or "none", f"`{path.name}`, {held['commit']}"])
+    head = ["set", "perception", "motion", "episodes", "success", "arm can", "success of these", "found of hidden", "list recall"]
+    head += ["list precision", "moves", "robot min", "wall s", "the others", "from"]
+    return f"""## The closed loop
+
+Within 20 moves. *Arm can*: scenes in which nothing stays hidden behind what no cup holds. *List*: of the objects that the agent
+knows by class and place when all has been in view.
+`python training/closed_loop_results.py runs/closed_loop`
+
+{table(head, told)}"""
+
+
+def detectors() -> str:
+    """What a trained detector sees."""
+    told = []
+    for path in sorted(RESULTS.glob("detector_*.json")):
+        held = json.loads(path.read_text())
+        for name, row in held["rows"].items() if isinstance(held, dict) else ():
+            cells = [held["detector"], name, str(row["images"]), with_interval(row["in_view"], "recall", "ci95")]
+            cells += [number(row["precision"]), number(row["class_accuracy_of_found"])]
+            for key in ("translation_mm", "rotation_deg", "ms_per_frame"):
+                cells.append(" / ".join(number(value, 1) for value in row[key]))
+            told.append(cells)
+    head = ["detector", "images of", "images", "recall, in view", "precision", "class right", "translation mm", "rotation deg"]
+    return f"""## Learned perception
+
+Objects of which at least 30 % are seen; found is one that a detection of its class covers with an IoU of 0.5. Errors and ms per
+frame: median / 95th percentile.
+`python training/detector_results.py --detector FILE --scenes SET --out FILE`
+
+{table([*head, "ms"], told)}"""
+
+
+PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, detectors)
+
+
+def page() -> str:
+    """The whole page."""
+    told = "Written by `training/results_page.py` from the files in `training/results/`, which name config, seed and commit."
+    return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
+
+
+def draw_curves(path: Path) -> None:
+    """How SG* learns, seed by seed."""
+    plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
+    figure, panels = plt.subplots(1, 3, figsize=(18, 5.5), layout="constrained")
+    names = (("score", "return of a scene"), ("hidden", "hidden objects"), ("stable", "stable, share"))
+    for file in sorted(RESULTS.glob("sg_star_seed_*.json")):
+        history = json.loads(file.read_text())["history"]
+        for panel, (name, label) in zip(panels, names, strict=True):
+            panel.plot([row["step"] / 1000 for row in history], [row[name] for row in history], label=f"seed {file.stem[-1]}")
+            panel.set(xlabel="steps / 1000", ylabel=label)
+            panel.grid(alpha=0.4)
+    panels[-1].set_ylim(0.5, 1.0)
+    panels[0].legend()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def main(out: Annotated[Path, typer.Option(help="Page to write.")] = PAGE) -> None:
+    """Writes the page and the curves."""
+    write_text(out, page())
+    if out == PAGE:
+        draw_curves(CURVES)
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
