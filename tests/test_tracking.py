@@ -65,3 +65,14 @@ def test_each_object_is_recognised_once_and_as_what_it_is() -> None:
     box = replace(at(0.2, 0.2), name="box", object_class=CLASSES["sugar_box"])
     assert recognised([at(0.01, 0), at(0.02, 0), box], there) == (f"{CAN}_1",)
     assert recognised([], there) == ()
+
+
+def test_what_was_taken_for_something_else_is_lost() -> None:
+    """A box known where a can is now recognised, by its pixels; without that, it may only have been missed."""
+    box = SceneObject("sugar_box_1", CLASSES["sugar_box"], Pose((0.0, 0.0, 0.1 - 0.175 / 2)))
+    seen = image(at(0.0, 0.0))
+    assert tracked([box], seen).lost == ()
+    (can,) = seen.detections
+    claimed = np.zeros(seen.depth.shape, bool)
+    claimed[200:280, 280:360] = True
+    assert tracked([box], replace(seen, detections=(replace(can, mask=claimed),))).lost == ("sugar_box_1",)

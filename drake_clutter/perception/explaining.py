@@ -35,6 +35,7 @@ class Explanation:
     Attributes:
         top, left: pixel where `seen` begins.
         seen: (rows, columns) bool, where the depth is as it should be.
+        away: (rows, columns) float32 m, where it is `seen`, how far along the optical axis the pose says it is.
         past: pixels where the camera sees past it.
         alone: pixels that it would cover if nothing stood before it.
     """
@@ -42,6 +43,7 @@ class Explanation:
     top: int
     left: int
     seen: NDArray[np.bool_]
+    away: NDArray[np.float32]
     past: int
     alone: int
 
@@ -53,10 +55,10 @@ class Explanation:
 
 @njit(cache=True, error_model="numpy")
 def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ignore[no-untyped-def]
-    """(rows, columns) int8 what the pixels within bounds say of a pose, and how many it covers."""
+    """(rows, columns) int8 what the pixels within bounds say of a pose, how far away it is (m), and how many it covers."""
     top, bottom, left, right = bounds
     middle_u, middle_v = depth.shape[1] / 2 - 1, depth.shape[0] / 2 - 1
-    said = np.zeros((bottom - top, right - left), np.int8)
+    said, far = np.zeros((bottom - top, right - left), np.int8), np.zeros((bottom - top, right - left), np.float32)
     e, h, alone = eye_in(R, p, altitude), (half[0], half[1], half[2]), 0
     for v in range(top, bottom):
         y = (middle_v - v) / focal
@@ -69,6 +71,7 @@ def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ig
             if away == np.inf:
                 continue
             alone += 1
+            far[v - top, u - left] = away
             seen = depth[v, u]
             if not 0.05 < seen < 50.0:
                 continue
@@ -76,7 +79,7 @@ def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ig
                 said[v - top, u - left] = _SEEN_PAST
             elif seen > away - _AGREES:
                 said[v - top, u - left] = _SEEN
-    return said, alone
+    return said, far, alone
 
 
 def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: CameraConfig) -> Explanation:
@@ -85,8 +88,8 @@ def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32
     depth = np.ascontiguousarray(depth, np.float32)
     bounds = image_bounds(half, R, p, depth.shape, camera.altitude, camera.focal_length)
     cylinder = object_class.shape is Shape.CYLINDER
-    said, alone = _compared(cylinder, half, R, p, depth, bounds, camera.altitude, camera.focal_length)
-    return Explanation(bounds[0], bounds[2], said == _SEEN, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
+    said, away, alone = _compared(cylinder, half, R, p, depth, bounds, camera.altitude, camera.focal_length)
+    return Explanation(bounds[0], bounds[2], said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
 
 
 def chosen(explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], least_share: float) -> list[int]:

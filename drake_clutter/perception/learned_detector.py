@@ -28,6 +28,8 @@ LEAST_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""
 SURE_SCORE, CLAIMED = 0.6, 0.7
 """A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
+FLOOR_WITHIN = 0.008
+"""m, of the floor; what is measured there is the floor: nothing that lies on it is so flat."""
 LEAST_SHARE = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
 
@@ -47,6 +49,8 @@ class LearnedDetector:
     def detect(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> Observation:
         """What two images show; names count the objects of each class, and mean nothing beyond this image.
 
+        The depth of what was recognised, and of the tray's floor, is that of the models: without noise.
+
         Args:
             depth: (height, width) m along the camera's axis; 0 or infinite where nothing is measured.
             color: (height, width, 3).
@@ -60,13 +64,16 @@ class LearnedDetector:
         votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
         fitted, explained = self._fitted(segments(kind, votes_T, self._radii, network.classes, window, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
+        clean = without_holes(np.where(depth > 0, depth, np.nan))
+        clean[np.abs(clean - self._camera.altitude) < FLOOR_WITHIN] = self._camera.altitude
         for k in chosen(explained, [pose.score for _, pose in fitted], depth.shape, LEAST_SHARE):
             object_class, pose = fitted[k]
             counted[object_class.name] += 1
             mask = np.zeros(depth.shape, bool)
             mask[explained[k].window] = explained[k].seen
+            clean[mask] = explained[k].away[explained[k].seen]
             found.append(Detection(f"{object_class.name}_{counted[object_class.name]}", object_class, pose.X_TO, mask))
-        return Observation(without_holes(np.where(depth > 0, depth, np.nan)), tuple(found), self._camera, self._tray_side)
+        return Observation(clean, tuple(found), self._camera, self._tray_side)
 
     def _fitted(
         self, found: Sequence[Segment], depth: NDArray[np.float32]

@@ -14,6 +14,7 @@ from PIL import Image
 from drake_clutter.files import replacing, write_text
 from drake_clutter.perception.label_detector import Look
 from drake_clutter.reports.arm_pictures import arm_moments, strip
+from drake_clutter.reports.detections_picture import detections_picture
 from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
 from drake_clutter.reports.recording import episode_frames, write_recording
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
@@ -138,6 +139,12 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         notes.append(f"{escape(_fall_in_words(outcome.instability))}.")
     if outcome.detail:
         notes.append(f"{escape(outcome.detail)}.")
+    if step.decision is not None and step.decision.observation is not None:
+        seen = step.decision.observation
+        names = _listed([detection.object_class.name for detection in seen.detections])
+        alt = f"The depth image before move {number}, with what was recognised in it: {names or 'nothing'}"
+        caption = "What the camera measured before the move, brighter is higher, and what was recognised in it."
+        figures += pictures.figure(f"move_{number:02d}_seen", detections_picture(seen), alt, caption)
     if outcome.motion and outcome.motion[0].arm:
         moments = arm_moments(outcome.motion, step.move.pick)
         alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"

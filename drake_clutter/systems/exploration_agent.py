@@ -68,7 +68,8 @@ class Request:
         name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in self.known}
         move = Move(name[self.move.pick], name[self.move.place])
         picks = {name[pick]: chance for pick, chance in self.decision.picks.items()}
-        return move, replace(self.decision, move=move, picks=picks, known=tuple(name[known] for known in self.decision.known))
+        known = tuple(name[known] for known in self.decision.known)
+        return move, replace(self.decision, move=move, picks=picks, known=known, observation=self.observation)
 
 
 @dataclass(frozen=True)

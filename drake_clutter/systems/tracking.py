@@ -7,13 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from drake_clutter.perception.explaining import explanation
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 
 NEAR = 0.04
 """m; an object that is seen so near to where one of its class is known to be is that one."""
-SEEN_THROUGH = 0.02
-"""m, by which what the camera sees must be below the middle of a known object that is no longer there."""
+SEEN_PAST = 0.3
+"""Of the pixels in which a known object should be seen, the share in which the camera sees past it if it is no longer there."""
+TAKEN = 0.5
+"""Of the pixels in which it seems to be in view, the share that is recognised as something else if it never was there."""
 
 
 class Tracked(NamedTuple):
@@ -21,7 +24,7 @@ class Tracked(NamedTuple):
 
     Attributes:
         observation: its detections bear the names of the known objects that they are, or new ones.
-        lost: names of known objects that are no longer where they were, and are not in view elsewhere.
+        lost: names of known objects that are no longer where they were, or never were, and are not in view elsewhere.
     """
 
     observation: Observation
@@ -62,11 +65,11 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
 
 def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> tuple[str, ...]:
     """The names of those objects that are among the known: each is one of its class, not far from where it is known to be."""
-    found = list[str]()
-    for object_class in {o.object_class for o in known}:
-        there = [o for o in objects if o.object_class is object_class]
-        pairs = _matched([o for o in known if o.object_class is object_class], there, NEAR)
-        found += [there[k].name for k in pairs.values()]
+    found = set[str]()
+    for name in {o.object_class.name for o in known}:
+        there = [o for o in objects if o.object_class.name == name]
+        pairs = _matched([o for o in known if o.object_class.name == name], there, NEAR)
+        found |= {there[k].name for k in pairs.values()}
     return tuple(o.name for o in objects if o.name in found)
 
 
@@ -81,9 +84,13 @@ def _matched(known: Sequence[SceneObject], seen: Sequence[SceneObject | Detectio
 
 
 def _gone(known: SceneObject, observation: Observation) -> bool:
-    """Whether the camera sees what is below the place where an object was."""
-    camera, p_TO = observation.camera, known.X_TO.p
-    column, row = np.rint(camera.project(p_TO[None])[0]).astype(int)
-    if not (0 <= row < camera.height and 0 <= column < camera.width):
-        return False
-    return bool(observation.depth[row, column] > camera.altitude - p_TO[2] + SEEN_THROUGH)
+    """Whether an object that was not recognised is not where it was: the camera sees past it, or sees something else there."""
+    e = explanation(known.object_class, known.X_TO, observation.depth, observation.camera)
+    as_expected = np.count_nonzero(e.seen)
+    if e.past > SEEN_PAST * (e.past + as_expected):
+        return True
+    others = np.zeros(observation.depth.shape, bool)
+    for detection in observation.detections:
+        others |= detection.mask
+    taken = np.count_nonzero(e.seen & others[e.window])
+    return bool(taken > TAKEN * as_expected and as_expected >= observation.camera.hidden_below * e.alone)

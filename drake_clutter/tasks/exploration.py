@@ -73,11 +73,13 @@ class Decision:
         move: what to do; None: there is no move.
         picks: the probability of each pick, by name; empty if the agent has none.
         known: the objects that it went by; empty if that is what is in view.
+        observation: what it was shown, if that is not what a perfect detector sees.
     """
 
     move: Move | None
     picks: Mapping[str, float] = field(default_factory=dict)
     known: tuple[str, ...] = ()
+    observation: Observation | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
