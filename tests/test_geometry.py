@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.grammar import Orientation
-from drake_clutter.scenes.geometry import deepest_penetration, penetration, touching_groups
+from drake_clutter.scenes.geometry import carried, deepest_penetration, penetration, touching_groups
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import add_scene_plant
 
@@ -203,3 +203,11 @@ def test_touching_groups() -> None:
     assert names_of(groups) == [["a", "c", "b", "above a"], ["far"]]
     assert names_of(touching_groups([*chain, far, high], 0.0005)) == [["a"], ["c"], ["b"], ["far"], ["above a"]]
     assert touching_groups([], 0.003) == []
+
+
+def test_carried() -> None:
+    quarter = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    believed, real = Pose((0.1, 0.0, 0.05)), Pose((0.11, 0.0, 0.05))
+    put = carried(believed, Pose((0.0, 0.2, 0.05), quarter), real)
+    assert put.p == pytest.approx([0.0, 0.21, 0.05]), "the error turns with it"
+    assert put.quaternion == pytest.approx(quarter)

@@ -5,17 +5,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import resting, scene_of, training_script
 
 from drake_clutter.agents.exploration import LargestClear
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import MoveResult, Observation
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.systems.teleported_loop import carried, explore_images
+from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.exploration import Decision, EpisodeEnd
 
@@ -52,14 +51,6 @@ def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
     sees = seen_but_shifted(COVERED, config, 0.0)
     task, _ = explore_images(COVERED, lambda *_: Decision(None), lambda *_: sees, max_moves=3, seed=0, world=config)
     assert (task.steps, task.end) == ([], None)
-
-
-def test_carried() -> None:
-    quarter = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
-    believed, real = Pose((0.1, 0.0, 0.05)), Pose((0.11, 0.0, 0.05))
-    put = carried(believed, Pose((0.0, 0.2, 0.05), quarter), real)
-    assert put.p == pytest.approx([0.0, 0.21, 0.05]), "the error turns with it"
-    assert put.quaternion == pytest.approx(quarter)
 
 
 def test_rows_of_the_results() -> None:

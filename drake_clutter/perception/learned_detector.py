@@ -1,7 +1,8 @@
 """The detector that knows nothing but images: a network finds the objects, geometry fits their poses."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -28,6 +29,8 @@ LEAST_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""
 SURE_SCORE, CLAIMED = 0.6, 0.7
 """A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
+SIDE_BY_SIDE = 2
+"""Segments that are fitted at the same time; always so many, so that the number of cores changes no result."""
 FLOOR_WITHIN = 0.008
 """m, of the floor; what is measured there is the floor: nothing that lies on it is so flat."""
 LEAST_SHARE = 0.2
@@ -44,7 +47,7 @@ class LearnedDetector:
         self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, tray_side)
         self._unknown = torch.tensor([False] + [name not in self._classes for name in self._network.classes])
         self._radii = [min(self._classes[n].size) / 2 if n in self._classes else 0.0 for n in self._network.classes]
-        self._fitter = PoseFitter(camera)
+        self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(SIDE_BY_SIDE)
 
     def detect(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> Observation:
         """What two images show; names count the objects of each class, and mean nothing beyond this image.
@@ -81,15 +84,20 @@ class LearnedDetector:
         """Poses of segments, the largest first, and what each explains; what a sure pose has explained already is left out."""
         fitted, explained = list[tuple[ObjectClass, FittedPose]](), list[Explanation]()
         claimed = np.zeros(depth.shape, bool)
-        for segment in sorted(found, key=lambda s: -np.count_nonzero(s.mask)):
-            if claimed[segment.mask].mean() > CLAIMED:
-                continue
-            object_class = self._classes[segment.name]
-            pose = self._fitter.fit(object_class, segment.mask, depth, segment.p_TO)
-            if pose is None or pose.score < LEAST_SCORE:
-                continue
-            fitted.append((object_class, pose))
-            explained.append(explanation(object_class, pose.X_TO, depth, self._camera))
-            if pose.score >= SURE_SCORE:
-                claimed[explained[-1].window] |= explained[-1].seen
+        left = deque(sorted(found, key=lambda segment: -np.count_nonzero(segment.mask)))
+        while left:
+            next_ones = list[Segment]()
+            while left and len(next_ones) < SIDE_BY_SIDE:
+                segment = left.popleft()
+                if claimed[segment.mask].mean() <= CLAIMED:
+                    next_ones.append(segment)
+            classes = [self._classes[segment.name] for segment in next_ones]
+            poses = self._workers.map(lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), next_ones, classes)
+            for object_class, pose in zip(classes, poses, strict=True):
+                if pose is None or pose.score < LEAST_SCORE:
+                    continue
+                fitted.append((object_class, pose))
+                explained.append(explanation(object_class, pose.X_TO, depth, self._camera))
+                if pose.score >= SURE_SCORE:
+                    claimed[explained[-1].window] |= explained[-1].seen
         return fitted, explained

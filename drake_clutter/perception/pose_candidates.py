@@ -17,7 +17,7 @@ SLACKS = (0.012, 0.048)
 """m, by which points may reach past the face that they are said to lie on; the second where the first leaves nothing good."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def spread_points(view, most):  # type: ignore[no-untyped-def]
     """The object's measured points (N, 3) m in T, at most so many, and those at its own edges, (M, 3)."""
     height, width = view.depth.shape
@@ -202,7 +202,7 @@ def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def candidates(cylinder, half, points, edges, view, slack):  # type: ignore[no-untyped-def]
     """Poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first."""
     R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0

@@ -105,7 +105,7 @@ def image_bounds(half, R, p, shape, altitude, focal):  # type: ignore[no-untyped
     return top, max(top, min(bottom, height)), left, max(left, min(right, width))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
     height, width = view.depth.shape
@@ -143,7 +143,7 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
     return speaks_for / (speaks_for + against) if speaks_for > 0 else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """The score, less what the distance to the guess costs."""
     off = p - view.p_TO_guess
@@ -164,7 +164,7 @@ def turned(R, axis, angle):  # type: ignore[no-untyped-def]
     return turned
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def search(cylinder, half, R, p, view, first_step, steps, resting):  # type: ignore[no-untyped-def]
     """Moves and turns a pose to a greater value, in steps that are halved; a resting one turns about the vertical only."""
     step, reach, rays, best = first_step, half.max(), 0, 0.0

@@ -1,4 +1,4 @@
-"""Geometry of convex pieces: how deep two objects penetrate, which objects touch."""
+"""Geometry of convex pieces: how deep two objects penetrate, which objects touch; and of motions."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import Pose, SceneObject
 
 PENETRATION_ALLOWED = 0.001
 """m; a scene whose objects penetrate deeper is refused. Settled objects rest within about 0.01 mm of each other."""
@@ -96,3 +96,9 @@ def touching_groups(objects: Sequence[SceneObject], margin: float) -> list[list[
         if np.maximum(lower_a - upper_b, lower_b - upper_a).max() <= margin:
             neighbours.add_edge(i, j)
     return [[objects[i] for i in sorted(group)] for group in nx.connected_components(neighbours)]
+
+
+def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
+    """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
+    R = X_TA_new.rotation @ X_TA.rotation.T
+    return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))

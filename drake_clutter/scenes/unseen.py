@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
+from scipy.ndimage import label, minimum_filter
 from trimesh.bounds import oriented_bounds_2D
 
 from drake_clutter.scenes.scene import SceneObject
@@ -18,6 +18,8 @@ _NEAR_KNOWN = 0.008
 """m, from a known object; what is seen there is taken for its surface."""
 _FEWEST = 12
 """Of the pixels looked at, for something that nobody has told the name of; fewer are noise at edges."""
+_BESIDE = 25
+"""Pixels; what is seen so near to the arm, or to the rim, may be a shadow of it that a depth camera cannot see into."""
 _HIGHEST = 0.98
 """Quantile of the heights of what is seen of something nameless: single pixels beyond are noise."""
 _EVERY = 2
@@ -65,9 +67,9 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
 
 def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> list[UnseenBlock]:
     camera = observation.camera
-    z, floor = observation.depth[::_EVERY, ::_EVERY], empty[::_EVERY, ::_EVERY]
+    z, floor = observation.depth[::_EVERY, ::_EVERY], minimum_filter(empty, _BESIDE)[::_EVERY, ::_EVERY]
     row, column = (_EVERY * index for index in np.indices(z.shape))
-    measured = np.isfinite(z) & (z > 0)
+    measured = np.isfinite(z) & (z > 0) & np.isfinite(floor)  # where nothing can be measured, a detector may have filled holes
     z = np.where(measured, z, floor)
     x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
     y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length

@@ -21,6 +21,7 @@ from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
@@ -221,9 +222,11 @@ class ClosedLoop:
             return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), decision)
         after = replace(before, objects=self._objects(root))
         picked = nearest(before.objects, plan.X_TO_pick).name
+        # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
+        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
-        outcome = judged(before, after, picked, plan.X_TO_place, came_off, self._world.settle)
-        error = float(np.linalg.norm((after[picked].X_TO.p - plan.X_TO_place.p)[:2]))
+        outcome = judged(before, after, picked, X_TO_place, came_off, self._world.settle)
+        error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"
         # The simulation goes on from where things are in it.

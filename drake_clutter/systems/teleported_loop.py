@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
 from drake_clutter.arm.arm_executor import nearest
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
+from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
@@ -58,9 +57,3 @@ def explore_images(
         state = state.placed(X_TO)
         report(task.note(move, replace(outcome, released=X_TO), decision))
     return task, agent.looked(state, seen())[0].known
-
-
-def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
-    """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
-    R = X_TA_new.rotation @ X_TA.rotation.T
-    return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
