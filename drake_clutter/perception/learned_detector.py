@@ -13,6 +13,7 @@ from drake_clutter.config import CameraConfig
 from drake_clutter.learning.checkpoint import Checkpoint
 from drake_clutter.perception.explaining import Explanation, chosen, explanation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
+from drake_clutter.perception.pose_score import FLOOR_SLACK
 from drake_clutter.perception.segmentation import (
     Segment,
     SegmentationNetwork,
@@ -23,12 +24,15 @@ from drake_clutter.perception.segmentation import (
     segments,
     without_holes,
 )
+from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.seams import Detection, Observation
 
 LEAST_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""
 SURE_SCORE, CLAIMED = 0.6, 0.7
 """A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
+RIM_SLACK = 0.02
+"""m, by which what is recognised may reach past the rim; the arm does, and it is no object."""
 SIDE_BY_SIDE = 2
 """Segments that are fitted at the same time; always so many, so that the number of cores changes no result."""
 FLOOR_WITHIN = 0.008
@@ -94,10 +98,15 @@ class LearnedDetector:
             classes = [self._classes[segment.name] for segment in next_ones]
             poses = self._workers.map(lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), next_ones, classes)
             for object_class, pose in zip(classes, poses, strict=True):
-                if pose is None or pose.score < LEAST_SCORE:
+                if pose is None or pose.score < LEAST_SCORE or not self._on_tray(object_class, pose.X_TO):
                     continue
                 fitted.append((object_class, pose))
                 explained.append(explanation(object_class, pose.X_TO, depth, self._camera))
                 if pose.score >= SURE_SCORE:
                     claimed[explained[-1].window] |= explained[-1].seen
         return fitted, explained
+
+    def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
+        """Whether an object can be there: within the rim, and not below the floor."""
+        corners = X_TO.apply(object_class.corners)
+        return bool(np.abs(corners[:, :2]).max() < self._tray_side / 2 + RIM_SLACK and corners[:, 2].min() > -2 * FLOOR_SLACK)

@@ -17,6 +17,10 @@ WITHIN = 0.006
 """m along the optical axis, within which what is seen agrees with a pose."""
 _PRIOR = 0.001
 """What a centre 1 cm away from the guess costs a score: little, it decides only what the image leaves open."""
+_BELOW = 20.0
+"""What 1 m below the floor costs a score: 5 cm, the whole of it."""
+FLOOR_SLACK = 0.006
+"""m, by which a pose may reach below the floor: as much as depth may be wrong."""
 COARSE_RAYS, FINE_RAYS = 350, 1500
 _LONG_STEP = 0.0015
 """m; a step that is at least so long is judged by few rays."""
@@ -145,9 +149,14 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
 
 @njit(cache=True, nogil=True)
 def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
-    """The score, less what the distance to the guess costs."""
+    """The score, less what the distance to the guess costs, and what reaching below the tray's floor does."""
     off = p - view.p_TO_guess
-    return share_explained(cylinder, half, R, p, view, rays, within) - _PRIOR * (off * off).sum() / 1e-4
+    if cylinder:
+        lowest = p[2] - half[2] * abs(R[2, 2]) - half[0] * math.sqrt(max(0.0, 1.0 - R[2, 2] * R[2, 2]))
+    else:
+        lowest = p[2] - half[0] * abs(R[2, 0]) - half[1] * abs(R[2, 1]) - half[2] * abs(R[2, 2])
+    cost = _PRIOR * (off * off).sum() / 1e-4 + _BELOW * max(0.0, -lowest - FLOOR_SLACK)
+    return share_explained(cylinder, half, R, p, view, rays, within) - cost
 
 
 @njit(cache=True)
