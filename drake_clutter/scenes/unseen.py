@@ -14,6 +14,8 @@ from drake_clutter.scenes.seams import Observation
 
 _FLAT = 0.012
 """m; nothing lies hidden under less, and what is no higher above the tray is noise."""
+_GAP = 0.003
+"""m, between an object and its shadow: where faces just touch, Drake's distances fail by rounding."""
 _NEAR_KNOWN = 0.008
 """m, from a known object; what is seen there is taken for its surface."""
 _FEWEST = 12
@@ -61,7 +63,7 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
         empty: (height, width) m, the depth that the camera shows of the cell with nothing on the tray, the arm at home.
     """
     lower = [float(o.bounds_T[0][2]) for o in known]
-    shadows = [UnseenBlock.under(o.corners_T, z) for o, z in zip(known, lower, strict=True) if z > _FLAT]
+    shadows = [UnseenBlock.under(o.corners_T, z - _GAP) for o, z in zip(known, lower, strict=True) if z > _FLAT]
     return (*shadows, *_nameless(known, observation, empty))
 
 
