@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 _MOST_POINTS = 400
 _RESTING_WITHIN = math.radians(3.0)
 _GOOD = 0.5
+_HOPELESS = 0.15
+"""Of 1,000 segments of an early network, those whose best candidate was worth less took half the time; 2 in 100 came to 0.3."""
 _GUESS_WITHIN = 0.05
 """m, of the guess to the true centre; pixels of the mask that are too far away are strays."""
 _REFINED, _WORSE = 2, 0.15
@@ -119,10 +121,10 @@ class PoseFitter:
             R, p, value = candidates(cylinder, half, points, edges, view, slack)
             if len(value) and value[0] > _GOOD:
                 break
+        if not len(value) or value[0] < _HOPELESS:
+            return None
         chosen = self._distinct(object_class, R, p, value)
         found = [self._refined(object_class, cylinder, half, R[k], p[k], points, view) for k in chosen]
-        if not found:
-            return None
         _, R_TO, p_TO = max(found, key=lambda one: one[0])
         score = float(share_explained(cylinder, half, R_TO, p_TO, view, FINE_RAYS, WITHIN))
         return FittedPose(Pose.of(R_TO, p_TO), score) if score > 0 else None
