@@ -3,6 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,6 +42,18 @@ LEAST_SHARE = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
 
 
+class _Candidate(NamedTuple):
+    object_class: ObjectClass
+    fitted: FittedPose
+    explains: Explanation
+
+
+def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Candidate]:
+    """Those that together explain an image best."""
+    numbers = chosen([c.explains for c in candidates], [c.fitted.score for c in candidates], shape, LEAST_SHARE)
+    return [candidates[k] for k in numbers]
+
+
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour."""
 
@@ -69,25 +82,21 @@ class LearnedDetector:
             logits, votes = network(torch.from_numpy(given)[None].to(memory_format=torch.channels_last))
             kind = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf).argmax(dim=0).numpy()
         votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
-        fitted, explained = self._fitted(segments(kind, votes_T, self._radii, network.classes, window, depth.shape), depth)
+        poses = self._fitted(segments(kind, votes_T, self._radii, network.classes, window, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
         clean = without_holes(np.where(depth > 0, depth, np.nan))
         clean[np.abs(clean - self._camera.altitude) < FLOOR_WITHIN] = self._camera.altitude
-        for k in chosen(explained, [pose.score for _, pose in fitted], depth.shape, LEAST_SHARE):
-            object_class, pose = fitted[k]
-            counted[object_class.name] += 1
-            mask = np.zeros(depth.shape, bool)
-            mask[explained[k].window] = explained[k].seen
-            clean[mask] = explained[k].away[explained[k].seen]
-            found.append(Detection(f"{object_class.name}_{counted[object_class.name]}", object_class, pose.X_TO, mask))
+        for candidate in _best(poses, depth.shape):
+            name, e, mask = candidate.object_class.name, candidate.explains, np.zeros(depth.shape, bool)
+            counted[name] += 1
+            mask[e.window] = e.seen
+            clean[mask] = e.away[e.seen]
+            found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask))
         return Observation(clean, tuple(found), self._camera, self._tray_side)
 
-    def _fitted(
-        self, found: Sequence[Segment], depth: NDArray[np.float32]
-    ) -> tuple[list[tuple[ObjectClass, FittedPose]], list[Explanation]]:
-        """Poses of segments, the largest first, and what each explains; what a sure pose has explained already is left out."""
-        fitted, explained = list[tuple[ObjectClass, FittedPose]](), list[Explanation]()
-        claimed = np.zeros(depth.shape, bool)
+    def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+        """Poses of segments, the largest first; what a sure pose has explained already is left out."""
+        fitted, claimed = list[_Candidate](), np.zeros(depth.shape, bool)
         left = deque(sorted(found, key=lambda segment: -np.count_nonzero(segment.mask)))
         while left:
             next_ones = list[Segment]()
@@ -100,11 +109,11 @@ class LearnedDetector:
             for object_class, pose in zip(classes, poses, strict=True):
                 if pose is None or pose.score < LEAST_SCORE or not self._on_tray(object_class, pose.X_TO):
                     continue
-                fitted.append((object_class, pose))
-                explained.append(explanation(object_class, pose.X_TO, depth, self._camera))
+                explains = explanation(object_class, pose.X_TO, depth, self._camera)
+                fitted.append(_Candidate(object_class, pose, explains))
                 if pose.score >= SURE_SCORE:
-                    claimed[explained[-1].window] |= explained[-1].seen
-        return fitted, explained
+                    claimed[explains.window] |= explains.seen
+        return fitted
 
     def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
         """Whether an object can be there: within the rim, and not below the floor."""
