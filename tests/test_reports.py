@@ -15,6 +15,7 @@ from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, TILE, write_contact_sheet
+from drake_clutter.reports.detections_picture import detections_picture
 from drake_clutter.reports.diagram_picture import connections, draw_diagram
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.reports.pictures import Mark, Marks, humanised
@@ -22,7 +23,7 @@ from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, w
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.tasks.exploration import ExplorationTask, Step
+from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step
 
 GELATIN = resting("gelatin_box", xy=(-0.15, 0.1), name="gelatin_box_1")
 SCENE = scene_of(
@@ -177,6 +178,19 @@ def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert "Nothing is hidden." in text
     assert "No move was made." in text
+
+
+def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
+    (step,) = task.steps
+    seen = task.first_look.observation
+    shown = replace(step, decision=Decision(step.move, observation=seen))
+    write_episode_page(tmp_path, "Seen", task.start, task.first_look, [shown], {})
+    picture = np.asarray(Image.open(tmp_path / "images/move_01_seen.png"))
+    assert picture.shape == (720, 720, 3)
+    assert "recognised in it: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()
+    unseen = detections_picture(replace(seen, detections=()))
+    assert (picture != unseen).any(axis=2).mean() > 0.01, "outlines and labels"
+    assert (unseen[:40, :40] == unseen[0, 0]).all(), "the tray's floor"
 
 
 @pytest.mark.parametrize(("count", "columns", "rows"), [(1, 2, 1), (7, 4, 2), (48, 8, 6)])

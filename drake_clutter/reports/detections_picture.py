@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from drake_clutter.reports.drawing import Canvas, Label, middle
+from drake_clutter.reports.pictures import humanised
 from drake_clutter.scenes.seams import Observation
 
 SIDE = 720
@@ -36,6 +37,6 @@ def detections_picture(observation: Observation) -> NDArray[np.uint8]:
         canvas.outline(mask, (0, 0), _INK, 4)
         ys, xs = np.nonzero(mask)
         about = (float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max()))
-        labels.append(Label(detection.object_class.name.replace("_", " "), middle(mask), about, _INK, 34))
+        labels.append(Label(humanised(detection.object_class.name), middle(mask), about, _INK, 34))
     canvas.labels(labels)
     return np.asarray(canvas.image.resize((SIDE, SIDE), Image.Resampling.LANCZOS))
