@@ -66,8 +66,8 @@ def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
 
 
 def demo(seed: int, nodes: int, out: Path, report: Report) -> dict[str, Any]:
-    """SG* makes scenes, and the arm searches them with the student, until everything is found in one; see `write`."""
-    scenario, index = Scenario(nodes=nodes, seed=seed), -1
+    """SG* makes scenes, and the arm searches them by depth images alone, until everything is found in one; see `write`."""
+    scenario, index = Scenario(nodes=nodes, seed=seed, perception="depth"), -1
     for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
         scene, index = scene_of(scenario, index + 1)
         task, timing = play(scenario, scene, report)
