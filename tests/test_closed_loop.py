@@ -27,7 +27,7 @@ from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scenario import Scenario, policy_of
-from drake_clutter.tasks.exploration import Decision, EpisodeEnd
+from drake_clutter.tasks.exploration import Decision, EpisodeEnd, legal_moves
 from drake_clutter.tasks.exploration_graph import seen
 
 COVERED = scene_of(
@@ -213,3 +213,20 @@ def test_a_random_explorer_plays(config: ClutterConfig) -> None:
     task, timing = play(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
     assert len(task.steps) == 1
     assert timing.robot > 0
+
+
+def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:
+    """No cup holds the marker, the gelatin box carries it, and on neither there is room for the can."""
+    given = list[Sequence[Move]]()
+
+    def choose(known: Sequence[SceneObject], _: Observation, tried: Any, rng: Any, failed: Sequence[Move]) -> Decision:
+        given.append(failed)
+        return Decision(None)
+
+    box = resting("gelatin_box", xy=(-0.1, 0.0))
+    marker, can = resting("large_marker", xy=(-0.1, 0.0), floor=box.top), resting("tomato_soup_can", xy=(0.2, 0.2))
+    loop = ClosedLoop(scene_of(box, marker, can), choose, max_moves=3, seed=0, world=config)
+    observation = loop.task.first_look.observation
+    assert loop.agent.decided(AgentState(), observation).finish is Finish.NOTHING_FEASIBLE
+    allowed = set(legal_moves(observation)) - set(given[0])
+    assert allowed == {Move(can.name)}

@@ -179,6 +179,7 @@ class Vacuum:
         station: whose cup.
         wanted: says, of the root context, whether the vacuum is to be on.
         held: the name of the object that hangs on the cup, or "".
+        taken: the name of the one that did since the vacuum was last switched on, or "".
         sealed: whether one did since the vacuum was last switched on; dropped: when it came off by its load since then, s.
         largest_share: of what the cup can bear, since then.
         slip: m, between cup and object from when it was taken to when it was let go.
@@ -187,6 +188,7 @@ class Vacuum:
     station: ClutterStation
     wanted: Callable[[Context], bool]
     held: str = ""
+    taken: str = ""
     sealed: bool = False
     dropped: float = math.nan
     largest_share: float = 0.0
@@ -205,6 +207,7 @@ class Vacuum:
         wanted = self.wanted(root)
         if wanted and not self._on:
             self.sealed, self.dropped, self.largest_share, self.slip, self._overloaded = False, math.nan, 0.0, math.nan, 0
+            self.taken = ""
         self._on = wanted
         if wanted and not self.held and math.isnan(self.dropped):
             self._take(context)
@@ -234,7 +237,7 @@ class Vacuum:
         uneven = unevenness(station.classes[first], grasps[first], suction.cup_diameter)
         if below[first] <= SUCKED_FROM and uneven <= suction.unevenness:
             station.hold.attach(context, station.scene.bodies[first])
-            self.held, self.sealed, self._X_OG = first, True, grasps[first]
+            self.held, self.taken, self.sealed, self._X_OG = first, first, True, grasps[first]
 
     def _release(self, context: Context) -> None:
         self.slip = float(np.linalg.norm(self._grasp(context, self.held)[:3, 3] - self._X_OG[:3, 3]))

@@ -96,6 +96,10 @@ class PickPlacePlanner:
         """Whether the cup seals somewhere on top of an object and can carry it."""
         return not isinstance(self._grasps(scene_object), NoPlan)
 
+    def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
+        """Whether the cup can hold an object, and none of the others rests on it: without that, no plan is worth asking for."""
+        return not rests_on(scene_object, objects) and self.holds(scene_object)
+
     def _grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
         """Where the cup seals on top and can hold, the nearest to its middle first."""
         suction = self.config.suction

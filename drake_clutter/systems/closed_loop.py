@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from drake_clutter.systems.exploration_agent import AgentState, Choose, Explorat
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception
 from drake_clutter.systems.tracking import tracked
-from drake_clutter.tasks.exploration import ExplorationTask, Step
+from drake_clutter.tasks.exploration import ExplorationTask, Step, legal_moves
 
 LATENCY = 1.15
 """s, from an image to the plan: 0.15 for perception, 1 for planning."""
@@ -111,10 +111,15 @@ class ClosedLoop:
         sees: Perceive = perceive or LabelPerception(scene, self.station, world)
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
         self._tracks = perceive is not None
-        self.agent = ExplorationAgent.AddToBuilder(
-            builder, choose=choose, track=tracked if self._tracks else None, max_moves=max_moves, seed=seed
-        )
         self._ways = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, camera.altitude)
+        self.agent = ExplorationAgent.AddToBuilder(
+            builder,
+            choose=choose,
+            track=tracked if self._tracks else None,
+            max_moves=max_moves,
+            seed=seed,
+            hopeless=self._hopeless,
+        )
         self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed, latency=LATENCY)
         self.executor = PickPlaceExecutor.AddToBuilder(builder, config=self._arm)
         for source, target, ports in (
@@ -149,6 +154,16 @@ class ClosedLoop:
     def _suction(self, root: Context) -> bool:
         context = self.executor.GetMyContextFromRoot(root)
         return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
+
+    def _hopeless(self, known: Sequence[SceneObject], observation: Observation) -> list[Move]:
+        """Moves of what no cup holds or what carries something, and those for which there is no free place."""
+        pickable, config = {o.name for o in known if self._ways.can_pick(o, known)}, self._world.exploration
+        some = np.random.default_rng(0)  # it decides where, not whether
+        return [
+            move
+            for move in legal_moves(observation)
+            if move.pick not in pickable or choose_placement(observation, move, config, some) is None
+        ]
 
     def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
@@ -221,7 +236,9 @@ class ClosedLoop:
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
             return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), decision)
         after = replace(before, objects=self._objects(root))
-        picked = nearest(before.objects, plan.X_TO_pick).name
+        # What hung on the cup, which may not be what the agent took it for.
+        picked = self.vacuum.taken or nearest(before.objects, plan.X_TO_pick).name
+        move, decision = replace(move, pick=picked), replace(decision, move=replace(move, pick=picked))
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
         X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -25,6 +26,10 @@ Track = Callable[[Sequence[SceneObject], Observation], Tracked]
 """From K_t and an image whose detections' names mean nothing, see `tracked`."""
 Choose = Callable[[Sequence[SceneObject], Observation, Sequence[Move], np.random.Generator, Sequence[Move]], Decision]
 """From K_t, what is in view, the moves so far, chance, and the moves that failed since anything last changed."""
+
+
+Hopeless = Callable[[Sequence[SceneObject], Observation], Sequence[Move]]
+"""From K_t and what is in view, the moves that are not worth trying."""
 
 
 class Phase(Enum):
@@ -123,7 +128,16 @@ class ExplorationAgent(LeafSystem):
     Output ports: request, abstract, the latest `Request` or None; state, abstract, the `AgentState`.
     """
 
-    def __init__(self, *, choose: Choose, track: Track | None, max_moves: int, seed: int, rest: float = 0.5) -> None:
+    def __init__(
+        self,
+        *,
+        choose: Choose,
+        track: Track | None,
+        max_moves: int,
+        seed: int,
+        hopeless: Hopeless | None = None,
+        rest: float = 0.5,
+    ) -> None:
         """Begins an episode.
 
         Args:
@@ -131,10 +145,12 @@ class ExplorationAgent(LeafSystem):
             track: what gives detections names that last; None: they have them.
             max_moves: after which it ends; a move that could not be carried out counts as one.
             seed: of its chances.
+            hopeless: what is not worth trying; None: everything is.
             rest: s, that it waits for things to come to rest before it looks.
         """
         super().__init__()
         self._choose, self._track, self._max_moves, self._seed, self._rest = choose, track, max_moves, seed, rest
+        self._hopeless = hopeless
         self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(None))
         self._answer = self.DeclareAbstractInputPort("answer", AbstractValue.Make(Answer()))
         self._finished = self.DeclareVectorInputPort("finished", 1)
@@ -146,10 +162,11 @@ class ExplorationAgent(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, *, choose: Choose, track: Track | None, max_moves: int, seed: int
+        builder: DiagramBuilder, *, choose: Choose, track: Track | None, max_moves: int, seed: int, hopeless: Hopeless
     ) -> "ExplorationAgent":
         """Adds one."""
-        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, track=track, max_moves=max_moves, seed=seed))
+        options: dict[str, Any] = {"max_moves": max_moves, "seed": seed, "hopeless": hopeless}
+        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, track=track, **options))
         system.set_name("exploration_agent")
         return system
 
@@ -190,7 +207,8 @@ class ExplorationAgent(LeafSystem):
         number = len(now.tried) + 1
         if number > self._max_moves:
             return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)
-        decision = self._choose(now.known, observation, now.tried, item_rng(self._seed, number), now.failed)
+        failed = (*now.failed, *(self._hopeless(now.known, observation) if self._hopeless else ()))
+        decision = self._choose(now.known, observation, now.tried, item_rng(self._seed, number), failed)
         if decision.move is None:
             return replace(now, phase=Phase.DONE, finish=Finish.NOTHING_FEASIBLE)
         return replace(now, phase=Phase.WAITING, request=Request(number, decision.move, observation, now.known, decision))
