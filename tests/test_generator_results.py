@@ -19,6 +19,9 @@ def test_a_table_of_one_row(results: ModuleType, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(results, "TABLE", [results.Row("random", 9, 5)])
     monkeypatch.setattr(results, "TRADE", [])
     out = tmp_path / "table.json"
+    results.main(tmp_path / "scenes", seed=3, out=out, at_most=3)
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["count"] == row["row"]["count"] == 3
     results.main(tmp_path / "scenes", seed=3, out=out)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["row"] == {"agent": "random", "nodes": 9, "count": 5, "objects": "ycb7", "temperature": None}
