@@ -18,7 +18,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.seams import Observation
-from drake_clutter.scenes.unseen import UnseenBlock, unseen_blocks
+from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
 
 CAMERA = CameraConfig()
 EMPTY = LabelDetector(CAMERA).look(scene_of()).observation.depth
@@ -66,6 +66,12 @@ def test_noise_is_nothing() -> None:
     noisy[100, 100] = 1.0  # a single wrong pixel
     noisy[200:210, 150:160] = 0.0  # not measured
     assert unseen_blocks([LOWER], replace(observation, depth=noisy), EMPTY) == ()
+
+
+def test_what_something_unknown_may_lie_on() -> None:
+    beside = resting("sugar_box", Orientation.FLAT_0, xy=(0.2, 0.2))
+    assert under_nameless([LOWER, beside], seen([LOWER, beside, UPPER]), EMPTY) == {LOWER.name}
+    assert not under_nameless([LOWER, UPPER], seen([LOWER, UPPER]), EMPTY)
 
 
 def highest(plan: Plan) -> float:

@@ -15,11 +15,13 @@ from drake_clutter.learning.checkpoint import Checkpoint
 from drake_clutter.perception.explaining import Explanation, chosen, explanation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
 from drake_clutter.perception.pose_score import FLOOR_SLACK
+from drake_clutter.perception.second_look import LEAST, Mask, doubtful, halves, possible, surfaces, unexplained
 from drake_clutter.perception.segmentation import (
     Segment,
     SegmentationNetwork,
     Window,
     coarse,
+    fine,
     network_input,
     points,
     segments,
@@ -54,6 +56,13 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
     return [candidates[k] for k in numbers]
 
 
+def _mask(explains: Explanation, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where in the image of a shape a pose is seen."""
+    mask = np.zeros(shape, bool)
+    mask[explains.window] = explains.seen
+    return mask
+
+
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour."""
 
@@ -80,21 +89,45 @@ class LearnedDetector:
         given = network_input(p_TP, color[window.rows, window.columns] if network.looks_at_color else None)
         with torch.inference_mode():
             logits, votes = network(torch.from_numpy(given)[None].to(memory_format=torch.channels_last))
-            kind = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf).argmax(dim=0).numpy()
+            logits = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf)
+            kind, chances = logits.argmax(dim=0).numpy(), torch.softmax(logits, dim=0)[1:].numpy()
         votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
-        poses = self._fitted(segments(kind, votes_T, self._radii, network.classes, window, depth.shape), depth)
+        poses = self._sure_first(segments(kind, votes_T, self._radii, network.classes, window, depth.shape, LEAST), depth)
+        surface = surfaces(coarse(p_TP)[..., 2])
+        for again in (1, 2):
+            best = _best(poses, depth.shape)
+            explained = [coarse(_mask(one.explains, depth.shape)[window.rows, window.columns]) for one in best]
+            masks = unexplained(surface, explained)
+            if again == 1:
+                masks += doubtful(surface, explained, [network.classes.index(o.object_class.name) for o in best], chances)
+            else:
+                masks = [half for mask in masks for half in halves(mask, votes_T)]
+            poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
         clean = without_holes(np.where(depth > 0, depth, np.nan))
         clean[np.abs(clean - self._camera.altitude) < FLOOR_WITHIN] = self._camera.altitude
         for candidate in _best(poses, depth.shape):
-            name, e, mask = candidate.object_class.name, candidate.explains, np.zeros(depth.shape, bool)
+            name, e = candidate.object_class.name, candidate.explains
+            mask = _mask(e, depth.shape)
             counted[name] += 1
-            mask[e.window] = e.seen
             clean[mask] = e.away[e.seen]
             found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask))
         return Observation(clean, tuple(found), self._camera, self._tray_side)
 
-    def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+    def _guessed(
+        self, masks: Sequence[Mask], chances: NDArray[np.float32], votes_T: NDArray[np.float32], shape: tuple[int, int]
+    ) -> list[Segment]:
+        """A segment for each class that may be in a mask of the network's answers."""
+        found = []
+        for mask in masks:
+            votes = votes_T[mask]
+            votes = votes[np.isfinite(votes).all(axis=1)]
+            if len(votes) >= LEAST:
+                whole, p_TO = fine(mask, self._window, shape), np.median(votes.astype(np.float64), axis=0)
+                found += [Segment(self._network.classes[k], whole, p_TO) for k in possible(mask, chances)]
+        return found
+
+    def _sure_first(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
         """Poses of segments, the largest first; what a sure pose has explained already is left out."""
         fitted, claimed = list[_Candidate](), np.zeros(depth.shape, bool)
         left = deque(sorted(found, key=lambda segment: -np.count_nonzero(segment.mask)))
@@ -104,16 +137,21 @@ class LearnedDetector:
                 segment = left.popleft()
                 if claimed[segment.mask].mean() <= CLAIMED:
                     next_ones.append(segment)
-            classes = [self._classes[segment.name] for segment in next_ones]
-            poses = self._workers.map(lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), next_ones, classes)
-            for object_class, pose in zip(classes, poses, strict=True):
-                if pose is None or pose.score < LEAST_SCORE or not self._on_tray(object_class, pose.X_TO):
-                    continue
-                explains = explanation(object_class, pose.X_TO, depth, self._camera)
-                fitted.append(_Candidate(object_class, pose, explains))
-                if pose.score >= SURE_SCORE:
-                    claimed[explains.window] |= explains.seen
+            for candidate in self._fitted(next_ones, depth):
+                fitted.append(candidate)
+                if candidate.fitted.score >= SURE_SCORE:
+                    claimed |= _mask(candidate.explains, depth.shape)
         return fitted
+
+    def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+        """The poses of segments that are good enough."""
+        classes = [self._classes[segment.name] for segment in found]
+        poses = self._workers.map(lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), found, classes)
+        return [
+            _Candidate(object_class, pose, explanation(object_class, pose.X_TO, depth, self._camera))
+            for object_class, pose in zip(classes, poses, strict=True)
+            if pose is not None and pose.score >= LEAST_SCORE and self._on_tray(object_class, pose.X_TO)
+        ]
 
     def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
         """Whether an object can be there: within the rim, and not below the floor."""

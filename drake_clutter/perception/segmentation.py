@@ -80,6 +80,13 @@ def coarse(array: NDArray[Element]) -> NDArray[Element]:
     return array[::COARSE, ::COARSE]
 
 
+def fine(mask: NDArray[np.bool_], window: Window, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask of the network's answers as one of the image, of a shape."""
+    found = np.zeros(shape, bool)
+    found[window.rows, window.columns] = mask.repeat(COARSE, axis=0).repeat(COARSE, axis=1)
+    return found
+
+
 def without_holes(image: NDArray[np.floating]) -> NDArray[np.floating]:
     """An image (height, width), where it is not finite the value of the nearest pixel that is."""
     holes = ~np.isfinite(image)
@@ -262,7 +269,7 @@ def segments(
     names: Sequence[str],
     window: Window,
     shape: tuple[int, int],
-    least: int = 8,
+    least: int,
 ) -> list[Segment]:
     """Objects from the network's answers.
 
@@ -285,7 +292,5 @@ def segments(
             mine = number == each
             small = np.zeros(kind.shape, bool)
             small[rows[mine], columns[mine]] = True
-            mask = np.zeros(shape, bool)
-            mask[window.rows, window.columns] = small.repeat(COARSE, axis=0).repeat(COARSE, axis=1)
-            found.append(Segment(name, mask, np.median(votes[mine], axis=0)))
+            found.append(Segment(name, fine(small, window, shape), np.median(votes[mine], axis=0)))
     return found

@@ -67,7 +67,36 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
     return (*shadows, *_nameless(known, observation, empty))
 
 
+def under_nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> frozenset[str]:
+    """The names of known objects right above which something is seen that belongs to none of them: it may lie on them.
+
+    Arguments: as of `unseen_blocks`.
+    """
+    p_TP, _ = _nameless_points(known, observation, empty)
+    found = set[str]()
+    for o in known:
+        p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
+        level = np.arange(3) != np.abs(o.X_TO.rotation[2]).argmax()
+        over = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2)[:, level].all(axis=1) & (p_TP[:, 2] > o.top + _FLAT)
+        if over.sum() >= _FEWEST:
+            found.add(o.name)
+    return frozenset(found)
+
+
 def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> list[UnseenBlock]:
+    p_TP, part = _nameless_points(known, observation, empty)
+    blocks = []
+    for k in np.unique(part):
+        mine = p_TP[part == k]
+        if len(mine) >= _FEWEST and np.ptp(mine[:, :2], axis=0).min() > 0:
+            blocks.append(UnseenBlock.under(mine, float(np.quantile(mine[:, 2], _HIGHEST))))
+    return blocks
+
+
+def _nameless_points(
+    known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """p_TP (N, 3) m of what is seen and belongs to nothing known, and (N,) the number of the patch of the image it is in."""
     camera = observation.camera
     z, floor = observation.depth[::_EVERY, ::_EVERY], minimum_filter(empty, _BESIDE)[::_EVERY, ::_EVERY]
     row, column = (_EVERY * index for index in np.indices(z.shape))
@@ -83,11 +112,5 @@ def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDA
         p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
         own = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2 + _NEAR_KNOWN).all(axis=1)
         left[where[0][own], where[1][own]] = False
-    parts, count = label(left)
-    blocks = []
-    for k in range(1, count + 1):
-        mine = parts == k
-        points_T = np.column_stack([x[mine], y[mine]])
-        if len(points_T) >= _FEWEST and np.ptp(points_T, axis=0).min() > 0:
-            blocks.append(UnseenBlock.under(points_T, float(np.quantile(height[mine], _HIGHEST))))
-    return blocks
+    part, _ = label(left)
+    return np.column_stack([x[left], y[left], height[left]]), part[left]

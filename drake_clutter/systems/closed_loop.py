@@ -25,7 +25,7 @@ from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
-from drake_clutter.scenes.unseen import unseen_blocks
+from drake_clutter.scenes.unseen import under_nameless, unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
 from drake_clutter.systems.move_planner import Answer, MovePlanner
@@ -156,14 +156,20 @@ class ClosedLoop:
         return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
 
     def _hopeless(self, known: Sequence[SceneObject], observation: Observation) -> list[Move]:
-        """Moves of what no cup holds or what carries something, and those for which there is no free place."""
+        """Moves of what no cup holds or what carries something, and those for which there is no free place.
+
+        Also those of what may carry something that was not recognised, as long as others are left.
+        """
         pickable, config = {o.name for o in known if self._ways.can_pick(o, known)}, self._world.exploration
         some = np.random.default_rng(0)  # it decides where, not whether
-        return [
+        free = [
             move
             for move in legal_moves(observation)
-            if move.pick not in pickable or choose_placement(observation, move, config, some) is None
+            if move.pick in pickable and choose_placement(observation, move, config, some) is not None
         ]
+        risky = under_nameless(known, observation, self._empty)
+        worth_trying = {move for move in free if move.pick not in risky} or set(free)
+        return [move for move in legal_moves(observation) if move not in worth_trying]
 
     def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)

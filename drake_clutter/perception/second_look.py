@@ -1,0 +1,106 @@
+"""Where to look again when a network's segments have been fitted: surfaces that no pose explains, and poses of a doubtful class.
+
+A network draws objects of the same class that lie side by side together, tears long ones apart, and takes the end of one box for
+that of another. Depth alone tells where a surface ends, so what it holds together is a better mask there.
+
+All masks are of the network's answers, (h, w): every second pixel each way.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, median_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Mask = NDArray[np.bool_]
+
+LEAST = 20
+"""Answers that make a segment."""
+_STEP = 0.008
+"""m; neighbours that differ more in height belong to different surfaces, and what is lower is the floor."""
+_BY_ALL, _BY_ONE = 0.95, 0.9
+"""Share of a surface that poses together, or one of them, must explain for it to be left alone."""
+_DOUBT = 0.2
+"""Mean chance of another class that makes a class doubtful."""
+_POSSIBLE, _MOST = 0.15, 3
+"""Mean chance with which a class is tried on a mask, and how many are."""
+_MARGIN = 5
+"""Answers by which the mask of a doubtful pose is widened: the right class may be larger."""
+
+
+def surfaces(height: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(h, w) the number of the surface that hangs together there; -1 for the floor and what is not measured.
+
+    Args:
+        height: (h, w) m over the tray's floor, NaN where it is not measured.
+    """
+    z = median_filter(np.nan_to_num(height, nan=-1.0), 3)
+    number = np.arange(z.size).reshape(z.shape)
+    ends = list[NDArray[np.int64]]()
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        joined = np.abs(z[a] - z[b]) < _STEP
+        ends.append(np.stack([number[a][joined], number[b][joined]]))
+    pairs = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), shape=(z.size, z.size))
+    _, found = connected_components(graph, directed=False)
+    return np.where(z > _STEP, found.reshape(z.shape), -1)
+
+
+def unexplained(surface: NDArray[np.int64], explained: Sequence[Mask]) -> list[Mask]:
+    """The surfaces that poses do not explain, given what each explains."""
+    size = np.bincount(surface[surface >= 0], minlength=1)
+    by_all = np.any([np.zeros(surface.shape, bool), *explained], axis=0)
+    found = []
+    for number in np.flatnonzero(size >= LEAST):
+        mine = surface == number
+        by_one = max((each[mine].mean() for each in explained), default=0.0)
+        if by_all[mine].mean() <= _BY_ALL and by_one <= _BY_ONE:
+            found.append(mine)
+    return found
+
+
+def doubtful(
+    surface: NDArray[np.int64], explained: Sequence[Mask], classes: Sequence[int], chances: NDArray[np.float32]
+) -> list[Mask]:
+    """Of what each pose explains, where its class is doubtful, all of the surface about it that no other explains.
+
+    Args:
+        surface: see `surfaces`.
+        explained: by each pose; classes: of each, numbers of `chances`.
+        chances: (classes, h, w) of each class.
+    """
+    found = []
+    for k, (mine, own) in enumerate(zip(explained, classes, strict=True)):
+        if mine.sum() < LEAST or np.delete(chances[:, mine].mean(axis=1), own).max() < _DOUBT:
+            continue
+        others = np.any([np.zeros_like(mine), *explained[:k], *explained[k + 1 :]], axis=0)
+        about = binary_dilation(mine, iterations=_MARGIN) & np.isin(surface, np.unique(surface[mine & (surface >= 0)]))
+        found.append(mine | about & ~others)
+    return found
+
+
+def halves(mask: Mask, votes_T: NDArray[np.float32]) -> list[Mask]:
+    """A mask cut in two in three ways: along and across it, and where the votes (h, w, 3) m for an object's middle part."""
+    places, votes = np.argwhere(mask).astype(float), np.nan_to_num(votes_T[mask]).astype(float)
+    places, votes = places - places.mean(axis=0), votes - votes.mean(axis=0)
+    axes = np.linalg.eigh(places.T @ places)[1]
+    along = [places @ axes[:, k] for k in range(2)]
+    cuts = [(value, (value.min() + value.max()) / 2) for value in along]
+    parted = votes @ np.linalg.eigh(votes.T @ votes)[1][:, -1]
+    cuts.append((parted, float(np.median(parted))))
+    found = []
+    for value, middle in cuts:
+        for side in (value < middle, value >= middle):
+            half = np.zeros_like(mask)
+            half[mask] = side
+            if side.sum() >= LEAST:
+                found.append(half)
+    return found
+
+
+def possible(mask: Mask, chances: NDArray[np.float32]) -> list[int]:
+    """The classes that may be in a mask, the likeliest first; see `doubtful`."""
+    mean = chances[:, mask].mean(axis=1)
+    return [int(k) for k in np.argsort(-mean)[:_MOST] if mean[k] > _POSSIBLE]

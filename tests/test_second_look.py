@@ -1,0 +1,75 @@
+"""Where a detector looks again."""
+
+import numpy as np
+
+from drake_clutter.perception.second_look import LEAST, doubtful, halves, possible, surfaces, unexplained
+
+SHAPE = (30, 40)
+LEFT, RIGHT = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
+LEFT[5:15, 4:14] = RIGHT[5:15, 14:24] = True
+
+
+def heights(left: float, right: float) -> np.ndarray:
+    height = np.zeros(SHAPE, np.float32)
+    height[LEFT], height[RIGHT] = left, right
+    return height
+
+
+def test_surfaces_end_at_steps_and_at_the_floor() -> None:
+    surface = surfaces(heights(0.05, 0.10))
+    assert surface[0, 0] == -1
+    left, right = surface[10, 8], surface[10, 20]
+    assert left != right
+    for mask, number in ((LEFT, left), (RIGHT, right)):
+        assert (surface[mask] == number).mean() > 0.95, "the median rounds corners"
+        assert (surface[~mask] == number).sum() <= 4
+    level = surfaces(heights(0.10, 0.10))
+    assert level[10, 8] == level[10, 20] >= 0
+    hole = heights(0.10, 0.10)
+    hole[8:11, 6:9] = np.nan
+    assert surfaces(hole)[9, 7] == -1, "what is not measured belongs to nothing"
+
+
+def test_a_surface_is_left_alone_when_a_pose_explains_it() -> None:
+    surface = surfaces(heights(0.05, 0.10))
+    (left,) = unexplained(surface, [RIGHT])
+    assert np.array_equal(left, surface == surface[10, 8])
+    assert unexplained(surface, [LEFT, RIGHT]) == []
+    assert len(unexplained(surface, [])) == 2
+    small = np.zeros(SHAPE, np.float32)
+    small[3:6, 3:6] = 0.1
+    assert small.astype(bool).sum() < LEAST
+    assert unexplained(surfaces(small), []) == []
+
+
+def test_a_doubtful_pose_is_widened_over_the_rest_of_its_surface() -> None:
+    surface = surfaces(heights(0.10, 0.10))
+    part = LEFT.copy()
+    part[:, 12:] = False
+    chances = np.zeros((2, *SHAPE), np.float32)
+    chances[0], chances[1] = 0.7, 0.3
+    (wider,) = doubtful(surface, [part], [0], chances)
+    assert wider[part].all()
+    assert wider[10, 12]
+    assert wider[10, 15]
+    assert not wider[0, 0]
+    of_two = doubtful(surface, [part, RIGHT], [0, 0], chances)
+    assert not (of_two[0] & RIGHT).any(), "not over what another pose explains"
+    chances[1] = 0.1
+    assert doubtful(surface, [part], [0], chances) == []
+
+
+def test_two_objects_side_by_side_are_among_the_halves() -> None:
+    both = LEFT | RIGHT
+    votes = np.zeros((*SHAPE, 3), np.float32)
+    votes[RIGHT, 0] = 0.05
+    found = halves(both, votes)
+    assert len(found) == 6
+    for one in (LEFT, RIGHT):
+        assert max((one & half).sum() / (one | half).sum() for half in found) > 0.9
+
+
+def test_the_likely_classes_come_first() -> None:
+    chances = np.zeros((4, *SHAPE), np.float32)
+    chances[:, LEFT] = np.array([0.2, 0.1, 0.5, 0.16])[:, None]
+    assert possible(LEFT, chances) == [2, 0, 3]
