@@ -116,6 +116,15 @@ def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
     assert bench.after(0.2).finish is Finish.OUT_OF_MOVES
 
 
+def test_what_the_cup_did_not_get_is_left_alone() -> None:
+    bench = Bench()
+    bench.after(0.1)
+    bench.give(BEFORE, Answer(1, a_plan()), 1)
+    state = bench.after(0.8)
+    assert (state.carried_out, state.failed) == (1, (Move("cracker_box"),)), "it is seen where it was"
+    assert state.finish is Finish.NOTHING_FEASIBLE
+
+
 def test_a_cloned_agent_goes_on_the_same() -> None:
     bench = Bench()
     bench.after(0.1)

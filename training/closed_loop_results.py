@@ -44,6 +44,8 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "closed_loop.json"
+FIRST = 10
+"""The first scene of a set that is played: those before it were looked at while the loop was debugged."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +236,8 @@ def main(
     for row in rows:
         if perception is not None and row.perception != "labels":
             row = replace(row, perception=perception)
-        asked = [Asked(row, k, folder / row.name / f"{k:04d}.json") for k in range(min(row.count, count or row.count))]
+        numbers = range(FIRST, FIRST + min(row.count, count or row.count))
+        asked = [Asked(row, k, folder / row.name / f"{k:04d}.json") for k in numbers]
         missing = [one for one in asked if not one.path.exists()]
         (folder / row.name).mkdir(parents=True, exist_ok=True)
         made = map_ordered(Player, missing, workers=workers)

@@ -1,4 +1,4 @@
-"""Writes docs/results.md, every number of it from the files in training/results and benchmarks/results, and the learning curves.
+"""Writes docs/results.md, every number of it from the files in training/results and benchmarks/results, and what they draw.
 
     python training/results_page.py
 
@@ -6,6 +6,7 @@ A table has the rows that have been measured so far; what is missing is not ther
 """
 
 import json
+import statistics
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +21,7 @@ from drake_clutter.files import told_in_one_line, write_text
 
 ROOT = Path(__file__).parents[1]
 RESULTS, CALIBRATION = ROOT / "training/results", ROOT / "benchmarks/results/calibration.json"
-PAGE, CURVES = ROOT / "docs/results.md", ROOT / "docs/images/learning_curves.png"
+PAGE, IMAGES = ROOT / "docs/results.md", ROOT / "docs/images"
 PAPER_GENERATORS = {
     ("random", "ycb7"): {10: (1.13, 0.84), 15: (1.64, 0.64), 20: (2.18, 0.55), 25: (2.51, 0.41)},
     ("sg", "ycb7"): {10: (2.12, 0.99), 15: (2.41, 0.99), 20: (2.46, 0.93), 25: (3.01, 0.81)},
@@ -62,7 +63,8 @@ def generator_row(row: dict[str, Any], source: str) -> list[str]:
     hidden, stable = PAPER_GENERATORS.get((row["agent"], row["objects"]), {}).get(row["nodes"], (None, None))
     if row.get("temperature") is not None:
         hidden = stable = None
-    name = row["agent"] if row.get("temperature") is None else f"{row['agent']} at {row['temperature']:g}"
+    agent = Path(row["agent"]).stem
+    name = agent if row.get("temperature") is None else f"{agent} at {row['temperature']:g}"
     told = [name, row["objects"], str(row["nodes"]), str(row["count"])]
     told += [with_interval(row, "stability_rate", "stability_ci95"), number(stable)]
     told += [with_interval(row, "hidden_mean", "hidden_ci95", 1), number(hidden)]
@@ -86,26 +88,55 @@ def generators() -> str:
             told.append(generator_row(row, "`calibration.json`"))
     head = ["agent", "objects", "nodes", "scenes", "stable", "paper", "hidden", "paper", "solvable", "distinct", "stacks"]
     head += ["balanced", "class bits", "fast judge wrong", "from"]
-    seeds = []
-    for path in sorted(RESULTS.glob("sg_star_seed_*.json")):
+    trainings = []
+    for path in [*sorted(RESULTS.glob("sg_star_seed_*.json")), RESULTS / "sg_star_paper.json"]:
         held = json.loads(path.read_text())
         last = held["history"][-1]
         figures = [number(last[name], digits) for name, digits in (("stable", 3), ("hidden", 1), ("stacks", 2), ("balanced", 2))]
         rate = last["step"] / last["seconds"]
-        seeds.append([path.stem.rsplit("_", 1)[1], str(last["step"]), number(held["minutes"], 0), number(rate, 0), *figures])
+        name = path.stem.removeprefix("sg_star_").replace("_", " ")
+        trainings.append([name, str(last["step"]), number(held["minutes"], 0), number(rate, 0), *figures])
     return f"""## Table I: scenes that hide things
 
 Drake settles and sees every scene. Hidden and solvable are of the stable ones; intervals are 95 %. *Balanced*: no stack holds
 more than 60 % of the objects. *Fast judge wrong*: of the scenes that it calls stable, the share that falls in Drake.
 `python training/generator_results.py runs/table1`
 
+`sg_star_paper` is SG* with the paper's reward alone, `sg_star_seed_1` and `_2` are other seeds of SG*; all are sampled at 0.28.
+{spread(rows)}
 {table(head, told)}
-The training of SG*, by seed; figures of 256 scenes by the fast judge at the training's temperature, 0.25, where what is too high
-or does not come apart counts as unstable, too. Seed 0 is the shipped one, sampled at 0.28.
+![How high stacks are, and of what](images/stacks.png)
+![The first scenes of each agent, 25 nodes](images/generators.png)
 
-{table(["seed", "steps", "minutes", "steps/s", "stable", "hidden", "stacks", "balanced"], seeds)}
+What temperature trades:
+
+![What is hidden, and how varied scenes are, over the temperature](images/trade_off.png)
+
+The trainings of SG*; figures of 256 scenes by the fast judge at the training's temperature, 0.25, where what is too high
+or does not come apart counts as unstable, too (for the paper's reward: what is too high alone). Seed 0 is the shipped one.
+
+{table(["training", "steps", "minutes", "steps/s", "stable", "hidden", "stacks", "balanced"], trainings)}
 ![Learning curves of SG*](images/learning_curves.png)
 """
+
+
+def of_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of Table I that are of SG* as it was trained with one seed or another, at 25 nodes."""
+    at_25 = [row for row in rows if row["nodes"] == 25 and row["temperature"] is None]
+    return [row for row in at_25 if row["agent"] == "sg-star" or Path(row["agent"]).stem.startswith("sg_star_seed_")]
+
+
+def spread(rows: Sequence[dict[str, Any]]) -> str:
+    """A sentence on the seeds of SG*, once there are several."""
+    seeds = of_seeds(rows)
+    if len(seeds) < 2:
+        return ""
+    told = []
+    for key, name, digits in (("stability_rate", "stable", 3), ("hidden_mean", "hidden", 2), ("balanced_share", "balanced", 2)):
+        values = [row[key] for row in seeds]
+        middle, deviation = statistics.mean(values), statistics.stdev(values)
+        told.append(f"{name} {middle:.{digits}f}, standard deviation {deviation:.{digits}f}")
+    return f"Over {len(seeds)} seeds of SG*, 25 nodes: {'; '.join(told)}.\n"
 
 
 def explorers() -> str:
@@ -209,11 +240,35 @@ def draw_curves(path: Path) -> None:
     plt.close(figure)
 
 
+def draw_stacks(path: Path) -> None:
+    """How high the stacks of each agent are, and of what classes its scenes are, at 25 nodes."""
+    rows = [row for row in read("table1.json")["rows"] if row["nodes"] == 25 and row["objects"] == "ycb7"]
+    rows = [row for row in rows if row["temperature"] is None and "/" not in row["agent"]]
+    plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
+    figure, (left, right) = plt.subplots(1, 2, figsize=(18, 6.5), layout="constrained")
+    for k, row in enumerate(rows):
+        share = [count / sum(row["stack_heights_5cm"]) for count in row["stack_heights_5cm"]]
+        left.stairs(share, range(0, 5 * len(share) + 1, 5), label=row["agent"], linewidth=3)
+        places = [n + (k - (len(rows) - 1) / 2) * 0.8 / len(rows) for n in range(len(row["classes"]))]
+        shares = [count / sum(row["classes"].values()) for count in row["classes"].values()]
+        right.bar(places, shares, 0.8 / len(rows), label=row["agent"])
+    left.set(xlabel="height of a stack, cm", ylabel="share of the stacks")
+    left.legend()
+    names = [name.replace("_", "\n") for name in rows[0]["classes"]]
+    right.set_xticks(range(len(names)), names)
+    right.set_ylabel("share of the objects")
+    for panel in (left, right):
+        panel.grid(alpha=0.4, axis="y")
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
 def main(out: Annotated[Path, typer.Option(help="Page to write.")] = PAGE) -> None:
-    """Writes the page and the curves."""
+    """Writes the page and its pictures."""
     write_text(out, page())
     if out == PAGE:
-        draw_curves(CURVES)
+        draw_curves(IMAGES / "learning_curves.png")
+        draw_stacks(IMAGES / "stacks.png")
 
 
 if __name__ == "__main__":

@@ -16,9 +16,11 @@ from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.systems.move_planner import Answer
 from drake_clutter.systems.tracking import Tracked
-from drake_clutter.tasks.exploration import Decision
+from drake_clutter.tasks.exploration import Decision, legal_moves
 from drake_clutter.tasks.exploration_graph import seen
 
+STUCK_WITHIN = 0.01
+"""m; an object that was to be moved and is seen so near to where it was has not been moved."""
 PERIOD = 0.05
 """s, between two looks at what the others are doing."""
 
@@ -86,7 +88,7 @@ class AgentState:
         known: K_t, each object as it was last seen.
         lost: names of those of them that are not in view any more, and not where they were.
         tried: all moves; failed: those that could not be carried out since anything last changed.
-        request: the latest; carried_out: how many moves were.
+        request: the latest; carried_out: how many moves were; acted: whether the latest was, and nobody has looked since.
         finish: why it ended.
     """
 
@@ -98,6 +100,7 @@ class AgentState:
     failed: tuple[Move, ...] = ()
     request: Request | None = None
     carried_out: int = 0
+    acted: bool = False
     finish: Finish | None = None
 
     def __deepcopy__(self, memo: object) -> "AgentState":
@@ -116,8 +119,18 @@ class AgentState:
         assert self.request is not None
         move = self.request.move
         known = tuple(replace(o, X_TO=X_TO) if o.name == move.pick else o for o in self.known)
-        over = replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), failed=(), known=known)
-        return replace(over, carried_out=self.carried_out + 1)
+        over = replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), known=known)
+        return replace(over, carried_out=self.carried_out + 1, acted=True)
+
+    @property
+    def stuck(self) -> str | None:
+        """The object that was to be moved, if it is seen where it was: the cup did not get it."""
+        assert self.request is not None
+        pick = self.request.move.pick
+        before, now = (next((o for o in known if o.name == pick), None) for known in (self.request.known, self.known))
+        if before is None or now is None or np.linalg.norm(before.X_TO.p - now.X_TO.p) > STUCK_WITHIN:
+            return None
+        return pick
 
 
 class ExplorationAgent(LeafSystem):
@@ -204,6 +217,9 @@ class ExplorationAgent(LeafSystem):
     def decided(self, now: AgentState, observation: Observation) -> AgentState:
         """After a look: with a request for a move, or done."""
         now, observation = self.looked(now, observation)
+        if now.acted:
+            again = [move for move in legal_moves(observation) if move.pick == now.stuck]
+            now = replace(now, acted=False, failed=(*now.failed, *again) if again else ())
         number = len(now.tried) + 1
         if number > self._max_moves:
             return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)
