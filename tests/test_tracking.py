@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from conftest import resting, scene_of
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import CameraConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 from drake_clutter.systems.tracking import recognised, tracked
@@ -76,3 +79,36 @@ def test_what_was_taken_for_something_else_is_lost() -> None:
     claimed = np.zeros(seen.depth.shape, bool)
     claimed[200:280, 280:360] = True
     assert tracked([box], replace(seen, detections=(replace(can, mask=claimed),))).lost == ("sugar_box_1",)
+
+
+def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
+    """Two boxes, what is seen of them, and what is seen if they are taken for two that lie across them."""
+    apart = CLASSES["sugar_box"].size[1] / 2 + 0.001
+    first = [resting("sugar_box", Orientation.FLAT_0, (0.0, y), name=f"sugar_box_{k}") for k, y in ((1, -apart), (2, apart))]
+    seen = LabelDetector(CAMERA).look(scene_of(*first)).observation
+    both = np.any([d.mask for d in seen.detections], axis=0)
+    west = both & (np.arange(both.shape[1]) < np.nonzero(both)[1].mean())
+    across = [resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=f"seen {x}") for x in (-apart, apart)]
+    masks = (west, both & ~west)
+    wrong = tuple(Detection(o.name, o.object_class, o.X_TO, mask) for o, mask in zip(across, masks, strict=True))
+    return first, seen, replace(seen, detections=wrong)
+
+
+def test_what_is_known_stands_until_something_explains_more() -> None:
+    known, _, across = side_by_side()
+    observation, lost = tracked(known, across)
+    assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
+    assert lost == ()
+    (whole,) = across.detections[:1]
+    larger = replace(whole, mask=np.any([d.mask for d in across.detections], axis=0), object_class=CLASSES["cracker_box"])
+    observation, lost = tracked(known[:1], replace(across, detections=(larger,)))
+    assert [d.object_class.name for d in observation.detections] == ["cracker_box"]
+    assert lost == ("sugar_box_1",)
+
+
+def test_what_was_missed_once_but_looks_the_same_is_still_in_view() -> None:
+    known, seen, _ = side_by_side()
+    observation, _ = tracked(known, replace(seen, detections=seen.detections[:1]))
+    assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
+    second = next(d for d in observation.detections if d.name == "sugar_box_2")
+    assert (second.mask & seen.detections[1].mask).sum() > 0.9 * seen.detections[1].mask.sum()

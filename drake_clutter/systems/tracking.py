@@ -18,6 +18,11 @@ SEEN_PAST = 0.3
 TAKEN = 0.5
 """Of the pixels in which it seems to be in view, the share that is recognised as something else if it never was there."""
 
+NO_BETTER = 0.9
+"""Of the pixels of a detection, the share in known objects that were not recognised, if it explains nothing that they do not."""
+STILL = 0.97
+"""Of the pixels that speak for or against a known object, the share that speaks for it if it is still where it was."""
+
 
 class Tracked(NamedTuple):
     """An image, told in the names of what is known.
@@ -41,6 +46,7 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
         known: K_t, each object where it was seen last, or where a move was to put it.
         observation: whose detections' names mean nothing.
     """
+    observation = _steadied(known, observation)
     named: dict[str, Detection] = {}
     lost = list[str]()
     classes = [o.object_class for o in known] + [d.object_class for d in observation.detections]
@@ -61,6 +67,37 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
                 named[f"{object_class.name}_{number}"] = detection
     detections = tuple(replace(detection, name=name) for name, detection in named.items())
     return Tracked(replace(observation, detections=detections), tuple(lost))
+
+
+def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observation:
+    """An image with the known objects that are still where they were, also those that were not recognised in it.
+
+    A detector in doubt may say one thing now and another then: two boxes side by side may be two that lie across them. What is
+    known stands as long as the depth is as it should be there, and no detection explains more of it.
+    """
+    recognised_now, familiar = set[str](), set[str]()
+    for object_class in {o.object_class for o in known}:
+        of_class = [o for o in known if o.object_class is object_class]
+        seen = [d for d in observation.detections if d.object_class is object_class]
+        for k, d in _matched(of_class, seen, NEAR).items():
+            recognised_now.add(of_class[k].name)
+            familiar.add(seen[d].name)
+    shape = observation.depth.shape
+    still = dict[str, Detection]()
+    for o in known:
+        if o.name in recognised_now:
+            continue
+        e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
+        count = np.count_nonzero(e.seen)
+        if count >= observation.camera.hidden_below * e.alone and count >= STILL * (count + e.past) and count > 0:
+            mask = np.zeros(shape, bool)
+            mask[e.window] = e.seen
+            still[o.name] = Detection(o.name, o.object_class, o.X_TO, mask)
+    explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
+    kept = [d for d in observation.detections if d.name in familiar or not d.mask.any() or explained[d.mask].mean() < NO_BETTER]
+    taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
+    steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
+    return replace(observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady)))
 
 
 def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> tuple[str, ...]:
