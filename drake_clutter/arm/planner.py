@@ -18,6 +18,7 @@ from drake_clutter.arm.paths import Payload
 from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.suction import EPICK_MASS, greatest_acceleration, unevenness
+from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
 
@@ -148,16 +149,3 @@ class PickPlacePlanner:
     def reach(self, X_TG: Floats) -> Floats:
         """(..., 8, 6) rad, see `branches`."""
         return branches(self._X_BT @ X_TG @ self._X_GF)
-
-
-def rests_on(picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004) -> tuple[str, ...]:
-    """The names of the objects that stand or lean on the picked one: they touch it and reach over it."""
-    found = []
-    for other in objects:
-        if other is picked:
-            continue
-        (lower, upper), (other_lower, other_upper) = picked.bounds_T, other.bounds_T
-        overlap = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
-        if overlap.min() > margin and abs(other_lower[2] - upper[2]) < margin:
-            found.append(other.name)
-    return tuple(found)

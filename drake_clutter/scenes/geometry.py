@@ -1,4 +1,4 @@
-"""Geometry of convex pieces: how deep two objects penetrate, which objects touch; and of motions."""
+"""Geometry of convex pieces: how deep two objects penetrate, which touch, which rest on one; and of motions."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -102,3 +102,16 @@ def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
     """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
     R = X_TA_new.rotation @ X_TA.rotation.T
     return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
+
+
+def rests_on(picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004) -> tuple[str, ...]:
+    """The names of the objects that stand or lean on the picked one: they touch it and reach over it."""
+    found = []
+    for other in objects:
+        if other is picked:
+            continue
+        (lower, upper), (other_lower, other_upper) = picked.bounds_T, other.bounds_T
+        overlap = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
+        if overlap.min() > margin and abs(other_lower[2] - upper[2]) < margin:
+            found.append(other.name)
+    return tuple(found)

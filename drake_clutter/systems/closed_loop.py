@@ -25,13 +25,13 @@ from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
-from drake_clutter.scenes.unseen import under_nameless, unseen_blocks
+from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
-from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request
+from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request, hopeless
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception
 from drake_clutter.systems.tracking import tracked
-from drake_clutter.tasks.exploration import ExplorationTask, Step, legal_moves
+from drake_clutter.tasks.exploration import ExplorationTask, Step
 
 LATENCY = 1.15
 """s, from an image to the plan: 0.15 for perception, 1 for planning."""
@@ -156,20 +156,9 @@ class ClosedLoop:
         return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
 
     def _hopeless(self, known: Sequence[SceneObject], observation: Observation) -> list[Move]:
-        """Moves of what no cup holds or what carries something, and those for which there is no free place.
-
-        Also those of what may carry something that was not recognised, as long as others are left.
-        """
-        pickable, config = {o.name for o in known if self._ways.can_pick(o, known)}, self._world.exploration
-        some = np.random.default_rng(0)  # it decides where, not whether
-        free = [
-            move
-            for move in legal_moves(observation)
-            if move.pick in pickable and choose_placement(observation, move, config, some) is not None
-        ]
-        risky = under_nameless(known, observation, self._empty)
-        worth_trying = {move for move in free if move.pick not in risky} or set(free)
-        return [move for move in legal_moves(observation) if move not in worth_trying]
+        """Moves of what no cup holds, and those that are not worth trying with any hand."""
+        able = {o.name for o in known if self._ways.can_pick(o, known)}
+        return hopeless(known, observation, able, self._empty, self._world.exploration)
 
     def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)

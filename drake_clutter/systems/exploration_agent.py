@@ -1,19 +1,23 @@
 """The exploring agent in the loop: it looks, chooses a move, waits until that is done or refused, and looks again."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
 from drake_clutter.arm.arm_executor import nearest
 from drake_clutter.arm.plan import NoPlan, Plan
+from drake_clutter.config import ExplorationConfig
 from drake_clutter.runner import item_rng
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.scenes.unseen import under_nameless
 from drake_clutter.systems.move_planner import Answer
 from drake_clutter.systems.tracking import Tracked
 from drake_clutter.tasks.exploration import Decision, legal_moves
@@ -32,6 +36,34 @@ Choose = Callable[[Sequence[SceneObject], Observation, Sequence[Move], np.random
 
 Hopeless = Callable[[Sequence[SceneObject], Observation], Sequence[Move]]
 """From K_t and what is in view, the moves that are not worth trying."""
+
+
+def hopeless(
+    known: Sequence[SceneObject],
+    observation: Observation,
+    pickable: Collection[str],
+    empty: NDArray[np.float32],
+    config: ExplorationConfig,
+) -> list[Move]:
+    """Moves of what cannot be picked, and those for which there is no free place.
+
+    Also those of what may carry something that was not recognised, as long as others are left.
+
+    Args:
+        known: K_t; observation: what is in view.
+        pickable: names of what is known to carry nothing, and can be held.
+        empty: (height, width) m, see `under_nameless`.
+        config: of the task.
+    """
+    some = np.random.default_rng(0)  # it decides where, not whether
+    free = [
+        move
+        for move in legal_moves(observation)
+        if move.pick in pickable and choose_placement(observation, move, config, some) is not None
+    ]
+    risky = under_nameless(known, observation, empty)
+    worth_trying = {move for move in free if move.pick not in risky} or set(free)
+    return [move for move in legal_moves(observation) if move not in worth_trying]
 
 
 class Phase(Enum):

@@ -1,19 +1,20 @@
 """The loop without an arm: a detector sees rendered images, what the agent picks appears at its place, and Drake settles it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from drake_clutter.arm.arm_executor import nearest
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
-from drake_clutter.scenes.geometry import carried
+from drake_clutter.scenes.geometry import carried, rests_on
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.seams import MoveResult, Observation, Outcome
+from drake_clutter.scenes.seams import Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase
+from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, hopeless
 from drake_clutter.systems.scene_perception import Perceive
 from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
@@ -35,7 +36,14 @@ def explore_images(
     """
     executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.camera)
     task = ExplorationTask(scene, executor, LabelDetector(world.camera), world.exploration, max_moves)
-    agent, state = ExplorationAgent(choose=choose, track=tracked, max_moves=max_moves, seed=seed), AgentState()
+    empty = camera.render(replace(scene, objects=())).depth
+
+    def not_worth_trying(known: Sequence[SceneObject], observation: Observation) -> list[Move]:
+        free = {o.name for o in known if not rests_on(o, known)}
+        return hopeless(known, observation, free, empty, world.exploration)
+
+    options: dict[str, Any] = {"max_moves": max_moves, "seed": seed, "hopeless": not_worth_trying}
+    agent, state = ExplorationAgent(choose=choose, track=tracked, **options), AgentState()
 
     def seen() -> Observation:
         images = camera.render(task.scene)
