@@ -26,6 +26,8 @@ _PAST = 0.25
 """Of the pixels that speak for or against a pose, the share that the camera may see past it."""
 _FEWEST = 25
 """Pixels of its own."""
+_EACH = 200
+"""Pixels that another object must explain for more objects to be the better explanation of an image."""
 
 
 @dataclass(frozen=True)
@@ -95,31 +97,46 @@ def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32
 def chosen(explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], least_share: float) -> list[int]:
     """The numbers of those that are taken for objects, the surest first.
 
+    Greedily, and again with each of those that were left out as the first; of all these, what explains most with fewest.
+
     Args:
         explanations: of poses.
         scores: 0 to 1, how well each fits the segment that it was fitted to: a pixel of a pose that does counts for more.
         shape: of the image.
         least_share: of the pixels that an object would cover alone, that must be seen.
     """
+    plausible = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
+    found, most = _greedy(explanations, scores, shape, plausible, None)
+    for first in set(plausible) - set(found):
+        other, explained = _greedy(explanations, scores, shape, plausible, first)
+        if explained > most:
+            found, most = other, explained
+    return found
+
+
+def _greedy(
+    explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], left: Sequence[int], first: int | None
+) -> tuple[list[int], int]:
+    """Of those that are left, one after the other; and what they explain: pixels, less those where the camera sees past them."""
     claimed = np.zeros(shape, bool)
-    left = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
-    found = list[int]()
+    found, explained = list[int](), 0
     # What a pose has to itself only becomes less: the first whose number is still right is the best.
     own = dict.fromkeys(left, math.inf)
     while own:
-        best = max(own, key=lambda k: (own[k], -k))
+        best = first if first in own else max(own, key=lambda k: (own[k], -k))
         e = explanations[best]
         mine = int(np.count_nonzero(e.seen & ~claimed[e.window])) - e.past
         if mine < max(_FEWEST, _OWN * np.count_nonzero(e.seen)):
             del own[best]
             continue
-        if scores[best] * mine < own[best]:
+        if best != first and scores[best] * mine < own[best]:
             own[best] = scores[best] * mine
             continue
         del own[best]
         claimed[e.window] |= e.seen
         found.append(best)
-    return found
+        explained += mine - _EACH
+    return found, explained
 
 
 def _plausible(e: Explanation, least_share: float) -> bool:

@@ -99,7 +99,8 @@ class LearnedDetector:
             explained = [coarse(_mask(one.explains, depth.shape)[window.rows, window.columns]) for one in best]
             masks = unexplained(surface, explained)
             if again == 1:
-                masks += doubtful(surface, explained, [network.classes.index(o.object_class.name) for o in best], chances)
+                classes = [network.classes.index(one.object_class.name) for one in best]
+                masks += doubtful(surface, explained, classes, chances)
             else:
                 masks = [half for mask in masks for half in halves(mask, votes_T)]
             poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)

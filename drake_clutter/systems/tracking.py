@@ -20,6 +20,8 @@ TAKEN = 0.5
 
 NO_BETTER = 0.9
 """Of the pixels of a detection, the share in known objects that were not recognised, if it explains nothing that they do not."""
+MORE = 1.1
+"""What a known object explains, over what a detection does that takes most of its pixels from it, if that is no better."""
 STILL = 0.97
 """Of the pixels that speak for or against a known object, the share that speaks for it if it is still where it was."""
 
@@ -94,7 +96,13 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
             mask[e.window] = e.seen
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, mask)
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
-    kept = [d for d in observation.detections if d.name in familiar or not d.mask.any() or explained[d.mask].mean() < NO_BETTER]
+
+    def no_better(detection: Detection) -> bool:
+        size = np.count_nonzero(detection.mask)
+        within = (np.count_nonzero(d.mask & detection.mask) for d in still.values() if np.count_nonzero(d.mask) > MORE * size)
+        return bool(size) and (explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within))
+
+    kept = [d for d in observation.detections if d.name in familiar or not no_better(d)]
     taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
     steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
     return replace(observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady)))
