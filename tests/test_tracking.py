@@ -112,3 +112,12 @@ def test_what_was_missed_once_but_looks_the_same_is_still_in_view() -> None:
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
     second = next(d for d in observation.detections if d.name == "sugar_box_2")
     assert (second.mask & seen.detections[1].mask).sum() > 0.9 * seen.detections[1].mask.sum()
+
+
+def test_what_is_in_the_place_of_something_seen_is_lost() -> None:
+    known, seen, _ = side_by_side()
+    ghost = resting("gelatin_box", xy=known[0].X_TO.translation[:2], name="gelatin_box_1")
+    hidden = resting("gelatin_box", xy=(0.25, 0.25), name="gelatin_box_2")
+    observation, lost = tracked([*known, ghost, hidden], replace(seen, depth=np.where(seen.depth > 0, np.float32(1.0), 0)))
+    assert len(observation.detections) == 2
+    assert lost == ("gelatin_box_1",)

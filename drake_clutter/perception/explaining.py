@@ -5,7 +5,7 @@ fits all of it. Both explain what another pose explains better: poses are taken 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,7 +94,13 @@ def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32
     return Explanation(bounds[0], bounds[2], said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
 
 
-def chosen(explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], least_share: float) -> list[int]:
+def chosen(
+    explanations: Sequence[Explanation],
+    scores: Sequence[float],
+    shape: tuple[int, int],
+    least_share: float,
+    clash: Callable[[int, int], bool] = lambda a, b: False,
+) -> list[int]:
     """The numbers of those that are taken for objects, the surest first.
 
     Greedily, and again with each of those that were left out as the first; of all these, what explains most with fewest.
@@ -104,18 +110,24 @@ def chosen(explanations: Sequence[Explanation], scores: Sequence[float], shape: 
         scores: 0 to 1, how well each fits the segment that it was fitted to: a pixel of a pose that does counts for more.
         shape: of the image.
         least_share: of the pixels that an object would cover alone, that must be seen.
+        clash: whether two, by their numbers, cannot both be there.
     """
     plausible = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
-    found, most = _greedy(explanations, scores, shape, plausible, None)
+    found, most = _greedy(explanations, scores, shape, plausible, clash, None)
     for first in set(plausible) - set(found):
-        other, explained = _greedy(explanations, scores, shape, plausible, first)
+        other, explained = _greedy(explanations, scores, shape, plausible, clash, first)
         if explained > most:
             found, most = other, explained
     return found
 
 
 def _greedy(
-    explanations: Sequence[Explanation], scores: Sequence[float], shape: tuple[int, int], left: Sequence[int], first: int | None
+    explanations: Sequence[Explanation],
+    scores: Sequence[float],
+    shape: tuple[int, int],
+    left: Sequence[int],
+    clash: Callable[[int, int], bool],
+    first: int | None,
 ) -> tuple[list[int], int]:
     """Of those that are left, one after the other; and what they explain: pixels, less those where the camera sees past them."""
     claimed = np.zeros(shape, bool)
@@ -133,6 +145,8 @@ def _greedy(
             own[best] = scores[best] * mine
             continue
         del own[best]
+        if any(clash(best, other) for other in found):
+            continue
         claimed[e.window] |= e.seen
         found.append(best)
         explained += mine - _EACH

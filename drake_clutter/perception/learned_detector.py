@@ -3,6 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ from drake_clutter.perception.segmentation import (
     segments,
     without_holes,
 )
-from drake_clutter.scenes.scene import Pose
+from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 
 LEAST_SCORE = 0.3
@@ -40,6 +42,8 @@ SIDE_BY_SIDE = 2
 """Segments that are fitted at the same time; always so many, so that the number of cores changes no result."""
 FLOOR_WITHIN = 0.008
 """m, of the floor; what is measured there is the floor: nothing that lies on it is so flat."""
+IN_EACH_OTHER = 0.010
+"""m; what penetrates deeper is not there together."""
 LEAST_SHARE = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
 
@@ -51,8 +55,14 @@ class _Candidate(NamedTuple):
 
 
 def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Candidate]:
-    """Those that together explain an image best."""
-    numbers = chosen([c.explains for c in candidates], [c.fitted.score for c in candidates], shape, LEAST_SHARE)
+    """Those that together explain an image best, and of which no two are in the same place."""
+    objects = [SceneObject(str(k), c.object_class, c.fitted.X_TO) for k, c in enumerate(candidates)]
+
+    @cache
+    def clash(a: int, b: int) -> bool:
+        return penetration(objects[a], objects[b]) > IN_EACH_OTHER
+
+    numbers = chosen([c.explains for c in candidates], [c.fitted.score for c in candidates], shape, LEAST_SHARE, clash)
     return [candidates[k] for k in numbers]
 
 

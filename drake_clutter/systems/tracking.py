@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.perception.explaining import explanation
+from drake_clutter.scenes.geometry import penetration
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import Detection, Observation
 
@@ -22,6 +23,8 @@ NO_BETTER = 0.9
 """Of the pixels of a detection, the share in known objects that were not recognised, if it explains nothing that they do not."""
 MORE = 1.1
 """What a known object explains, over what a detection does that takes most of its pixels from it, if that is no better."""
+IN_EACH_OTHER = 0.015
+"""m; what is known but out of view, and is deeper in something that is seen, cannot be there."""
 STILL = 0.97
 """Of the pixels that speak for or against a known object, the share that speaks for it if it is still where it was."""
 
@@ -68,6 +71,9 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
                 number += 1
                 named[f"{object_class.name}_{number}"] = detection
     detections = tuple(replace(detection, name=name) for name, detection in named.items())
+    there = [SceneObject(d.name, d.object_class, d.X_TO) for d in detections]
+    unseen = (o for o in known if o.name not in named and o.name not in lost)
+    lost += [o.name for o in unseen if any(penetration(o, other) > IN_EACH_OTHER for other in there)]
     return Tracked(replace(observation, detections=detections), tuple(lost))
 
 
