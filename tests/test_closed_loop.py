@@ -125,6 +125,18 @@ def test_what_the_cup_did_not_get_is_left_alone() -> None:
     assert state.finish is Finish.NOTHING_FEASIBLE
 
 
+def test_nothing_is_said_of_what_is_lost() -> None:
+    given = list[Sequence[Move]]()
+
+    def choose(known: Any, observation: Any, tried: Any, rng: Any, failed: Sequence[Move]) -> Decision:
+        given.append(failed)
+        return Decision(None)
+
+    agent = ExplorationAgent(choose=choose, track=None, max_moves=3, seed=0)
+    agent.decided(AgentState(failed=(Move("lost"), Move("cracker_box", "lost"), Move("cracker_box"))), BEFORE)
+    assert given == [(Move("cracker_box"),)]
+
+
 def test_a_cloned_agent_goes_on_the_same() -> None:
     bench = Bench()
     bench.after(0.1)

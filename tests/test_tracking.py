@@ -39,6 +39,14 @@ def test_what_is_new_gets_a_name_of_its_own() -> None:
     assert names([at(0, 0, f"{CAN}_1")], image(at(0.01, 0), at(0.2, 0))) == {f"{CAN}_1": (0.01, 0), f"{CAN}_2": (0.2, 0)}
 
 
+def test_the_names_of_what_was_lost_are_given_again_but_never_twice() -> None:
+    assert names([at(0, 0, f"{CAN}_2")], image(at(0, 0), at(0.2, 0), at(0.2, 0.2))) == {
+        f"{CAN}_1": (0.2, 0),
+        f"{CAN}_2": (0, 0),
+        f"{CAN}_3": (0.2, 0.2),
+    }
+
+
 def test_two_of_a_class_are_not_exchanged() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.03, 0, f"{CAN}_2")]
     assert names(known, image(at(0.035, 0), at(0.012, 0))) == {f"{CAN}_1": (0.012, 0), f"{CAN}_2": (0.035, 0)}

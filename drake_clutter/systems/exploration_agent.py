@@ -255,7 +255,9 @@ class ExplorationAgent(LeafSystem):
         number = len(now.tried) + 1
         if number > self._max_moves:
             return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)
-        failed = (*now.failed, *(self._hopeless(now.known, observation) if self._hopeless else ()))
+        names = {TRAY, *(o.name for o in now.known)}  # of what is lost nothing more is said
+        still_failed = (move for move in now.failed if {move.pick, move.place} <= names)
+        failed = (*still_failed, *(self._hopeless(now.known, observation) if self._hopeless else ()))
         decision = self._choose(now.known, observation, now.tried, item_rng(self._seed, number), failed)
         if decision.move is None:
             return replace(now, phase=Phase.DONE, finish=Finish.NOTHING_FEASIBLE)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -65,11 +66,9 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
         moved = _matched(left, unnamed, np.inf)
         named |= {left[k].name: unnamed[d] for k, d in moved.items()}
         lost += [o.name for k, o in enumerate(left) if k not in moved]
-        number = len(of_class)
-        for k, detection in enumerate(unnamed):
-            if k not in moved.values():
-                number += 1
-                named[f"{object_class.name}_{number}"] = detection
+        taken = {o.name for o in of_class}
+        free = (name for number in count(1) if (name := f"{object_class.name}_{number}") not in taken)
+        named |= {next(free): detection for k, detection in enumerate(unnamed) if k not in moved.values()}
     detections = tuple(replace(detection, name=name) for name, detection in named.items())
     there = [SceneObject(d.name, d.object_class, d.X_TO) for d in detections]
     unseen = (o for o in known if o.name not in named and o.name not in lost)
@@ -96,8 +95,8 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         if o.name in recognised_now:
             continue
         e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
-        count = np.count_nonzero(e.seen)
-        if count >= observation.camera.hidden_below * e.alone and count >= STILL * (count + e.past) and count > 0:
+        for_it = np.count_nonzero(e.seen)
+        if for_it >= max(1, observation.camera.hidden_below * e.alone) and for_it >= STILL * (for_it + e.past):
             mask = np.zeros(shape, bool)
             mask[e.window] = e.seen
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, mask)
