@@ -24,7 +24,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
-from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
+from drake_clutter.agents.exploration import CAREFUL, FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
@@ -37,9 +37,9 @@ from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
-AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "teacher", FULL_KNOWLEDGE)
+AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "careful-student", "teacher", FULL_KNOWLEDGE)
 SEVEN = ("sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "paper_hardness", "rg_25")
-FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
+FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", "careful-student-14", FULL_KNOWLEDGE)
 ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", agent) for agent in FOURTEEN]
 
 
@@ -65,6 +65,7 @@ def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, w
 
 def weights_of(agent: str) -> str:
     """The hash of a trained agent's weights; "" for the others."""
+    agent = agent.removeprefix(CAREFUL)
     if agent not in TRAINED and not agent.endswith(".safetensors"):
         return ""
     return hashlib.sha256((shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent)).read_bytes()).hexdigest()
@@ -188,7 +189,7 @@ def main(
         solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
         for agent in chosen:
             ceiling = found.get(FULL_KNOWLEDGE)
-            row = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
+            row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
             row |= row_of(found[agent], ceiling)
             part = [found[agent][k] for k in solvable]
             row["solvable"] = row_of(part, [ceiling[k] for k in solvable] if ceiling else None) if part else None
