@@ -44,7 +44,7 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "closed_loop.json"
-FIRST = 10
+FIRST = 60
 """The first scene of a set that is played: those before it were looked at while the loop was debugged."""
 
 

@@ -29,7 +29,7 @@ from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request, hopeless
 from drake_clutter.systems.move_planner import Answer, MovePlanner
-from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception
+from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception, for_who_sees
 from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
 
@@ -91,7 +91,8 @@ class ClosedLoop:
             seed: of all chances.
             world, arm: configs.
         """
-        self._arm, self._world, self._start = arm or ArmConfig(), world, scene
+        self._arm, self._start = arm or ArmConfig(), scene
+        self._world = world if perceive is None else for_who_sees(world)
         builder, camera, eye = DiagramBuilder(), world.camera, Intrinsics.of(world.camera)
         self.station: ClutterStation = builder.AddSystem(
             ClutterStation(

@@ -27,6 +27,16 @@ Detect = Callable[[NDArray[np.float32], NDArray[np.uint8]], Observation]
 """Depth and colour alone, as `LearnedDetector.detect`."""
 
 
+RELEASE_HEIGHT = 0.003
+"""m; what is seen of a support is a millimetre or two off, and an arm that goes on down pushes stacks over."""
+
+
+def for_who_sees(world: ClutterConfig) -> ClutterConfig:
+    """The world of an agent that knows its objects from images: it lets go a little higher."""
+    higher = max(world.exploration.release_height, RELEASE_HEIGHT)
+    return replace(world, exploration=replace(world.exploration, release_height=higher))
+
+
 class ScenePerception(LeafSystem):
     """Detects what is in view, whenever it is asked.
 

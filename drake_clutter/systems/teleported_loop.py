@@ -15,7 +15,7 @@ from drake_clutter.scenes.seams import Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, hopeless
-from drake_clutter.systems.scene_perception import Perceive
+from drake_clutter.systems.scene_perception import Perceive, for_who_sees
 from drake_clutter.systems.tracking import tracked
 from drake_clutter.tasks.exploration import ExplorationTask, Step
 
@@ -34,6 +34,7 @@ def explore_images(
 
     Arguments: as of `ClosedLoop`.
     """
+    world = for_who_sees(world)
     executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.camera)
     task = ExplorationTask(scene, executor, LabelDetector(world.camera), world.exploration, max_moves)
     empty = camera.render(replace(scene, objects=())).depth
