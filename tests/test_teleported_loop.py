@@ -73,6 +73,14 @@ def test_rows_of_the_results() -> None:
     held, refused = "what is left lies behind what no cup holds", "moves that the arm cannot plan"
     assert row["failed_of"] == {"collapsed": 1, refused: 1, held: 1, "exception": 1}
     assert json.dumps(row)
+    nothing = script.row_of(script.ROWS[0], episodes[-1:])
+    assert (nothing["success"], nothing["found"], nothing["robot_minutes"], nothing["failed_of"]) == (
+        0,
+        None,
+        None,
+        {"exception": 1},
+    )
+    script.table_of([row, nothing])
 
 
 def test_what_the_arm_can() -> None:

@@ -178,7 +178,7 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     told |= {"arm_can": len(able) / len(episodes), "success_of_arm_can": won_able / len(able) if able else None}
     told["success_of_arm_can_ci95"] = wilson_interval(won_able, len(able)) if able else None
-    told |= {"hidden": float(np.mean([e["hidden"] for e in played])), "found": float(np.mean([e["found"] for e in played]))}
+    told |= {key: float(np.mean([e[key] for e in played])) if played else None for key in ("hidden", "found")}
     told["found_ci95"] = mean_interval([e["found"] for e in played])
     told["found_of_hidden"] = sum(e["found"] for e in played) / max(1, sum(e["hidden"] for e in played))
     moves = [e["moves"] for e, success in zip(episodes, won, strict=True) if success]
@@ -188,8 +188,8 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     right = sum(e["recognised"] for e in lists)
     told["list_recall"] = right / max(1, sum(e["objects"] for e in lists))
     told["list_precision"] = right / max(1, sum(e["known"] for e in lists))
-    told["robot_minutes"] = float(np.median([e["robot"] for e in played])) / 60
-    told["wall_seconds"] = float(np.median([e["wall"] for e in played]))
+    told["robot_minutes"] = float(np.median([e["robot"] for e in played])) / 60 if played else None
+    told["wall_seconds"] = float(np.median([e["wall"] for e in episodes]))
     told["not_planned"] = dict(sum((Counter(e["not_planned"]) for e in played), Counter[str]()))
     told["dropped"] = sum(e["results"].get(MoveResult.DROPPED.value, 0) for e in played)
     told["failed_of"] = dict(Counter(stage(e) for e, success in zip(episodes, won, strict=True) if not success))
@@ -203,7 +203,8 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     )
     for row in rows:
         low, high = row["success_ci95"]
-        numbers = [row[key] for key in ("arm_can", "success_of_arm_can", "found_of_hidden", "moves_of_successes")]
+        figures = ("arm_can", "success_of_arm_can", "found_of_hidden", "moves_of_successes", "robot_minutes")
+        numbers = [row[key] for key in figures]
         cells = [
             row["scenes"],
             row["perception"],
@@ -212,7 +213,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
             f"{row['success']:.2f} ({low:.2f} to {high:.2f})",
         ]
         cells += ["" if number is None else f"{number:.2f}" for number in numbers]
-        table.add_row(*cells, f"{row['robot_minutes']:.1f}", f"{row['wall_seconds']:.0f}")
+        table.add_row(*cells, f"{row['wall_seconds']:.0f}")
     return table
 
 
