@@ -56,6 +56,14 @@ def test_onto_another_object(executor: SettleExecutor, detector: LabelDetector) 
         assert how_far(STACKS, after, name) < 0.001
 
 
+def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecutor) -> None:
+    """More than the margin within which objects are simulated together."""
+    start = STACKS["on the can"].X_TO
+    outcome = executor.put(STACKS, "on the can", start.moved((0.0, 0.0, 0.005)), rng(0))
+    assert outcome.result is MoveResult.PLACED
+    assert outcome.scene["on the can"].X_TO.p[2] == pytest.approx(start.p[2], abs=0.001)
+
+
 @pytest.mark.parametrize(("pick", "falls"), [("below", "above"), ("can", "on the can")])
 def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExecutor, detector: LabelDetector) -> None:
     observation = detector.look(STACKS).observation

@@ -8,7 +8,7 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene, jittered
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
 from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import Settled, settle
@@ -52,7 +52,7 @@ class SettleExecutor:
         groups = touching_groups(scene.objects, TOUCHING_MARGIN)
         touched = next(names for group in groups if pick in (names := {o.name for o in group}))
         settled = []
-        for group in touching_groups(moved.objects, TOUCHING_MARGIN):
+        for group in _groups(moved, released):
             if touched.isdisjoint(o.name for o in group):
                 continue
             settled.append(settle(group, scene.tray_side, settle_config, record=True))
@@ -67,6 +67,16 @@ class SettleExecutor:
                 return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), fall, whole.motion, released=released.X_TO)
         motion = _together(moved.poses, settled)
         return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, motion, released=released.X_TO)
+
+
+def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
+    """Objects that may touch each other: also what is let go and what it falls onto, however high above it that is."""
+    margin = TOUCHING_MARGIN
+    while True:
+        groups = touching_groups(scene.objects, margin)
+        if [released] not in groups or released.bounds_T[0][2] <= margin:
+            return groups
+        margin += TOUCHING_MARGIN
 
 
 def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:
