@@ -54,6 +54,12 @@ class Explanation:
         """Rows and columns of the image that `seen` is of."""
         return slice(self.top, self.top + self.seen.shape[0]), slice(self.left, self.left + self.seen.shape[1])
 
+    def mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Where in the whole image, of a shape, it is `seen`."""
+        found = np.zeros(shape, bool)
+        found[self.window] = self.seen
+        return found
+
 
 @njit(cache=True, error_model="numpy")
 def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ignore[no-untyped-def]
@@ -114,7 +120,7 @@ def chosen(
     """
     plausible = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
     found, most = _greedy(explanations, scores, shape, plausible, clash, None)
-    for first in set(plausible) - set(found):
+    for first in [k for k in plausible if k not in found]:
         other, explained = _greedy(explanations, scores, shape, plausible, clash, first)
         if explained > most:
             found, most = other, explained

@@ -66,13 +66,6 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
     return [candidates[k] for k in numbers]
 
 
-def _mask(explains: Explanation, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where in the image of a shape a pose is seen."""
-    mask = np.zeros(shape, bool)
-    mask[explains.window] = explains.seen
-    return mask
-
-
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour."""
 
@@ -106,7 +99,7 @@ class LearnedDetector:
         surface = surfaces(coarse(p_TP)[..., 2])
         for again in (1, 2):
             best = _best(poses, depth.shape)
-            explained = [coarse(_mask(one.explains, depth.shape)[window.rows, window.columns]) for one in best]
+            explained = [coarse(one.explains.mask(depth.shape)[window.rows, window.columns]) for one in best]
             masks = unexplained(surface, explained)
             if again == 1:
                 classes = [network.classes.index(one.object_class.name) for one in best]
@@ -119,7 +112,7 @@ class LearnedDetector:
         clean[np.abs(clean - self._camera.altitude) < FLOOR_WITHIN] = self._camera.altitude
         for candidate in _best(poses, depth.shape):
             name, e = candidate.object_class.name, candidate.explains
-            mask = _mask(e, depth.shape)
+            mask = e.mask(depth.shape)
             counted[name] += 1
             clean[mask] = e.away[e.seen]
             found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask))
@@ -151,7 +144,7 @@ class LearnedDetector:
             for candidate in self._fitted(next_ones, depth):
                 fitted.append(candidate)
                 if candidate.fitted.score >= SURE_SCORE:
-                    claimed |= _mask(candidate.explains, depth.shape)
+                    claimed |= candidate.explains.mask(depth.shape)
         return fitted
 
     def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:

@@ -97,9 +97,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
         for_it = np.count_nonzero(e.seen)
         if for_it >= max(1, observation.camera.hidden_below * e.alone) and for_it >= STILL * (for_it + e.past):
-            mask = np.zeros(shape, bool)
-            mask[e.window] = e.seen
-            still[o.name] = Detection(o.name, o.object_class, o.X_TO, mask)
+            still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
 
     def no_better(detection: Detection) -> bool:
