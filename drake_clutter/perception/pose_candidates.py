@@ -9,6 +9,8 @@ from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, worth
 
 FEWEST_POINTS = 12
 _COARSE_WITHIN = 0.015
+_FIRST_RAYS, _PROMISING = 60, 10
+"""By so few rays all candidates are told apart first; so many of them by `COARSE_RAYS`."""
 _ON_PLANE = 0.004
 _PLANE_TRIES = 120
 _SECOND_PLANE_SHARE = 0.1
@@ -204,7 +206,7 @@ def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no
 
 @njit(cache=True, nogil=True)
 def candidates(cylinder, half, points, edges, view, slack):  # type: ignore[no-untyped-def]
-    """Poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first."""
+    """The most promising poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first."""
     R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0
     guess, vertical = view.p_TO_guess, np.array([0.0, 0.0, 1.0])
     n, p, member = _plane(points, view.altitude)
@@ -250,8 +252,12 @@ def candidates(cylinder, half, points, edges, view, slack):  # type: ignore[no-u
                     break
                 axis = np.array([math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)])
                 count = _lying(half, fewer, axis, guess, slack, R, p_TO, count)
-    value = np.empty(count)
+    rough = np.empty(count)
     for k in range(count):
-        value[k] = worth(cylinder, half, R[k], p_TO[k], view, COARSE_RAYS, _COARSE_WITHIN)
-    order = np.argsort(-value)
-    return R[:count][order], p_TO[:count][order], value[order]
+        rough[k] = worth(cylinder, half, R[k], p_TO[k], view, _FIRST_RAYS, _COARSE_WITHIN)
+    best = np.argsort(-rough)[:_PROMISING]
+    value = np.empty(len(best))
+    for k in range(len(best)):
+        value[k] = worth(cylinder, half, R[best[k]], p_TO[best[k]], view, COARSE_RAYS, _COARSE_WITHIN)
+    order = best[np.argsort(-value)]
+    return R[order], p_TO[order], np.sort(value)[::-1]

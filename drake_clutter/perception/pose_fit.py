@@ -27,7 +27,7 @@ _GUESS_WITHIN = 0.05
 """m, of the guess to the true centre; pixels of the mask that are too far away are strays."""
 _REFINED, _WORSE = 2, 0.15
 """How many candidates are refined, if not that much worse than the best."""
-_FIRST_STEP, _STEPS = 0.004, 5
+_FIRST_STEP, _STEPS = 0.004, 4
 """m, and how often it is halved."""
 _MODEL_SPACING = 0.004
 _ICP_POINTS = 150

@@ -22,6 +22,8 @@ _STEP = 0.008
 """m; neighbours that differ more in height belong to different surfaces, and what is lower is the floor."""
 _BY_ALL, _BY_ONE = 0.95, 0.9
 """Share of a surface that poses together, or one of them, must explain for it to be left alone."""
+_WORTH_A_LOOK = 50
+"""Answers of a surface that no pose explains, fewer than which are left alone: with so little no object is believed."""
 _DOUBT = 0.2
 """Mean chance of another class that makes a class doubtful."""
 _POSSIBLE, _MOST = 0.15, 3
@@ -56,7 +58,8 @@ def unexplained(surface: NDArray[np.int64], explained: Sequence[Mask]) -> list[M
     for number in np.flatnonzero(size >= LEAST):
         mine = surface == number
         by_one = max((each[mine].mean() for each in explained), default=0.0)
-        if by_all[mine].mean() <= _BY_ALL and by_one <= _BY_ONE:
+        left = np.count_nonzero(mine & ~by_all)
+        if left >= max(_WORTH_A_LOOK, (1 - _BY_ALL) * size[number]) and by_one <= _BY_ONE:
             found.append(mine)
     return found
 
