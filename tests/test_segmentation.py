@@ -137,6 +137,17 @@ def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
     assert torch.equal(again(given)[1], votes)
 
 
+def test_a_warm_start_answers_as_what_it_begins_with_whatever_the_colours_and_other_classes_are() -> None:
+    learned = SegmentationNetwork(CLASSES, False).eval()
+    network = SegmentationNetwork(("mug", *reversed(CLASSES)), True).eval()
+    network.begin_with(learned)
+    given = torch.randn(2, 7, 64, 64)
+    (logits, votes), (expected, expected_votes) = network(given), learned(given[:, :4])
+    assert torch.allclose(logits[:, [0, 3, 2]], expected, atol=1e-5)
+    assert torch.allclose(votes, expected_votes, atol=1e-6)
+    assert not torch.allclose(logits[:, 1], expected[:, 1])
+
+
 def test_the_loss_leaves_out_what_is_not_known() -> None:
     kind = torch.tensor([[[1, 0], [2, 0]]])
     to_middle = torch.full((1, 3, 2, 2), torch.nan)

@@ -17,6 +17,7 @@ import typer
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import CameraConfig, LayoutConfig, load_typed
 from drake_clutter.files import told_in_one_line
+from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import SegmentationNetwork, Window
@@ -34,6 +35,7 @@ class TrainDetector:
         images: folder of `make_images.py`; held_out: of its last images are not learned from, but looked at as it goes.
         objects: name of the object set; catalogue: a folder with object classes of one's own, or "".
         looks_at_color: whether the network is given colour beside depth.
+        warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
         seed: same seed, same weights (on the same kind of machine).
         evaluate_every: steps.
         learning, camera, layout: see there.
@@ -44,6 +46,7 @@ class TrainDetector:
     objects: str = "pantry14"
     catalogue: str = ""
     looks_at_color: bool = False
+    warm_start: str = ""
     seed: int = 0
     evaluate_every: int = 250
     learning: SegmentationConfig = field(default_factory=SegmentationConfig)
@@ -67,6 +70,8 @@ def main(
     learned = len(images) - given.held_out
     torch.manual_seed(given.seed)
     network = SegmentationNetwork(classes, given.looks_at_color)
+    if given.warm_start:
+        network.begin_with(SegmentationNetwork.of(load_checkpoint(Path(given.warm_start))))
     learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, tray_side, given.seed, chosen)
     run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, tray_side)
 

@@ -158,6 +158,26 @@ class SegmentationNetwork(nn.Module):
             found = self.out(x).float()
         return found[:, :-3], found[:, -3:] * _VOTE_UNIT
 
+    def begin_with(self, learned: "SegmentationNetwork") -> None:
+        """Takes over what another has learned: answers as it does of the classes that both know, whatever the colours are."""
+        first = "into.1.0.weight"
+        kept = {name: value for name, value in learned.state_dict().items() if not name.startswith((first, "out."))}
+        self.load_state_dict(kept, strict=False)
+        mine, theirs = self.get_parameter(first), learned.get_parameter(first)  # channels of depth come first
+        both = min(mine.shape[1], theirs.shape[1])
+        rows, other_rows = self._rows(), learned._rows()
+        with torch.no_grad():
+            mine.zero_()
+            mine[:, :both] = theirs[:, :both]
+            for name in rows.keys() & other_rows.keys():
+                for own, others in zip(self.out.parameters(), learned.out.parameters(), strict=True):
+                    own[rows[name]] = others[other_rows[name]]
+
+    def _rows(self) -> dict[str | int, int]:
+        """Which of the last layer's answers is about what: no object, each class, and the votes' x, y, z."""
+        names: tuple[str | int, ...] = ("", *self.classes, 0, 1, 2)
+        return {name: row for row, name in enumerate(names)}
+
     @staticmethod
     def of(checkpoint: Checkpoint) -> "SegmentationNetwork":
         """From a checkpoint, ready to be asked."""
