@@ -1,6 +1,7 @@
-"""Trains the privileged teacher of the explorers by actor-critic learning.
+"""Trains explorers by actor-critic learning: the privileged teacher, or a student that goes on where it was cloned.
 
     python training/train_explorer.py --config training/configs/teacher.yaml --out runs/teacher
+    python training/train_explorer.py --config training/configs/student_tuned.yaml --out runs/student_tuned
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
@@ -13,11 +14,12 @@ import typer
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
-from drake_clutter.agents.learned_explorer import TEACHER, about_explorer
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, load_typed
-from drake_clutter.files import told_in_one_line
+from drake_clutter.files import InputError, told_in_one_line
+from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
@@ -30,6 +32,8 @@ class TrainExplorer:
     """A training.
 
     Attributes:
+        privileged: whether it sees everything, a teacher; or K_t, a student.
+        warm_start: a checkpoint of the same kind to begin with, or "".
         scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
         seed: same seed, same weights (on the same kind of machine).
         fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
@@ -37,6 +41,8 @@ class TrainExplorer:
         learning, world: see there.
     """
 
+    privileged: bool = True
+    warm_start: str = ""
     scenes: str = "training/scenes/train_sg_star.json"
     catalogue: str = ""
     seed: int = 0
@@ -60,8 +66,14 @@ def main(
     one_thread_per_operation()
     scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
     room = {"max_moves": given.max_moves, "most_objects": given.most_objects}
-    environment = ClutterExploration(scenes, privileged=True, fidelity=given.fidelity, config=given.world, **room)
+    environment = ClutterExploration(scenes, privileged=given.privileged, fidelity=given.fidelity, config=given.world, **room)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
+    kind = TEACHER if given.privileged else STUDENT
+    if given.warm_start:
+        begun, numbers = load_explorer(load_checkpoint(Path(given.warm_start)), Path(given.warm_start), kind)
+        if (numbers, len(begun.mark)) != (environment.numbers, given.learning.width):
+            raise InputError(f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same")
+        learner.network.load_state_dict(begun.state_dict())
     run = TrainingRun(out, given, learner, given.learning.steps)
     while learner.step < given.learning.steps:
         before = learner.step
@@ -71,7 +83,7 @@ def main(
             episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
             run.report(figures(episodes), learner.losses)
             run.save()
-    about = {"kind": TEACHER, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
+    about = {"kind": kind, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
     run.finish(CHECKPOINT, learner.network, about)
 
 
