@@ -211,6 +211,24 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Pa
     assert (set(decision.known) == everything) == (script == "train_explorer")
 
 
+def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Path) -> None:
+    """With no rate of learning it stays as it was; a teacher is no student."""
+    numbers, begun = ClutterExploration(file).numbers, tmp_path / "s.safetensors"
+    torch.manual_seed(3)
+    cloned = ExplorerNetwork(len(numbers), 8)
+    save_checkpoint(begun, cloned, {"kind": STUDENT, "network": about_explorer(numbers, 8)})
+    settings = [f"scenes={file}", f"warm_start={begun}", *TEACHER_SETTINGS, "learning.steps=10", "learning.learning_rate=1.0e-30"]
+    train = training_script("train_explorer")
+    train.main(tmp_path / "tuned", settings=[*settings, "privileged=false"])
+    tuned = load_checkpoint(tmp_path / "tuned" / "explorer.safetensors")
+    assert tuned.about["kind"] == STUDENT
+    assert all(torch.equal(value, tuned.weights[name]) for name, value in cloned.state_dict().items())
+    with pytest.raises(InputError, match=r"s\.safetensors: is a checkpoint of a student; allowed is one of a teacher"):
+        train.main(tmp_path / "teacher", settings=settings)
+    with pytest.raises(InputError, match=r"warm_start: .* another width"):
+        train.main(tmp_path / "wide", settings=[*settings, "privileged=false", "learning.width=16"])
+
+
 def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--agent nobody; allowed are random, .*full-knowledge"):
         make_explorers("nobody", ClutterConfig())
