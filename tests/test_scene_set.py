@@ -71,3 +71,16 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
         load_scene_set(path, CATALOGUE)
     with pytest.raises(InputError, match=r"none\.json: cannot be read"):
         load_scene_set(tmp_path / "none.json", CATALOGUE)
+
+
+def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
+    """Of the sets that are shipped, up to symmetry; and none is there twice."""
+    sets = {path: load_scene_set(path, CATALOGUE) for path in (Path(__file__).parents[1] / "training/scenes").glob("*.json")}
+    learned_from = {scene.form for path, held in sets.items() if path.stem.startswith("train_") for scene in held.scenes}
+    assert len(learned_from) > 9000
+    for path, held in sets.items():
+        forms = {scene.form for scene in held.scenes}
+        assert len(forms) == len(held.scenes), path.name
+        if not path.stem.startswith("train_"):
+            assert all(scene.settled is not None for scene in held.scenes)
+            assert not forms & learned_from, path.name
