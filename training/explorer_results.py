@@ -37,7 +37,7 @@ from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
-AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "careful-student", "teacher", FULL_KNOWLEDGE)
+AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "student-tuned", "teacher", FULL_KNOWLEDGE)
 SEVEN = ("sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "paper_hardness", "rg_25")
 FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", "careful-student-14", FULL_KNOWLEDGE)
 ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", agent) for agent in FOURTEEN]
