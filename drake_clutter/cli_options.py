@@ -51,8 +51,8 @@ ExplorerOption = Annotated[
     str,
     typer.Option(
         "--agent",
-        help="Who chooses the moves: random, largest-first, largest-clear; student, student-tuned, student-14, student-rg, teacher "
-        "(trained); or the file of a checkpoint that you trained.",
+        help="Who chooses the moves: random, largest-first, largest-clear; student, student-tuned, student-14, student-rg, "
+        "teacher (trained); or the file of a checkpoint that you trained.",
     ),
 ]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
