@@ -39,5 +39,6 @@ def test_a_table_of_one_row(results: ModuleType, tmp_path: Path, monkeypatch: py
 
 def test_the_picture_of_the_temperature(results: ModuleType, tmp_path: Path) -> None:
     figures = {"hidden_mean": 5.0, "hidden_ci95": (4.0, 6.0), "stability_rate": 0.9, "solvable_share": 0.8, "distinct_share": 1.0}
+    figures |= {"balanced_share": 0.5, "class_entropy": 2.0, "objects": "ycb7"}
     results.draw_trade([{"temperature": 0.1} | figures, {"temperature": 0.4} | figures], tmp_path / "trade.png")
     assert (tmp_path / "trade.png").stat().st_size > 10_000

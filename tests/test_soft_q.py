@@ -12,8 +12,13 @@ import pytest
 import torch
 from conftest import rng, training_script
 
+from drake_clutter.agents.generation import make_generation_agent
 from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, chances, play, soft_value, softmax_choice
+from drake_clutter.assets import build_assets
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.grammar import NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
@@ -194,6 +199,23 @@ def test_a_warm_start_of_another_width_is_refused() -> None:
     other = SoftQLearner(small_environment, SMALL, 1, CPU)
     other.begin_with(narrow.network)
     assert all(torch.equal(mine, theirs) for mine, theirs in zip(state_of(other), state_of(narrow), strict=True))
+
+
+def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
+    """An object class of one's own, learned after the shipped ones: the script takes both, and what it writes makes scenes."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    brick = "  brick: {shape: box, size_mm: [60, 100, 40], mass_g: 300}\n"
+    (folder / "catalogue.yaml").write_text(f"classes:\n{brick}object_sets:\n  mine: [sugar_box, tomato_soup_can, brick]\n")
+    build_assets(folder)
+    train = training_script("train_generator")
+    train.main(tmp_path / "first", settings=SETTINGS)
+    own = [*SETTINGS, f"catalogue={folder}", "objects=mine", f"warm_start={tmp_path / 'first/generator.safetensors'}"]
+    train.main(tmp_path / "second", settings=own)
+    agent = make_generation_agent(str(tmp_path / "second" / "generator.safetensors"), ClutterConfig())
+    grammar = SceneGrammar(load_catalogue(folder).object_set("mine"))
+    kinds = [kind for seed in range(10) for kind in agent.derive(grammar, NodeBudget(6), rng(seed)).graph.kinds()]
+    assert any("brick" in kind for kind in kinds)
 
 
 def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:

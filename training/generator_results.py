@@ -116,10 +116,13 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
         ("stability_rate", "stable", "o"),
         ("solvable_share", "solvable", "s"),
         ("distinct_share", "distinct", "D"),
+        ("balanced_share", "balanced", "^"),
     ):
         right.plot(warmth, [row[key] for row in rows], marker=marker, label=name)
+    even = [row["class_entropy"] / np.log2(len(load_catalogue().object_set(row["objects"]))) for row in rows]
+    right.plot(warmth, even, marker="v", label="classes, of the\ngreatest entropy")
     right.set(xscale="log", xlabel="temperature", ylabel="share of the scenes", ylim=(0, 1.03))
-    right.legend()
+    right.legend(loc="lower right", fontsize=16)
     for panel in (left, right):
         panel.grid(alpha=0.4)
         panel.set_xticks(warmth, [f"{value:g}" for value in warmth])

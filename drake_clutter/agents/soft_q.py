@@ -113,7 +113,7 @@ def play(
     while len(episodes) < count:
         # So many at a time, and none in the place of one that ends: short episodes are not to be more frequent.
         running = {k: environment.reset(seed=int(rng.integers(2**31))) for k, environment in enumerate(environments)}
-        scores = [0.0] * len(environments)
+        scores, ended = [0.0] * len(environments), dict[int, Episode]()
         while running:
             observations = stacked([observation for observation, _ in running.values()])
             masks = np.array([info["action_mask"] for _, info in running.values()]).astype(bool)
@@ -124,8 +124,9 @@ def play(
                 scores[k] += float(reward)
                 running[k] = observation, info
                 if over:
-                    episodes.append(Episode(scores[k], info))
+                    ended[k] = Episode(scores[k], info)
                     del running[k]
+        episodes += [ended[k] for k in range(len(environments))]
     return episodes[:count]
 
 

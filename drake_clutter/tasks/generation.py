@@ -209,7 +209,8 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
         stand ends the episode: what was earned is taken back, and w_s paid. At the end the finished scene is laid out and judged,
         and what it hides more or less than its stacks is made up for; `balance_reward` is paid for a balanced one. So the rewards
         of an episode sum up to what a stable scene is worth, or to w_s. They are meant to be summed without discount.
-    The last `info` has the `scene` and its `verdict`, or the `fault` (a `StackFault`, or None if there was no room).
+    The last `info` has the `scene` and its `verdict`, or the `fault`: a `StackFault`, or None if the whole
+    found no room on the tray or does not stand.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
