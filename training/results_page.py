@@ -104,21 +104,8 @@ def generators() -> str:
         row = {"agent": "random", "objects": earlier["objects"], "count": earlier["count"], **row}
         if ("random", row["objects"], row["nodes"]) not in measured:
             told.append(generator_row(row, "`calibration.json`"))
-    head = [
-        "agent",
-        "objects",
-        "nodes",
-        "scenes",
-        "laid out",
-        "stable",
-        "paper",
-        "hidden",
-        "paper",
-        "solvable",
-        "distinct",
-        "stacks",
-    ]
-    head += ["balanced", "class bits", "fast judge wrong", "from"]
+    head = ["agent", "objects", "nodes", "scenes", "laid out", "stable", "paper", "hidden", "paper", "solvable", "distinct"]
+    head += ["stacks", "balanced", "class bits", "fast judge wrong", "from"]
     trainings, shown = [], (("stable", 3), ("hidden", 1), ("stacks", 2), ("balanced", 2))
     for path in [*sorted(RESULTS.glob("sg_star_seed_*.json")), RESULTS / "sg_star_paper.json"]:
         held = json.loads(path.read_text())
@@ -130,9 +117,8 @@ def generators() -> str:
     for agent, name in (("sg", "SG, 15 nodes"), ("sg_14", "SG-14")):
         last = json.loads((RESULTS.parent / f"checkpoints/{agent}.json").read_text())["metrics"]
         figures = [number(last[key], digits) for key, digits in shown]
-        trainings.append(
-            [name, str(last["step"]), number(last["seconds"] / 60, 0), number(last["step"] / last["seconds"], 0), *figures]
-        )
+        rate = last["step"] / last["seconds"]
+        trainings.append([name, str(last["step"]), number(last["seconds"] / 60, 0), number(rate, 0), *figures])
     pictures = picture("stacks", "How high stacks are, and of what objects scenes are, at 25 nodes") + sheets()
     pictures += picture("trade_off", "What SG* hides, and how varied its scenes are, over the temperature")
     return f"""## Table I: scenes that hide things
@@ -257,7 +243,7 @@ PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, dete
 
 def page() -> str:
     """The whole page."""
-    told = "Written by `training/results_page.py` from the files in `training/results/`, which name config, seed and commit."
+    told = "Written by `training/results_page.py` from `training/results/`; its files, or the checkpoints, name config, seed and commit."
     return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
 
 
