@@ -243,7 +243,7 @@ PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, dete
 
 def page() -> str:
     """The whole page."""
-    told = "Written by `training/results_page.py` from `training/results/`; its files, or the checkpoints, name config, seed and commit."
+    told = "Written by `training/results_page.py` from `training/results/`; files or checkpoints name config, seed and commit."
     return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
 
 

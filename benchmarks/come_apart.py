@@ -1,0 +1,63 @@
+"""Is what the generator's reward asks of a scene, that it can be taken apart from the top, what makes it solvable?
+
+    drake-clutter generate --agent training/checkpoints/sg_star_paper.safetensors --count 100 --seed 1000 --out out/paper
+    python benchmarks/come_apart.py out/paper out/others
+
+For each folder that `drake-clutter generate` wrote: its stable scenes by whether they come apart, and whether they are solvable.
+"""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from drake_clutter.agents.generation import wilson_interval
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.resources import git_commit
+from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.tasks.full_knowledge import Answer
+
+OUT = Path(__file__).parent / "results" / "come_apart.json"
+
+
+def counted(folder: Path) -> dict[str, Any]:
+    """A folder's row."""
+    job, catalogue, judge = json.loads((folder / JOB_FILE).read_text()), load_catalogue(), FastJudge(ClutterConfig())
+    counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
+    answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
+    for index, answer in enumerate(answers):
+        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
+        if file.verdict is not None and file.verdict.stable:
+            counts[judge.comes_apart(file.settled_scene) is True, answer == Answer.SOLVABLE.value] += 1
+    told: dict[str, Any] = {"agent": job["agent"], "nodes": job["nodes"], "seed": job["seed"], "scenes": len(answers)}
+    for name, apart in (("comes_apart", True), ("does_not", False)):
+        solved, total = counts[apart, True], counts[apart, True] + counts[apart, False]
+        told[name] = {"stable": total, "solvable": solved, "solvable_ci95": wilson_interval(solved, total)}
+    return told
+
+
+def main(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Of `drake-clutter generate`.")],
+    out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
+) -> None:
+    """Counts, and prints a table."""
+    rows = [counted(folder) for folder in folders]
+    write_json(out, {"commit": git_commit(), "rows": rows})
+    table = Table("agent", "nodes", "scenes", "stable, come apart", "of these solvable", "stable, do not", "of these solvable")
+    for row in rows:
+        cells = [f"{row[name][key]}" for name in ("comes_apart", "does_not") for key in ("stable", "solvable")]
+        table.add_row(Path(row["agent"]).stem, str(row["nodes"]), str(row["scenes"]), *cells)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        typer.run(main)
