@@ -64,9 +64,9 @@ def picture(name: str, told: str) -> str:
 
 
 def sheets() -> str:
-    """Links to the first 48 scenes of each agent."""
+    """Links to 48 scenes of each agent."""
     links = [f"[{path.stem.removeprefix('sheet_')}](images/{path.name})" for path in sorted(IMAGES.glob("sheet_*.png"))]
-    return f"The first 48 scenes of 25 nodes: {', '.join(links)}.\n\n" if links else ""
+    return f"48 scenes of 25 nodes by each agent: {', '.join(links)}.\n\n" if links else ""
 
 
 def generator_row(row: dict[str, Any], source: str) -> list[str]:
