@@ -7,7 +7,7 @@ Scenes stay in the folder; a run that was stopped goes on with what is missing.
 
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,13 +22,13 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import GenerationJob
+from drake_clutter.agents.generation import TRAINED, GenerationJob
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
-from drake_clutter.resources import git_commit
+from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.seams import CannotJudge
 
@@ -104,6 +104,15 @@ def show(rows: list[dict[str, Any]], console: Console) -> None:
     console.print(table)
 
 
+def of_temperatures(found: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of SG* at 25 nodes in the order of their temperatures; Table I's is at that of the checkpoint."""
+    rows = [found[row.folder] for row in TRADE if row.folder in found]
+    if (as_shipped := found.get(Row("sg-star", 25, 1000).folder)) is not None:
+        about = json.loads(shipped_path(TRAINED["sg-star"]).with_suffix(".json").read_text())
+        rows.append(as_shipped | {"temperature": about["temperature"]})
+    return sorted(rows, key=lambda row: float(row["temperature"]))
+
+
 def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
     """Hidden objects, stability and variety over the temperature."""
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
@@ -111,7 +120,7 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
     warmth = [row["temperature"] for row in rows]
     hidden = np.array([[row["hidden_mean"], *(row["hidden_ci95"] or (np.nan, np.nan))] for row in rows])
     left.errorbar(warmth, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6)
-    left.set(xscale="log", xlabel="temperature", ylabel="hidden objects in a stable scene", ylim=(0, None))
+    left.set(xscale="log", xlabel="temperature of the policy", ylabel="hidden objects in a stable scene", ylim=(0, None))
     for key, name, marker in (
         ("stability_rate", "stable", "o"),
         ("solvable_share", "solvable", "s"),
@@ -121,7 +130,7 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
         right.plot(warmth, [row[key] for row in rows], marker=marker, label=name)
     even = [row["class_entropy"] / np.log2(len(load_catalogue().object_set(row["objects"]))) for row in rows]
     right.plot(warmth, even, marker="v", label="classes, of the\ngreatest entropy")
-    right.set(xscale="log", xlabel="temperature", ylabel="share of the scenes", ylim=(0, 1.03))
+    right.set(xscale="log", xlabel="temperature of the policy", ylabel="share of the scenes", ylim=(0, 1.03))
     right.legend(loc="lower right", fontsize=16)
     for panel in (left, right):
         panel.grid(alpha=0.4)
@@ -156,9 +165,8 @@ def main(
             out.parent.mkdir(parents=True, exist_ok=True)
             write_json(out, {"seed": seed, "rows": list(found.values())})
     show(list(found.values()), console)
-    trade = [found[row.folder] for row in TRADE if row.folder in found]
-    if picture is not None and trade:
-        draw_trade(trade, picture)
+    if picture is not None:
+        draw_trade(of_temperatures(found), picture)
 
 
 if __name__ == "__main__":
