@@ -134,7 +134,7 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
     right.legend(loc="lower right", fontsize=16)
     for panel in (left, right):
         panel.grid(alpha=0.4)
-        panel.set_xticks(warmth, [f"{value:g}" for value in warmth])
+        panel.set_xticks(warmth, [f"{value:g}" for value in warmth], rotation=45)
         panel.minorticks_off()
     figure.savefig(path, dpi=100)
     plt.close(figure)
