@@ -1,15 +1,19 @@
 """Moves by teleport: what stays, what falls, what is left alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import resting, rng, scene_of
 
 from drake_clutter.config import ClutterConfig
+from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import deepest_penetration
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.seams import Move, MoveResult, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.simulation.judge import TOUCHING_MARGIN
 
 STACKS = scene_of(
     resting("cracker_box", name="below"),
@@ -62,6 +66,19 @@ def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecut
     outcome = executor.put(STACKS, "on the can", start.moved((0.0, 0.0, 0.005)), rng(0))
     assert outcome.result is MoveResult.PLACED
     assert outcome.scene["on the can"].X_TO.p[2] == pytest.approx(start.p[2], abs=0.001)
+
+
+def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
+    """What is let go too high beside something close falls onto what is below all the same."""
+    picked, neighbour = resting("gelatin_box", floor=0.101, name="picked"), resting("cracker_box", Orientation.UPRIGHT_0)
+    gap = TOUCHING_MARGIN - 0.001
+    beside = neighbour.bounds_T[1][0] + gap - picked.bounds_T[0][0]
+    scene = scene_of(
+        neighbour, resting("tomato_soup_can", xy=(beside, 0.0)), replace(picked, X_TO=picked.X_TO.moved((beside, 0.0, 0.0)))
+    )
+    outcome = executor.put(scene, "picked", scene["picked"].X_TO.moved((0.0, 0.0, 0.005)), rng(0))
+    assert outcome.result is MoveResult.PLACED
+    assert outcome.scene["picked"].X_TO.p[2] == pytest.approx(scene["picked"].X_TO.p[2], abs=0.001)
 
 
 @pytest.mark.parametrize(("pick", "falls"), [("below", "above"), ("can", "on the can")])

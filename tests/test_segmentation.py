@@ -8,9 +8,11 @@ import torch
 from conftest import rng
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.perception.image_set import LabelledImage
 from drake_clutter.perception.segmentation import (
+    DETECTOR,
     SegmentationNetwork,
     Window,
     class_weights,
@@ -22,6 +24,7 @@ from drake_clutter.perception.segmentation import (
     segments,
 )
 from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
+from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene import Pose
 
 CAMERA = CameraConfig(width=160, height=120)
@@ -131,10 +134,16 @@ def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
     logits, votes = network(given)
     assert (logits.shape, votes.shape) == ((2, 3, 32, 32), (2, 3, 32, 32))
     assert torch.allclose(network(given[:1])[0], logits[:1], atol=1e-5), "one by one as in a batch"
-    about = {"classes": list(CLASSES), "looks_at_color": looks_at_color}
+    about = {"kind": DETECTOR, "classes": list(CLASSES), "looks_at_color": looks_at_color}
     save_checkpoint(tmp_path / "d.safetensors", network, about)
-    again = SegmentationNetwork.of(load_checkpoint(tmp_path / "d.safetensors"))
+    again = SegmentationNetwork.load(tmp_path / "d.safetensors")
     assert torch.equal(again(given)[1], votes)
+
+
+def test_a_checkpoint_of_something_else_is_refused() -> None:
+    student = shipped_path("training/checkpoints/student.safetensors")
+    with pytest.raises(InputError, match=r"student\.safetensors: is a checkpoint of a student; allowed is one of a detector"):
+        SegmentationNetwork.load(student)
 
 
 def test_a_warm_start_answers_as_what_it_begins_with_whatever_the_colours_and_other_classes_are() -> None:

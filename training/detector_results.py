@@ -27,6 +27,7 @@ from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import ImageSet, LabelledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
+from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene_set import load_scene_set
@@ -119,7 +120,7 @@ def main(
     """Compares detections with the truth."""
     torch.set_num_threads(threads)
     config, catalogue, console = ClutterConfig(), load_catalogue(), Console(stderr=True)
-    checkpoint, camera, rows = load_checkpoint(detector), OverheadCamera(config.camera), dict[str, Any]()
+    network, camera, rows = SegmentationNetwork.load(detector), OverheadCamera(config.camera), dict[str, Any]()
 
     def shown(path: Path) -> tuple[list[str], list[LabelledImage]]:
         held = load_scene_set(path, catalogue)
@@ -137,7 +138,7 @@ def main(
         return [c.name for c in held.classes], found
 
     def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
-        eye = LearnedDetector(checkpoint, [catalogue.classes[n] for n in names], config.camera, config.layout.tray_side)
+        eye = LearnedDetector(network, [catalogue.classes[n] for n in names], config.camera, config.layout.tray_side)
         eye.detect(given[0].depth, given[0].color)  # compiles
         objects, false, seconds = list[Seen](), 0, list[float]()
         for k, image in enumerate(given):
@@ -149,10 +150,10 @@ def main(
         rows[path.stem] = told(*shown(path))
     if images is not None:
         held_out = ImageSet(images)
-        rows["images"] = told(list(checkpoint.about["classes"]), [held_out[k] for k in range(min(count, len(held_out)))])
+        rows["images"] = told(list(network.classes), [held_out[k] for k in range(min(count, len(held_out)))])
     fields = {
         "detector": detector.name,
-        "trained": checkpoint.about["metrics"],
+        "trained": load_checkpoint(detector).about["metrics"],
         "commit": git_commit(),
         "seed": seed,
         "rows": rows,

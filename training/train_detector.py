@@ -17,10 +17,9 @@ import typer
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import CameraConfig, LayoutConfig, load_typed
 from drake_clutter.files import told_in_one_line
-from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
-from drake_clutter.perception.segmentation import SegmentationNetwork, Window
+from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
 from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
 from drake_clutter.runner import item_rng
 
@@ -71,7 +70,7 @@ def main(
     torch.manual_seed(given.seed)
     network = SegmentationNetwork(classes, given.looks_at_color)
     if given.warm_start:
-        network.begin_with(SegmentationNetwork.of(load_checkpoint(Path(given.warm_start))))
+        network.begin_with(SegmentationNetwork.load(Path(given.warm_start)))
     learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, tray_side, given.seed, chosen)
     run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, tray_side)
 
@@ -96,7 +95,7 @@ def main(
         if learner.step == given.learning.steps or learner.step % given.evaluate_every == 0:
             run.report(figures(), learner.losses)
             run.save()
-    about = {"kind": "detector", "classes": classes, "looks_at_color": given.looks_at_color, "images": learned}
+    about = {"kind": DETECTOR, "classes": classes, "looks_at_color": given.looks_at_color, "images": learned}
     run.finish(CHECKPOINT, network, about)
 
 

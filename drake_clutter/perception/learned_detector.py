@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import CameraConfig
-from drake_clutter.learning.checkpoint import Checkpoint
 from drake_clutter.perception.explaining import Explanation, chosen, explanation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
 from drake_clutter.perception.pose_score import FLOOR_SLACK
@@ -69,9 +68,11 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour."""
 
-    def __init__(self, checkpoint: Checkpoint, classes: Sequence[ObjectClass], camera: CameraConfig, tray_side: float) -> None:
+    def __init__(
+        self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: CameraConfig, tray_side: float
+    ) -> None:
         """With a trained network, for objects of these classes, of which it must know all."""
-        self._network, self._camera, self._tray_side = SegmentationNetwork.of(checkpoint), camera, tray_side
+        self._network, self._camera, self._tray_side = network, camera, tray_side
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, tray_side)
         self._unknown = torch.tensor([False] + [name not in self._classes for name in self._network.classes])

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -19,10 +20,13 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor, nn
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.learning.checkpoint import Checkpoint
+from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import load_checkpoint
 
 Element = TypeVar("Element", bound=np.generic)
 
+DETECTOR = "detector"
+"""Kind of its checkpoints."""
 COARSE = 2
 """Pixels, each way, for one answer."""
 _MULTIPLE = 16
@@ -179,8 +183,16 @@ class SegmentationNetwork(nn.Module):
         return {name: row for row, name in enumerate(names)}
 
     @staticmethod
-    def of(checkpoint: Checkpoint) -> "SegmentationNetwork":
-        """From a checkpoint, ready to be asked."""
+    def load(path: Path) -> "SegmentationNetwork":
+        """From a checkpoint of training/train_detector.py, ready to be asked.
+
+        Raises:
+            InputError: it cannot be read, or is none of a detector.
+        """
+        checkpoint = load_checkpoint(path)
+        kind = checkpoint.about.get("kind")
+        if kind != DETECTOR:
+            raise InputError(f"{path}: is a checkpoint of a {kind}; allowed is one of a {DETECTOR}")
         network = SegmentationNetwork(checkpoint.about["classes"], checkpoint.about["looks_at_color"])
         network.load_state_dict(checkpoint.weights)
         return network.eval()

@@ -70,13 +70,15 @@ class SettleExecutor:
 
 
 def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
-    """Objects that may touch each other: also what is let go and what it falls onto, however high above it that is."""
-    margin = TOUCHING_MARGIN
-    while True:
-        groups = touching_groups(scene.objects, margin)
-        if [released] not in groups or released.bounds_T[0][2] <= margin:
-            return groups
-        margin += TOUCHING_MARGIN
+    """Objects that may touch each other; what is let go may fall onto all that is below it, however far."""
+    lower, upper = (bound[:2] for bound in released.bounds_T)
+    with_released, others = list[SceneObject](), []
+    for group in touching_groups(scene.objects, TOUCHING_MARGIN):
+        if any((lower <= o.bounds_T[1][:2]).all() and (o.bounds_T[0][:2] <= upper).all() for o in group):
+            with_released += group
+        else:
+            others.append(group)
+    return [with_released, *others]
 
 
 def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:

@@ -60,11 +60,11 @@ def perception_of(scenario: Scenario, tray_side: float) -> Perceive | None:
         allowed = f"labels, {', '.join(DETECTORS)}, or a .safetensors file"
         raise InputError(f"perception: {scenario.perception}; allowed are {allowed}")
     path = checkpoint_path(scenario.perception, DETECTORS)
-    from drake_clutter.learning.checkpoint import load_checkpoint  # takes PyTorch
-    from drake_clutter.perception.learned_detector import LearnedDetector
+    from drake_clutter.perception.learned_detector import LearnedDetector  # takes PyTorch
+    from drake_clutter.perception.segmentation import SegmentationNetwork
 
     classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(scenario.objects)
-    detector = LearnedDetector(load_checkpoint(path), classes, scenario.world.camera, tray_side)
+    detector = LearnedDetector(SegmentationNetwork.load(path), classes, scenario.world.camera, tray_side)
     return LearnedPerception(detector.detect, noise=scenario.camera_noise, seed=scenario.seed)
 
 
