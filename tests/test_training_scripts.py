@@ -1,5 +1,6 @@
 """The scripts that make sets of scenes and the explorers' tables."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def test_a_row_of_the_table() -> None:
         result(OUT, 1, (0,) * 20),
     ]
     ceiling = [result(ALL, 2, (2, 2)), result(ALL, 3, (0, 3)), result(ALL, 4, (4,)), result("gave up", 1, ())]
-    row = training_script("explorer_results").row_of(results, ceiling)
+    row = training_script("explorer_results").row_of(results, {"ceiling": ceiling})
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
     assert (row["within_10"]["found"], row["within_20"]["found"]) == (3 / 4, 6 / 4)
@@ -36,7 +37,7 @@ def test_a_row_of_the_table() -> None:
     assert row["not_carried_out"] == 3 / 36
     low, high = row["moves_to_ceiling_ci95"]
     assert (low, high) == (2 / 2, 12 / 2), "two scenes, drawn again and again: either of them twice, or both"
-    assert (row["moves_to_ceiling"], row["both_succeeded"]) == (14 / 4, 2)
+    assert (row["moves_to_ceiling"], row["both_with_ceiling"]) == (14 / 4, 2)
 
 
 def test_episodes_are_played_once(tmp_path: Path) -> None:
@@ -51,10 +52,24 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
     assert played[0].hidden == scenes.scenes[0].hidden
     with pytest.raises(InputError, match=r"random\.json: holds other episodes \(agent, seed\)"):
         script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
-    with pytest.raises(InputError, match="is the whole table's"):
-        script.main(tmp_path, only="sg_star_25")
+    with pytest.raises(InputError, match="--out: is missing"):
+        script.main(tmp_path, only="sg_star_25", agents=["random"])
     with pytest.raises(InputError, match="--only none"):
         script.main(tmp_path, only="none", out=tmp_path / "table.json")
+
+
+def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
+    add_rows, path = training_script("explorer_results").add_rows, tmp_path / "table.json"
+    add_rows(path, {"seed": 1}, [{"set": "b", "agent": "student", "episodes": 1}, {"set": "b", "agent": "random", "episodes": 1}])
+    add_rows(path, {"seed": 1}, [{"set": "b", "agent": "random", "episodes": 2}, {"set": "a", "agent": "random", "episodes": 2}])
+    rows = json.loads(path.read_text())["rows"]
+    assert [(row["set"], row["agent"], row["episodes"]) for row in rows] == [
+        ("a", "random", 2),
+        ("b", "student", 1),
+        ("b", "random", 2),
+    ]
+    with pytest.raises(InputError, match=r"table\.json: holds rows of other chances"):
+        add_rows(path, {"seed": 2}, [])
 
 
 @pytest.mark.parametrize("drake", [False, True])

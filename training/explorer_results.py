@@ -7,7 +7,7 @@ Episodes stay in the folder, a file for each set and agent; a run that was stopp
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -37,10 +37,13 @@ from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
-AGENTS = ("random", "largest-first", "largest-clear", "student-rg", "student", "student-tuned", "teacher", FULL_KNOWLEDGE)
-SEVEN = ("sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "paper_hardness", "rg_25")
-FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", "careful-student-14", FULL_KNOWLEDGE)
-ROWS = [(scenes, agent) for scenes in SEVEN for agent in AGENTS] + [("sg_14", agent) for agent in FOURTEEN]
+COMPARED = {"ceiling": FULL_KNOWLEDGE, "largest_clear": "largest-clear"}
+"""Whose moves the others' are compared with, by what the figures call them."""
+SEVEN = ("random", "largest-first", "largest-clear", "student-rg", "student", FULL_KNOWLEDGE)
+FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
+SETS_OF_SEVEN = ("paper_hardness", "sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "rg_25")
+TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", FOURTEEN)}
+"""Of every frozen set, the table that it belongs to, and who plays it."""
 
 
 def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
@@ -84,8 +87,8 @@ def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -
     return low, high
 
 
-def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | None) -> dict[str, Any]:
-    """The figures of an agent on scenes; `ceiling`: how someone who knows everything fared on the same."""
+def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
+    """The figures of an agent on scenes; `others`: how those fared on the same whose moves its own are to be compared with."""
     row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
     for limit in LIMITS:
         won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
@@ -105,14 +108,31 @@ def row_of(results: Sequence[EpisodeResult], ceiling: Sequence[EpisodeResult] | 
     row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
     row["moves_of_successes_ci95"] = mean_interval(won_moves)
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
-    if ceiling is not None:
+    for name, theirs in others.items():
         pairs = [
-            (r.moves, c.moves) for r, c in zip(results, ceiling, strict=True) if r.ended == c.ended == EpisodeEnd.ALL_FOUND.value
+            (a.moves, b.moves) for a, b in zip(results, theirs, strict=True) if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}
         ]
-        row["moves_to_ceiling"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
-        row["moves_to_ceiling_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
-        row["both_succeeded"] = len(pairs)
+        row[f"moves_to_{name}"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
+        row[f"moves_to_{name}_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
+        row[f"both_with_{name}"] = len(pairs)
     return row
+
+
+def add_rows(path: Path, held: dict[str, Any], rows: Sequence[dict[str, Any]]) -> None:
+    """Writes the rows into a file of results, in the place of those of the same sets and agents.
+
+    Raises:
+        InputError: the file's were measured otherwise.
+    """
+    kept = []
+    if path.exists():
+        there = json.loads(path.read_text())
+        if any(there[key] != value for key, value in held.items()):
+            raise InputError(f"{path}: holds rows of other chances, fidelity or config; give another file as --out")
+        new = {(row["set"], row["agent"]) for row in rows}
+        kept = [row for row in there["rows"] if (row["set"], row["agent"]) not in new]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, held | {"rows": sorted([*kept, *rows], key=lambda row: row["set"])})
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
@@ -120,8 +140,9 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     table = Table(
         "set", "agent", "episodes", "hidden", *(f"{what} in {n}" for n in LIMITS for what in ("success", "found", "of hidden"))
     )
-    for column in ("collapsed", "moves", "to ceiling"):
+    for column in ("collapsed", "moves", *(f"to {name}" for name in COMPARED)):
         table.add_column(column)
+    columns = ("moves_of_successes", *(f"moves_to_{name}" for name in COMPARED))
     for row in rows:
         numbers = []
         for limit in LIMITS:
@@ -133,7 +154,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
                 f"{part['found_of_hidden']:.2f}",
             ]
         last = [f"{row[f'within_{LIMITS[-1]}']['collapsed']:.2f}"]
-        last += ["" if row.get(key) is None else f"{row[key]:.2f}" for key in ("moves_of_successes", "moves_to_ceiling")]
+        last += ["" if row.get(key) is None else f"{row[key]:.2f}" for key in columns]
         table.add_row(row["set"], row["agent"], str(row["episodes"]), f"{row['hidden']:.2f}", *numbers, *last)
     return table
 
@@ -165,41 +186,45 @@ def main(
     count: Annotated[int | None, typer.Option(min=1, help="Of each set's scenes; all if not given.")] = None,
     only: Annotated[str | None, typer.Option(help="Of sets whose name contains this.")] = None,
     agents: Annotated[list[str] | None, typer.Option("--agent", help="These instead of the tables'; may be repeated.")] = None,
-    out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table2.json",
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="JSON to write; table2.json and table3.json if not given.")
+    ] = None,
     curves: Annotated[Path | None, typer.Option(metavar="FILE", help="PNG to write, of the last set.")] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
-    if out == RESULTS / "table2.json" and (only or agents or fidelity != "settle"):
-        raise InputError(f"--out {out}: is the whole table's; give another file for a part of it")
+    if out is None and (agents or fidelity != "settle"):
+        raise InputError("--out: is missing; the published tables are all agents', under settle: give a file for others")
     if fidelity not in EXECUTORS:
         raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(EXECUTORS)}")
     folder.mkdir(parents=True, exist_ok=True)
-    catalogue, rows = load_catalogue(), list[dict[str, Any]]()
-    names = [name for name in dict.fromkeys(name for name, _ in ROWS) if only is None or only in name]
+    catalogue, shown = load_catalogue(), list[dict[str, Any]]()
+    names = [name for name in TABLES if only is None or only in name]
     if not names:
-        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(dict(ROWS))}")
+        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
     for name in names:
+        table, agents_of_table = TABLES[name]
         scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
         number = min(count or len(scenes.scenes), len(scenes.scenes))
-        chosen = agents or [agent for of, agent in ROWS if of == name]
+        chosen = agents or agents_of_table
         found = {
             agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.json")
-            for agent in sorted(chosen, key=lambda agent: agent != FULL_KNOWLEDGE)
+            for agent in chosen
         }
+        others = {label: found[agent] for label, agent in COMPARED.items() if agent in found}
         solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
+        rows = []
         for agent in chosen:
-            ceiling = found.get(FULL_KNOWLEDGE)
             row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
-            row |= row_of(found[agent], ceiling)
+            row |= {"commit": git_commit()} | row_of(found[agent], others)
             part = [found[agent][k] for k in solvable]
-            row["solvable"] = row_of(part, [ceiling[k] for k in solvable] if ceiling else None) if part else None
+            row["solvable"] = row_of(part, {label: [o[k] for k in solvable] for label, o in others.items()}) if part else None
             rows.append(row)
         if curves is not None:
             draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {number} scenes, {fidelity}", curves)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        fields = {"seed": seed, "fidelity": fidelity, "commit": git_commit(), "config": asdict(ClutterConfig())}
-        write_json(out, fields | {"rows": rows})
-    Console(width=180).print(table_of(rows))
+        held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
+        add_rows(out or RESULTS / f"{table}.json", held, rows)
+        shown += rows
+    Console(width=180).print(table_of(shown))
 
 
 if __name__ == "__main__":
