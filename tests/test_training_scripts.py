@@ -44,13 +44,14 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
     """And those that are there are not taken for others."""
     script = training_script("explorer_results")
     scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOGUE)
-    path = tmp_path / "random.json"
+    path = tmp_path / "random.jsonl"
     played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
     before = path.read_bytes()
     assert script.played(scenes, "random", 1, "equilibrium", 0, 1, path) == played
     assert path.read_bytes() == before
+    assert script.played(scenes, "random", 2, "equilibrium", 0, 1, path)[:1] == played, "others are added to it"
     assert played[0].hidden == scenes.scenes[0].hidden
-    with pytest.raises(InputError, match=r"random\.json: holds other episodes \(agent, seed\)"):
+    with pytest.raises(InputError, match=r"random\.jsonl: holds other episodes \(agent, seed\)"):
         script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
     with pytest.raises(InputError, match="--out: is missing"):
         script.main(tmp_path, only="sg_star_25", agents=["random"])

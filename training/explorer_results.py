@@ -1,8 +1,8 @@
 """Tables II and III: every explorer on every frozen set of scenes, moves settled by Drake; and how much was found over the moves.
 
-    python training/explorer_results.py runs/table2 --workers 2
+    python training/explorer_results.py --workers 2
 
-Episodes stay in the folder, a file for each set and agent; a run that was stopped goes on with what is missing.
+Every episode is a line of a file in training/results/episodes, a file for each set and agent; what is there is not played again.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from drake_clutter.agents.exploration import CAREFUL, FULL_KNOWLEDGE, TRAINED, m
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
 from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
@@ -47,23 +47,30 @@ TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", 
 
 
 def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
-    """The episodes of an agent on a set's first scenes, from the file if they are there."""
+    """The episodes of an agent on a set's first scenes; those that the file has not got are played, and written as they end."""
     config = ClutterConfig()
     asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
-    asked |= {"count": count, "seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
-    if path.exists():
-        held = json.loads(path.read_text())
-        differing = ", ".join(key for key, value in asked.items() if held["asked"].get(key) != value)
-        if differing:
-            raise InputError(f"{path}: holds other episodes ({differing}); give the same options or another folder")
-        return [EpisodeResult(**{**row, "found_after": tuple(row["found_after"])}) for row in held["episodes"]]
+    asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
+    lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
+    there = json.loads(lines[0])
+    differing = ", ".join(key for key, value in asked.items() if there.get(key) != value)
+    if differing:
+        raise InputError(f"{path}: holds other episodes ({differing}); give the same options or another folder")
     make_explorers(agent, config)  # says what is wrong before anything is played
-    episodes = [Episode(SCENES / scenes.name, k, agent, k) for k in range(count)]
-    results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), episodes, workers=workers)
-    shown = track(results, f"{path.stem}", total=len(episodes), console=Console(stderr=True))
-    found = list(shown)
-    write_json(path, {"asked": asked, "commit": git_commit(), "episodes": [asdict(result) for result in found]})
-    return found
+    missing = [Episode(SCENES / scenes.name, k, agent, k) for k in range(len(lines) - 1, count)]
+    results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), missing, workers=workers)
+    commit = git_commit()
+    for result in track(results, path.stem, total=len(missing), console=Console(stderr=True)):
+        lines.append(json.dumps(asdict(result) | {"commit": commit}))
+        write_text(path, "\n".join(lines) + "\n")
+    return [episode_of(line) for line in lines[1 : 1 + count]]
+
+
+def episode_of(line: str) -> EpisodeResult:
+    """From a line of a file of episodes."""
+    fields = json.loads(line)
+    fields.pop("commit")
+    return EpisodeResult(**fields | {"found_after": tuple(fields["found_after"])})
 
 
 def weights_of(agent: str) -> str:
@@ -179,7 +186,7 @@ def draw_curves(found: dict[str, Sequence[EpisodeResult]], title: str, path: Pat
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = RESULTS / "episodes",
     workers: Annotated[int, typer.Option(min=1)] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the episodes' chances.")] = 2000,
     fidelity: Annotated[str, typer.Option(help="fast or settle; the published tables are settle.")] = "settle",
@@ -192,6 +199,8 @@ def main(
     curves: Annotated[Path | None, typer.Option(metavar="FILE", help="PNG to write, of the last set.")] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
+    if folder == RESULTS / "episodes" and fidelity != "settle":
+        raise InputError(f"DIR: {folder}: is for episodes under settle; give another folder")
     if out is None and (agents or fidelity != "settle"):
         raise InputError("--out: is missing; the published tables are all agents', under settle: give a file for others")
     if fidelity not in EXECUTORS:
@@ -207,7 +216,7 @@ def main(
         number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or agents_of_table
         found = {
-            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.json")
+            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.jsonl")
             for agent in chosen
         }
         others = {label: found[agent] for label, agent in COMPARED.items() if agent in found}
@@ -215,7 +224,7 @@ def main(
         rows = []
         for agent in chosen:
             row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
-            row |= {"commit": git_commit()} | row_of(found[agent], others)
+            row |= row_of(found[agent], others)
             part = [found[agent][k] for k in solvable]
             row["solvable"] = row_of(part, {label: [o[k] for k in solvable] for label, o in others.items()}) if part else None
             rows.append(row)
