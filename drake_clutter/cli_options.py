@@ -51,7 +51,7 @@ ExplorerOption = Annotated[
     str,
     typer.Option(
         "--agent",
-        help="Who chooses the moves: random, largest-first, largest-clear; student, student-tuned, student-14, student-rg, "
+        help="Who chooses the moves: random, largest-first, largest-clear; student, student-dagger, student-14, student-rg, "
         "teacher (trained); or the file of a checkpoint that you trained.",
     ),
 ]

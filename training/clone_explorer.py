@@ -1,6 +1,6 @@
 """Trains a student, which sees what the camera has shown, by cloning a teacher, which sees everything.
 
-    python training/clone_explorer.py --config training/configs/student.yaml --out runs/student
+    python training/clone_explorer.py --config training/configs/student_dagger.yaml --out runs/student_dagger
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """

@@ -1,7 +1,7 @@
 """Trains explorers by actor-critic learning: the privileged teacher, or a student that goes on where it was cloned.
 
     python training/train_explorer.py --config training/configs/teacher.yaml --out runs/teacher
-    python training/train_explorer.py --config training/configs/student_tuned.yaml --out runs/student_tuned
+    python training/train_explorer.py --config training/configs/student.yaml --out runs/student
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """

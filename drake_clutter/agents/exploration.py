@@ -115,7 +115,7 @@ BASELINES: dict[str, Callable[[], ExplorationAgent]] = {
 TRAINED = {
     "teacher": "training/checkpoints/teacher.safetensors",
     "student": "training/checkpoints/student.safetensors",
-    "student-tuned": "training/checkpoints/student_tuned.safetensors",
+    "student-dagger": "training/checkpoints/student_dagger.safetensors",
     "student-rg": "training/checkpoints/student_rg.safetensors",
     "student-14": "training/checkpoints/student_14.safetensors",
 }
