@@ -44,18 +44,25 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "closed_loop.json"
-FIRST = 60
-"""The first scene of a set that is played: those before it were looked at while the loop was debugged."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Episodes of one kind; `perception` and `agent` as of `Scenario`; labels with settle are in the explorers' own table."""
+    """Episodes of one kind; labels with settle are in the explorers' own table.
+
+    Attributes:
+        perception, agent: see `Scenario`.
+        motion: settle or arm.
+        scenes: name of the set.
+        first: scene of the set that is played: those before it were looked at while the loop was debugged.
+        count: of scenes.
+    """
 
     perception: str
     motion: str
     scenes: str
     agent: str
+    first: int
     count: int
 
     @property
@@ -65,8 +72,8 @@ class Row:
 
 
 ROWS = [
-    Row(perception, motion, scenes, agent, count)
-    for scenes, agent, count in (("sg_star_25", "student", 100), ("sg_14", "student-14", 50))
+    Row(perception, motion, scenes, agent, first, count)
+    for scenes, agent, first, count in (("sg_star_25", "student", 60, 100), ("sg_14", "student-14", 50, 50))
     for perception, motion in (("depth", "settle"), ("labels", "arm"), ("depth", "arm"))
 ]
 
@@ -237,7 +244,7 @@ def main(
     for row in rows:
         if perception is not None and row.perception != "labels":
             row = replace(row, perception=perception)
-        numbers = range(FIRST, FIRST + min(row.count, count or row.count))
+        numbers = range(row.first, row.first + min(row.count, count or row.count))
         asked = [Asked(row, k, folder / row.name / f"{k:04d}.json") for k in numbers]
         missing = [one for one in asked if not one.path.exists()]
         (folder / row.name).mkdir(parents=True, exist_ok=True)
