@@ -37,7 +37,8 @@ def counted(folder: Path) -> dict[str, Any]:
         file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
         if file.verdict is not None and file.verdict.stable:
             counts[judge.comes_apart(file.settled_scene) is True, answer == Answer.SOLVABLE.value] += 1
-    told: dict[str, Any] = {"agent": job["agent"], "nodes": job["nodes"], "seed": job["seed"], "scenes": len(answers)}
+    told: dict[str, Any] = {"agent": job["agent"], "objects": job["objects"], "nodes": job["nodes"]}
+    told |= {"seed": job["seed"], "scenes": len(answers)}
     for name, apart in (("comes_apart", True), ("does_not", False)):
         solved, total = counts[apart, True], counts[apart, True] + counts[apart, False]
         told[name] = {"stable": total, "solvable": solved, "solvable_ci95": wilson_interval(solved, total)}
@@ -51,10 +52,12 @@ def main(
     """Counts, and prints a table."""
     rows = [counted(folder) for folder in folders]
     write_json(out, {"commit": git_commit(), "rows": rows})
-    table = Table("agent", "nodes", "scenes", "stable, come apart", "of these solvable", "stable, do not", "of these solvable")
+    table = Table(
+        "agent", "objects", "nodes", "scenes", "stable, come apart", "of these solvable", "stable, do not", "of these solvable"
+    )
     for row in rows:
         cells = [f"{row[name][key]}" for name in ("comes_apart", "does_not") for key in ("stable", "solvable")]
-        table.add_row(Path(row["agent"]).stem, str(row["nodes"]), str(row["scenes"]), *cells)
+        table.add_row(Path(row["agent"]).stem, row["objects"], str(row["nodes"]), str(row["scenes"]), *cells)
     Console().print(table)
 
 
