@@ -39,7 +39,7 @@ SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
 COMPARED = {"ceiling": FULL_KNOWLEDGE, "largest_clear": "largest-clear"}
 """Whose moves the others' are compared with, by what the figures call them."""
-SEVEN = ("random", "largest-first", "largest-clear", "student-rg", "student", FULL_KNOWLEDGE)
+SEVEN = ("random", "largest-first", "largest-clear", "student-rg", "student-dagger", "student", FULL_KNOWLEDGE)
 FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
 SETS_OF_SEVEN = ("paper_hardness", "sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "rg_25")
 TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", FOURTEEN)}
