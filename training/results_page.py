@@ -7,7 +7,7 @@ A table has the rows that have been measured so far; what is missing is not ther
 
 import json
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +30,20 @@ PAPER_GENERATORS = {
     ("sg-14", "pantry14"): {25: (6.03, 0.70)},
 }
 """Table I of the paper and its text: objects hidden and stability, by agent, object set, and nodes (SPEC section 5)."""
+
+PAPER_EXPLORERS = {
+    "sg_star_10": {"random": (0.05, 0.76), "largest-first": (0.88, 2.93), "student-rg": (0.92, 3.06), "student": (0.91, 3.13)},
+    "sg_star_15": {"random": (0.03, 1.15), "largest-first": (0.58, 3.33), "student-rg": (0.84, 4.40), "student": (0.82, 4.27)},
+    "sg_star_20": {"random": (0.00, 0.93), "largest-first": (0.32, 3.64), "student-rg": (0.36, 4.24), "student": (0.64, 4.71)},
+    "paper_hardness": {
+        "random": (0.00, 0.90),
+        "largest-first": (0.10, 2.70),
+        "student-rg": (0.52, 4.87),
+        "student": (0.91, 5.82),
+    },
+    "sg_14": {"random": (0.03, None), "largest-first": (0.56, None), "student-14": (0.64, 5.33)},
+}
+"""Tables II and III of the paper: success and objects found, by set (its 25 nodes hid as many as `paper_hardness`) and agent."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -165,31 +179,40 @@ def spread(rows: Sequence[dict[str, Any]]) -> str:
 
 def explorers() -> str:
     """Tables II and III."""
-    rows = list(read("table2.json").get("rows", []))
-    held = {(row["set"], row["agent"]) for row in rows}
-    for name in ("explorers_100.json", "explorers_14.json"):
-        rows += [row for row in read(name).get("rows", []) if (row["set"], row["agent"]) not in held]
     told = []
-    for row in rows:
+    for row in [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]:
+        success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
         cells = [row["set"], row["agent"], str(row["episodes"]), number(row["hidden"], 1)]
-        for limit in ("within_10", "within_20"):
-            cells += [with_interval(row[limit], "success", "success_ci95"), number(row[limit]["found"], 1)]
-        solvable = row.get("solvable") or {}
+        for limit, in_paper in (("within_10", True), ("within_20", False)):
+            cells += [with_interval(row[limit], "success", "success_ci95"), *([number(success)] if in_paper else [])]
+            cells += [number(row[limit]["found"], 1), *([number(found, 1)] if in_paper else [])]
+        solvable = row["solvable"] or {}
         cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
-        cells += [
-            number(row["within_20"]["collapsed"]),
-            number(row["moves_of_successes"], 1),
-            number(row.get("moves_to_ceiling")),
-        ]
+        cells += [with_interval(row["within_20"], "collapsed", "collapsed_ci95"), number(row["moves_of_successes"], 1)]
+        cells += [number(row.get(f"moves_to_{name}")) for name in ("ceiling", "largest_clear")]
         told.append(cells)
-    head = ["set", "agent", "episodes", "hidden", "success in 10", "found", "success in 20", "found", "of solvable", "of hidden"]
+    trainings = []
+    for row in read("explorer_trainings.json").get("rows", []):
+        last = row["history"][-1]
+        cells = [row["agent"], str(last["step"]), number(row["minutes"], 0)]
+        cells += [number(last[key], 3) for key in ("success", "found_share", "collapsed")]
+        trainings.append([*cells, number(last["moves_of_successes"], 1)])
+    head = ["set", "agent", "episodes", "hidden", "success in 10", "paper", "found", "paper", "success in 20", "found"]
+    head += ["of solvable", "of hidden", "collapsed", "moves", "to ceiling", "to LF-clear"]
     return f"""## Tables II and III: explorers
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
-*to ceiling*: moves on the scenes that both solve, to those of full knowledge. `python training/explorer_results.py runs/table2`
+*to ceiling*, *to LF-clear*: moves on the scenes that both solve, to those of full knowledge and of LF-clear. Every episode is a
+line of `training/results/episodes/`, with its commit. `python training/explorer_results.py`
 
-{table([*head, "collapsed", "moves", "to ceiling"], told)}
+{table(head, told)}
 ![What was found over the moves](images/explorers.png)
+
+The trainings, and 200 episodes as they ended, at fidelity `equilibrium` and within 20 moves. All had other work beside them. A
+step is a move; of a clone, a round. `training/results/explorer_trainings.json`
+
+{table(["training", "steps", "minutes", "success", "found of hidden", "collapsed", "moves"], trainings)}
+![How explorers learn](images/explorer_curves.png)
 """
 
 
@@ -247,18 +270,15 @@ def page() -> str:
     return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
 
 
-def draw_curves(path: Path) -> None:
-    """How SG* learns, seed by seed."""
+def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]]], labels: Mapping[str, str]) -> None:
+    """How trainings went, each a line: a panel for every figure that has a label."""
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
-    figure, panels = plt.subplots(1, 3, figsize=(18, 5.5), layout="constrained")
-    names = (("score", "return of a scene"), ("hidden", "hidden objects"), ("stable", "stable, share"))
-    for file in sorted(RESULTS.glob("sg_star_seed_*.json")):
-        history = json.loads(file.read_text())["history"]
-        for panel, (name, label) in zip(panels, names, strict=True):
-            panel.plot([row["step"] / 1000 for row in history], [row[name] for row in history], label=f"seed {file.stem[-1]}")
+    figure, panels = plt.subplots(1, len(labels), figsize=(18, 5.5), layout="constrained")
+    for training, history in histories.items():
+        for panel, (name, label) in zip(panels, labels.items(), strict=True):
+            panel.plot([row["step"] / 1000 for row in history], [row[name] for row in history], label=training)
             panel.set(xlabel="steps / 1000", ylabel=label)
             panel.grid(alpha=0.4)
-    panels[-1].set_ylim(0.5, 1.0)
     panels[0].legend()
     figure.savefig(path, dpi=80)
     plt.close(figure)
@@ -291,7 +311,17 @@ def main(out: Annotated[Path, typer.Option(help="Page to write.")] = PAGE) -> No
     """Writes the page and its pictures."""
     write_text(out, page())
     if out == PAGE:
-        draw_curves(IMAGES / "learning_curves.png")
+        seeds = {f"seed {f.stem[-1]}": json.loads(f.read_text())["history"] for f in sorted(RESULTS.glob("sg_star_seed_*.json"))}
+        labels = {"score": "return of a scene", "hidden": "hidden objects", "stable": "stable, share"}
+        draw_curves(IMAGES / "learning_curves.png", seeds, labels)
+        explorers = {row["agent"]: row["history"] for row in read("explorer_trainings.json")["rows"]}
+        by_moves = {agent: history for agent, history in explorers.items() if history[-1]["step"] > 1000}  # clones count rounds
+        labels = {
+            "success": "everything found, share",
+            "moves_of_successes": "moves of successes",
+            "collapsed": "collapsed, share",
+        }
+        draw_curves(IMAGES / "explorer_curves.png", by_moves, labels)
         draw_stacks(IMAGES / "stacks.png")
 
 
