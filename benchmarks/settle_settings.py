@@ -29,7 +29,8 @@ from drake_clutter.simulation.settle import settle
 NEVER = 1_000_000
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
-    "no early stop, 2.5 s": {"calm_samples": NEVER, "max_time": 2.5},
+    "no early stop, 2.5 s": {"calm_samples": NEVER, "still_displacement": 0.0, "max_time": 2.5},
+    "calm, or 2 s": {"still_displacement": 0.0},
     "1 ms steps": {"time_step": 0.001},
     "4 ms steps": {"time_step": 0.004},
     "other random offsets": {},

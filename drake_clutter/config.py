@@ -54,6 +54,8 @@ class SettleConfig:
         calm_speed: m/s; calm_displacement: m, calm_tilt_deg: deg, both since the start. A stack is calm while every object is
             below all three.
         calm_samples: calm samples in a row, 0.05 s apart, that end the simulation early.
+        still_displacement: m; so does half a second in which nothing was further than this, or turned by calm_tilt_deg, from
+            where it is: light objects under heavy ones chatter, and are never calm.
     """
 
     time_step: float = 0.002
@@ -66,6 +68,7 @@ class SettleConfig:
     calm_displacement: float = 0.001
     calm_tilt_deg: float = 0.3
     calm_samples: int = 4
+    still_displacement: float = 0.0005
 
 
 @dataclass

@@ -19,6 +19,8 @@ from drake_clutter.simulation.judge import DrakeJudge
 UPRIGHT = Orientation.UPRIGHT_0
 MARGIN = 0.00205
 """m: what the offsets of two objects, 1 mm each, can take away, and what is added for rounding."""
+STEP = 0.0001
+"""m, to which `margins` knows them."""
 
 
 FAST = FastJudge(ClutterConfig())

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
-from test_fast_judge import FAST, MARGIN, UPRIGHT, reason_of, stands
+from test_fast_judge import FAST, MARGIN, STEP, UPRIGHT, reason_of, stands
 from test_settle import BELOW
 
 from drake_clutter.config import ClutterConfig
@@ -21,9 +21,6 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, InstabilityReason, Verdict
 from drake_clutter.simulation.judge import DrakeJudge
-
-STEP = 0.0001
-"""m, to which `margins` knows them."""
 
 # --- Columns, for which there is a formula ---
 

@@ -173,13 +173,15 @@ def test_not_at_rest() -> None:
     assert result.instability.tilt == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_end_comes_when_all_are_calm() -> None:
+def test_the_end_comes_when_all_are_calm_or_still() -> None:
     box = resting("sugar_box", name="box")
     calm = settle([box], 0.7, SettleConfig(), record=True)
     assert calm.instability is None
     assert calm.motion[-1].time == pytest.approx(0.2)  # four calm samples
-    patient = settle([box], 0.7, SettleConfig(max_time=0.6, calm_samples=100), record=True)
-    assert patient.motion[-1].time == pytest.approx(0.6)
+    still = settle([box], 0.7, SettleConfig(max_time=0.8, calm_samples=100), record=True)
+    assert still.motion[-1].time == pytest.approx(0.5), "half a second in which nothing left its place"
+    patient = settle([box], 0.7, SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0), record=True)
+    assert patient.motion[-1].time == pytest.approx(0.8)
 
 
 def check_motion(result: Settled, start: list[SceneObject]) -> None:

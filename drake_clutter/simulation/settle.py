@@ -17,7 +17,7 @@ from drake_clutter.simulation.plant import add_scene_plant
 SAMPLE_PERIOD = 0.05
 """s between two looks at whether the objects have come to rest; at every second one, at whether they have fallen."""
 REST_SAMPLES = 10
-"""Samples over which what is at rest may not drift."""
+"""Samples over which what is at rest may not drift: half a second."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def settle(
 ) -> Settled:
     """Simulates objects alone on the tray, from rest where they are.
 
-    Ends when an object has fallen, when all have been calm for a while (not for a single lying cylinder that carries
-    something: it starts to roll too slowly for that), or when the config's time is up.
+    Ends when an object has fallen, when all have been calm or still for a while, or when the config's time is up. A single lying
+    cylinder that carries something starts to roll slowly: it must be still for longer.
 
     Args:
         objects: what to settle.
@@ -78,7 +78,8 @@ def settle(
 
     history = [{o.name: o.X_TO for o in objects}]
     motion = [Frame(0.0, history[0])] if record else []
-    may_end_early = not _may_creep(objects)
+    may_creep = _may_creep(objects)
+    still_samples = REST_SAMPLES * (2 if may_creep else 1)
     calm_samples, instability = 0, None
     last = math.ceil(config.max_time / SAMPLE_PERIOD)
     for sample in range(1, last + 1):
@@ -105,11 +106,24 @@ def settle(
             for o in objects
         )
         calm_samples = calm_samples + 1 if calm else 0
-        if calm_samples >= config.calm_samples and (may_end_early or instability):
+        if calm_samples >= config.calm_samples and (instability or not may_creep):
+            return Settled(instability, poses, tuple(motion))
+        if sample % 2 == 0 and len(history) > still_samples and _still(objects, history[-1 - still_samples :], config):
             return Settled(instability, poses, tuple(motion))
     if instability is None:
         instability = _still_moving(objects, poses, history[max(0, len(history) - 1 - REST_SAMPLES)], config)
     return Settled(instability, poses, tuple(motion))
+
+
+def _still(objects: Sequence[SceneObject], history: Sequence[dict[str, Pose]], config: SettleConfig) -> bool:
+    """Whether all objects have been close to where they are now."""
+    *earlier, now = history
+    return all(
+        _distance(poses[o.name], now[o.name]) < config.still_displacement
+        and tilt_between(o.object_class, poses[o.name], now[o.name]) < math.radians(config.calm_tilt_deg)
+        for poses in earlier
+        for o in objects
+    )
 
 
 def _distance(X_TA: Pose, X_TB: Pose) -> float:
