@@ -180,7 +180,11 @@ def spread(rows: Sequence[dict[str, Any]]) -> str:
 def explorers() -> str:
     """Tables II and III."""
     told = []
-    for row in [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]:
+    rows = [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]
+    held = {(row["set"], row["agent"]) for row in rows}
+    for name in ("explorers_100.json", "explorers_14.json"):  # measured before settling ended when all are still
+        rows += [row for row in read(name).get("rows", []) if (row["set"], row["agent"]) not in held]
+    for row in sorted(rows, key=lambda row: str(row["set"])):
         success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
         cells = [row["set"], row["agent"], str(row["episodes"]), number(row["hidden"], 1)]
         for limit, in_paper in (("within_10", True), ("within_20", False)):
