@@ -4,14 +4,13 @@ import json
 import subprocess
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import CATALOGUE, CLASSES, random_scene, resting, scene_of, training_script
+from conftest import CATALOGUE, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import advantage
@@ -19,15 +18,13 @@ from drake_clutter.agents.cloning import Cloning, CloningConfig
 from drake_clutter.agents.exploration import make_explorers, play
 from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, LearnedExplorer, about_explorer
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
-from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
-from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.scenes.seams import Move
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration import EpisodeEnd, legal_moves
 
@@ -258,23 +255,3 @@ def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig
     assert environment.task.hidden_at_start
     assert environment.task.end is EpisodeEnd.ALL_FOUND
     assert environment.task.steps[-1].newly_found
-
-
-def test_who_is_careful_makes_nothing_fall_that_is_known(config: ClutterConfig) -> None:
-    lower = resting("cracker_box")
-    known = [lower, resting("gelatin_box", floor=lower.top), resting("tomato_soup_can", xy=(0.25, 0.2))]
-    scene = scene_of(*known)
-    observation = LabelDetector(config.camera).look(scene).observation
-    numbers, fast = {name: k for k, name in enumerate((TRAY, *sorted(CLASSES)), start=1)}, FastExecutor(config)
-    falls = Counter[str]()
-    for seed in range(6):
-        torch.manual_seed(seed)
-        network = ExplorerNetwork(len(numbers), 8).eval()
-        for name, ahead in (("bold", None), ("careful", fast)):
-            move = LearnedExplorer(network, numbers, Path("none"), ahead=ahead).decide(known, observation, (), ()).move
-            assert move is not None
-            falls[name] += fast.execute(scene, observation, move, np.random.default_rng(0)).result is MoveResult.COLLAPSED
-    assert falls["bold"] > 0
-    assert falls["careful"] == 0
-    with pytest.raises(InputError, match="trained ones also with careful- before"):
-        make_explorers("careful-random", config)

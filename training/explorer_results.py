@@ -24,7 +24,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
-from drake_clutter.agents.exploration import CAREFUL, FULL_KNOWLEDGE, TRAINED, make_explorers
+from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
@@ -75,7 +75,6 @@ def episode_of(line: str) -> EpisodeResult:
 
 def weights_of(agent: str) -> str:
     """The hash of a trained agent's weights; "" for the others."""
-    agent = agent.removeprefix(CAREFUL)
     if agent not in TRAINED and not agent.endswith(".safetensors"):
         return ""
     return hashlib.sha256((shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent)).read_bytes()).hexdigest()

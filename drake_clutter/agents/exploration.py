@@ -6,7 +6,6 @@ from typing import Protocol
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.scenes.placement import has_clear_top
@@ -123,16 +122,13 @@ TRAINED = {
 
 
 FULL_KNOWLEDGE = "full-knowledge"
-CAREFUL = "careful-"
-"""Before the name of a trained explorer: one that looks a move ahead, see `LearnedExplorer.decide`."""
 
 
 def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
     """What makes an explorer for each episode.
 
     Args:
-        name: one of `BASELINES`, of `TRAINED`, `FULL_KNOWLEDGE`, or the file of a checkpoint; `CAREFUL` may go before a trained
-            one's.
+        name: one of `BASELINES`, of `TRAINED`, `FULL_KNOWLEDGE`, or the file of a checkpoint.
         config: the world.
 
     Raises:
@@ -143,14 +139,13 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
     if name == FULL_KNOWLEDGE:
         search = FullKnowledgeSearch(config)
         return lambda task: FullKnowledge(task, search)
-    learned = name.removeprefix(CAREFUL)
-    if learned not in TRAINED and not learned.endswith(".safetensors"):
-        allowed = f"{', '.join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])}, or a .safetensors file, trained ones also with {CAREFUL}"
-        raise InputError(f"--agent {name}; allowed are {allowed} before")
-    path = checkpoint_path(learned, TRAINED)
+    if name not in TRAINED and not name.endswith(".safetensors"):
+        allowed = ", ".join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])
+        raise InputError(f"--agent {name}; allowed are {allowed}, or a .safetensors file")
+    path = checkpoint_path(name, TRAINED)
     from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
-    return LearnedExplorers(path, FastExecutor(config) if name.startswith(CAREFUL) else None)
+    return LearnedExplorers(path)
 
 
 def play(

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
-from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
-from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
-from drake_clutter.scenes.seams import InstabilityReason, Move, Observation
-from drake_clutter.tasks.exploration import Decision, ExplorationTask, legal_moves
+from drake_clutter.scenes.scene import TRAY, SceneObject
+from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.tasks.exploration import Decision, ExplorationTask
 from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph, seen
 
 TEACHER, STUDENT = "teacher", "student"
@@ -60,16 +59,14 @@ class LearnedExplorer:
         numbers: dict[str, int],
         path: Path,
         task: ExplorationTask | None = None,
-        ahead: FastExecutor | None = None,
     ) -> None:
         """Begins an episode.
 
         Args:
             network, numbers: see `load_explorer`; path: of the checkpoint, for errors.
             task: whose scene the agent knows all of; None: it knows K_t.
-            ahead: with which it looks a move ahead; None: it does not.
         """
-        self._network, self._numbers, self._path, self._task, self._ahead = network, numbers, path, task, ahead
+        self._network, self._numbers, self._path, self._task = network, numbers, path, task
         self._known: tuple[SceneObject, ...] = ()
 
     def choose(
@@ -87,27 +84,7 @@ class LearnedExplorer:
     def decide(
         self, shown: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], failed: Collection[Move]
     ) -> Decision:
-        """The same for given objects: what is remembered is the caller's business.
-
-        One that looks ahead tries its moves in its mind, on what it knows and by the fast judge, and takes the likeliest that
-        makes nothing fall there; the likeliest of all if all do.
-        """
-        likeliest = decision = self._likeliest(shown, observation, tried, failed)
-        falls = set(failed)
-        while self._ahead is not None and decision.move is not None:
-            scene = Scene(tuple(shown), observation.tray_side)
-            outcome = self._ahead.execute(scene, observation, decision.move, np.random.default_rng(0))
-            if outcome.instability is None:
-                return decision
-            unsupported = outcome.instability.reason is InstabilityReason.UNSUPPORTED
-            picks = [decision.move.pick] if unsupported else []  # wherever it goes, something falls
-            falls |= {decision.move, *(move for move in legal_moves(observation) if move.pick in picks)}
-            decision = self._likeliest(shown, observation, tried, falls)
-        return likeliest
-
-    def _likeliest(
-        self, shown: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], failed: Collection[Move]
-    ) -> Decision:
+        """The same for given objects: what is remembered is the caller's business."""
         unknown = sorted({o.object_class.name for o in shown} - set(self._numbers))
         if unknown:
             raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
@@ -127,21 +104,21 @@ class LearnedExplorers:
         privileged: whether it knows everything.
     """
 
-    def __init__(self, path: Path, ahead: FastExecutor | None = None) -> None:
-        """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`; `ahead`: see `LearnedExplorer`.
+    def __init__(self, path: Path) -> None:
+        """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
 
         Raises:
             InputError: it cannot be read, or is none of an explorer.
         """
-        self._path, self._ahead = path, ahead
+        self._path = path
         checkpoint = load_checkpoint(path)
         self._network, self._numbers = load_explorer(checkpoint, path)
         self.privileged = checkpoint.about["kind"] == TEACHER
 
     def __call__(self, task: ExplorationTask) -> LearnedExplorer:
         """For an episode."""
-        return LearnedExplorer(self._network, self._numbers, self._path, task if self.privileged else None, self._ahead)
+        return LearnedExplorer(self._network, self._numbers, self._path, task if self.privileged else None)
 
     def student(self) -> LearnedExplorer:
         """One that knows what it is shown."""
-        return LearnedExplorer(self._network, self._numbers, self._path, ahead=self._ahead)
+        return LearnedExplorer(self._network, self._numbers, self._path)
