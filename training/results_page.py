@@ -207,7 +207,8 @@ def explorers() -> str:
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
 *to ceiling*, *to LF-clear*: moves on the scenes that both solve, to those of full knowledge and of LF-clear. Every episode is a
-line of `training/results/episodes/`, with its commit. `python training/explorer_results.py`
+line of `training/results/episodes/`, with its commit, but for older rows, which say nothing of LF-clear (`explorers_100.json`,
+`explorers_14.json`). `python training/explorer_results.py`
 
 {table(head, told)}
 ![What was found over the moves](images/explorers.png)
