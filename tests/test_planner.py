@@ -202,7 +202,8 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
                     errors.append(abs(float(gradient[joint] - sum(sides) / 2)))
     assert len(errors) > 100
     assert np.quantile(errors, 0.9) < 5e-4
-    assert max(errors) < 5e-3
+    assert np.quantile(errors, 0.99) < 2e-3
+    assert max(errors) < 1e-2, "no difference is known better than its two sides are alike"
 
 
 def test_optimised_ways_are_quicker(plan: Plan) -> None:
