@@ -185,7 +185,7 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
     """Beside the way, where faces are not parallel: between those that are, the nearest points are not unique."""
     scene, step, draw = planner().clearance_scene(PILE), 1e-4, rng(0)
     scene.hold(plan.pick, inverse(plan.X_OG))
-    errors = list[float]()
+    errors: dict[bool, list[float]] = {True: [], False: []}  # of pairs with a cylinder, and without
     for time in np.linspace(0.0, plan.phases[1].duration, 15):
         q = plan.phases[1].trajectory.value(time).ravel() + draw.normal(0, 0.1, 6)
         gradients = scene.gradients(q, 0.2)
@@ -199,11 +199,11 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
             for pair, (_, gradient) in found.items():
                 sides = (ahead[pair] - found[pair][0]) / step, (found[pair][0] - behind[pair]) / step
                 if abs(sides[0] - sides[1]) < 1e-2:  # not where the nearest corner changes
-                    errors.append(abs(float(gradient[joint] - sum(sides) / 2)))
-    assert len(errors) > 100
-    assert np.quantile(errors, 0.9) < 5e-4
-    assert np.quantile(errors, 0.99) < 2e-3
-    assert max(errors) < 1e-2, "no difference is known better than its two sides are alike"
+                    errors["tomato_soup_can" in pair].append(abs(float(gradient[joint] - sum(sides) / 2)))
+    assert min(len(of_some) for of_some in errors.values()) > 50
+    assert np.quantile(errors[True] + errors[False], 0.9) < 5e-4
+    assert max(errors[False]) < 5e-3
+    assert max(errors[True]) < 1e-2, "Drake finds the nearest points of curved faces by iteration"
 
 
 def test_optimised_ways_are_quicker(plan: Plan) -> None:

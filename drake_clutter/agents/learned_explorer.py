@@ -54,11 +54,7 @@ class LearnedExplorer:
     """Takes the likeliest move (an `ExplorationAgent`); one instance plays one episode."""
 
     def __init__(
-        self,
-        network: ExplorerNetwork,
-        numbers: dict[str, int],
-        path: Path,
-        task: ExplorationTask | None = None,
+        self, network: ExplorerNetwork, numbers: dict[str, int], path: Path, task: ExplorationTask | None = None
     ) -> None:
         """Begins an episode.
 
