@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, worth
+from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, Floats, View, worth
 
 FEWEST_POINTS = 12
 _COARSE_WITHIN = 0.015
@@ -53,7 +53,7 @@ def spread_points(view, most):  # type: ignore[no-untyped-def]
     return points[:found], edges[:at_edge]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _plane(points, altitude):  # type: ignore[no-untyped-def]
     """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
     count, state = len(points), 12345
@@ -106,7 +106,7 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
     return along[cut], along[len(points) - 1 - cut]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _axes_in(n):  # type: ignore[no-untyped-def]
     """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
     x_axis = np.cross(np.array([0.0, 1.0, 0.0]) if abs(n[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), n)
@@ -114,7 +114,7 @@ def _axes_in(n):  # type: ignore[no-untyped-def]
     return x_axis, np.cross(n, x_axis)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _edge_angle(x, y):  # type: ignore[no-untyped-def]
     """The angle, rad within a quarter turn, at which points x, y (N,) m fall on the fewest lines (a Hough transform)."""
     best, best_angle = -1.0, 0.0
@@ -131,7 +131,7 @@ def _edge_angle(x, y):  # type: ignore[no-untyped-def]
     return best_angle
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _least_rectangle(x, y):  # type: ignore[no-untyped-def]
     """The angle, rad within a quarter turn, of the smallest rectangle about points x, y (N,) m."""
     best, best_angle = np.inf, 0.0
@@ -157,7 +157,7 @@ def _middles(low, high, size, guess, slack):  # type: ignore[no-untyped-def]
     return np.array([low + size / 2, high - size / 2, min(max(guess, high - size / 2), low + size / 2)])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _faced(half, axes, points, p, n, angles, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
     """Adds the poses with one of the axes along a plane's normal, its face on the plane's points, to R and p_TO; their number."""
     x_axis, y_axis = _axes_in(n)
@@ -180,7 +180,7 @@ def _faced(half, axes, points, p, n, angles, guess, slack, R, p_TO, count):  # t
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
     """Adds the poses of a cylinder whose side is seen, its axis as given (3,), to R and p_TO; returns their number."""
     level = math.hypot(axis[0], axis[1])
@@ -205,59 +205,56 @@ def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
-def candidates(cylinder, half, points, edges, view, slack):  # type: ignore[no-untyped-def]
-    """The most promising poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first."""
+def _worth_of_each(cylinder, half, R, p_TO, view, rays):  # type: ignore[no-untyped-def]
+    """(n,) values of poses."""
+    value = np.empty(len(R))
+    for k in range(len(R)):
+        value[k] = worth(cylinder, half, R[k], p_TO[k], view, rays, _COARSE_WITHIN)
+    return value
+
+
+def candidates(
+    cylinder: bool, half: Floats, points: Floats, edges: Floats, view: View, slack: float
+) -> tuple[Floats, Floats, Floats]:
+    """The most promising poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first.
+
+    Not compiled, but made of what is: as one piece that takes the compiler 40 s.
+
+    Args:
+        cylinder: or a box. half: (3,) m, half its size.
+        points, edges: see `spread_points`. view: where they are seen.
+        slack: one of `SLACKS`.
+    """
     R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0
-    guess, vertical = view.p_TO_guess, np.array([0.0, 0.0, 1.0])
+    guess, given = view.p_TO_guess, (slack, R, p_TO)
     n, p, member = _plane(points, view.altitude)
-    rest = points[~member]
-    has_second = len(rest) > max(FEWEST_POINTS, _SECOND_PLANE_SHARE * len(points))
-    second_n, second_p, second_member = _plane(rest if has_second else points, view.altitude)
-    has_second = has_second and abs((n * second_n).sum()) < 0.2 and second_member.sum() > _SECOND_PLANE_SHARE * len(points)
-    for which in range(2):
-        if which == 1:
-            if not has_second:
-                break
-            n, p, second_n, face = second_n, second_p, n, rest[second_member]
-        else:
-            face = points[member]
-        if n[2] > math.cos(_PLANE_LEVEL_WITHIN):
-            n = vertical
+    planes, rest = [(n, p, points[member])], points[~member]
+    if len(rest) > max(FEWEST_POINTS, _SECOND_PLANE_SHARE * len(points)):
+        second_n, second_p, second_member = _plane(rest, view.altitude)
+        if abs(n @ second_n) < 0.2 and second_member.sum() > _SECOND_PLANE_SHARE * len(points):
+            planes.append((second_n, second_p, rest[second_member]))
+    normals = [np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(_PLANE_LEVEL_WITHIN) else n for n, _, _ in planes]
+    for n, (_, p, face) in zip(normals, planes, strict=True):
         if cylinder:
-            count = _faced(half, (2,), face, p, n, np.zeros(1), guess, slack, R, p_TO, count)
+            count = _faced(half, np.array([2]), face, p, n, np.zeros(1), guess, *given, count)
             continue
         x_axis, y_axis = _axes_in(n)
-        angles, some = np.empty(3), 0
         beside = edges[np.abs((edges - p) @ n) < 2 * _ON_PLANE]
-        if len(beside) >= FEWEST_POINTS:
-            angles[some] = _edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)
-            some += 1
-        angles[some] = _least_rectangle((face - p) @ x_axis, (face - p) @ y_axis)
-        some += 1
-        if has_second:
-            angles[some] = math.atan2((second_n * y_axis).sum(), (second_n * x_axis).sum())
-            some += 1
-        count = _faced(half, (0, 1, 2), face, p, n, angles[:some], guess, slack, R, p_TO, count)
+        angles = [_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)] if len(beside) >= FEWEST_POINTS else []
+        angles.append(_least_rectangle((face - p) @ x_axis, (face - p) @ y_axis))
+        angles += [math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n]
+        count = _faced(half, np.arange(3), face, p, n, np.array(angles), guess, *given, count)
     if cylinder:
-        mean = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
-        off = points - mean
+        off, fewer = points - points.mean(axis=0), points[::2].copy()
         main = np.linalg.eigh(off.T @ off)[1][:, 2].copy()
-        fewer = points[::2].copy()
-        count = _lying(half, fewer, main, guess, slack, R, p_TO, count)
-        for tilt in (0.0, -0.5, 0.5):
-            azimuth = math.atan2(main[1], main[0])
-            for k in range(12):
-                a = azimuth + k * math.pi / 12 if tilt == 0.0 else azimuth + k * math.pi / 6
-                if tilt != 0.0 and k >= 6:
-                    break
+        count = _lying(half, fewer, main, guess, *given, count)
+        azimuth = math.atan2(main[1], main[0])
+        for tilt, parts in ((0.0, 12), (-0.5, 6), (0.5, 6)):
+            for a in azimuth + np.arange(parts) * (math.pi / parts):
                 axis = np.array([math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)])
-                count = _lying(half, fewer, axis, guess, slack, R, p_TO, count)
-    rough = np.empty(count)
-    for k in range(count):
-        rough[k] = worth(cylinder, half, R[k], p_TO[k], view, _FIRST_RAYS, _COARSE_WITHIN)
+                count = _lying(half, fewer, axis, guess, *given, count)
+    rough = _worth_of_each(cylinder, half, R[:count], p_TO[:count], view, _FIRST_RAYS)
     best = np.argsort(-rough)[:_PROMISING]
-    value = np.empty(len(best))
-    for k in range(len(best)):
-        value[k] = worth(cylinder, half, R[best[k]], p_TO[best[k]], view, COARSE_RAYS, _COARSE_WITHIN)
-    order = best[np.argsort(-value)]
-    return R[order], p_TO[order], np.sort(value)[::-1]
+    value = _worth_of_each(cylinder, half, R[best], p_TO[best], view, COARSE_RAYS)
+    order = np.argsort(-value)
+    return R[best[order]], p_TO[best[order]], value[order]
