@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, Floats, View, worth
 
@@ -54,45 +55,43 @@ def spread_points(view, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _plane(points, altitude):  # type: ignore[no-untyped-def]
-    """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
+def _fullest_plane(points):  # type: ignore[no-untyped-def]
+    """Normal (3,) and a point (3,) m of that plane through three of the points (N, 3) which holds the most of them."""
     count, state = len(points), 12345
-    best, best_n, best_p = 0, np.array([0.0, 0.0, 1.0]), points[0].copy()
+    best, normal, point = 0, np.array((0.0, 0.0, 1.0)), points[0].copy()
     picks = np.empty(3, np.int64)
     for _ in range(_PLANE_TRIES):
         for i in range(3):
             state = (state * 1103515245 + 12345) % 2147483648
             picks[i] = (state >> 8) % count
-        n = np.cross(points[picks[1]] - points[picks[0]], points[picks[2]] - points[picks[0]])
-        length = math.sqrt((n * n).sum())
+        p, q, r = points[picks[0]], points[picks[1]], points[picks[2]]
+        ax, ay, az, bx, by, bz = q[0] - p[0], q[1] - p[1], q[2] - p[2], r[0] - p[0], r[1] - p[1], r[2] - p[2]
+        x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        length = math.sqrt(x * x + y * y + z * z)
         if length < 1e-6:
             continue
-        n /= length
-        p = points[picks[0]]
+        x, y, z = x / length, y / length, z / length
         on = 0
         for k in range(count):
-            off = n[0] * (points[k, 0] - p[0]) + n[1] * (points[k, 1] - p[1]) + n[2] * (points[k, 2] - p[2])
-            on += abs(off) < _ON_PLANE
+            on += abs(x * (points[k, 0] - p[0]) + y * (points[k, 1] - p[1]) + z * (points[k, 2] - p[2])) < _ON_PLANE
         if on > best:
-            best, best_n, best_p = on, n, p.copy()
-    member = np.zeros(count, np.bool_)
+            best = on
+            normal[0], normal[1], normal[2] = x, y, z
+            point[:] = p
+    return normal, point
+
+
+def _plane(points: Floats, altitude: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
+    n, p = _fullest_plane(points)
     for _ in range(2):
-        total, mean = 0, np.zeros(3)
-        for k in range(count):
-            x, y, z = points[k, 0] - best_p[0], points[k, 1] - best_p[1], points[k, 2] - best_p[2]
-            member[k] = abs(x * best_n[0] + y * best_n[1] + z * best_n[2]) < _ON_PLANE
-            if member[k]:
-                total += 1
-                for i in range(3):
-                    mean[i] += points[k, i]
-        if total < 3:
+        member = np.abs((points - p) @ n) < _ON_PLANE
+        if member.sum() < 3:
             break
-        best_p = mean / total
-        off = points[member] - best_p
-        best_n = np.linalg.eigh(off.T @ off)[1][:, 0].copy()
-    if best_n[2] * (altitude - best_p[2]) < best_n[0] * best_p[0] + best_n[1] * best_p[1]:
-        best_n = -best_n
-    return best_n, best_p, member
+        p = points[member].mean(axis=0)
+        off = points[member] - p
+        n = np.linalg.eigh(off.T @ off)[1][:, 0].copy()
+    return (n if n[2] * altitude >= n @ p else -n), p, member
 
 
 @njit(cache=True)
@@ -106,11 +105,10 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
     return along[cut], along[len(points) - 1 - cut]
 
 
-@njit(cache=True, nogil=True)
-def _axes_in(n):  # type: ignore[no-untyped-def]
+def _axes_in(n: Floats) -> tuple[Floats, Floats]:
     """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
-    x_axis = np.cross(np.array([0.0, 1.0, 0.0]) if abs(n[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), n)
-    x_axis /= math.sqrt((x_axis * x_axis).sum())
+    x_axis = np.cross((0.0, 1.0, 0.0) if abs(n[1]) < 0.9 else (1.0, 0.0, 0.0), n)
+    x_axis /= np.linalg.norm(x_axis)
     return x_axis, np.cross(n, x_axis)
 
 
@@ -158,12 +156,13 @@ def _middles(low, high, size, guess, slack):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _faced(half, axes, points, p, n, angles, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
-    """Adds the poses with one of the axes along a plane's normal, its face on the plane's points, to R and p_TO; their number."""
-    x_axis, y_axis = _axes_in(n)
-    for angle in angles:
-        first = math.cos(angle) * x_axis + math.sin(angle) * y_axis
-        second = np.cross(n, first)
+def _faced(half, axes, points, p, n, sides, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
+    """Adds the poses with one of the axes along a plane's normal, its face on the plane's points, to R and p_TO; their number.
+
+    `sides`: (k, 2, 3) directions in the plane that the face's sides may have, right-handed with the normal.
+    """
+    for k in range(len(sides)):
+        first, second = sides[k, 0], sides[k, 1]
         low, high = _extent(points, p, first)
         left, right = _extent(points, p, second)
         for a in axes:
@@ -235,15 +234,16 @@ def candidates(
             planes.append((second_n, second_p, rest[second_member]))
     normals = [np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(_PLANE_LEVEL_WITHIN) else n for n, _, _ in planes]
     for n, (_, p, face) in zip(normals, planes, strict=True):
-        if cylinder:
-            count = _faced(half, np.array([2]), face, p, n, np.zeros(1), guess, *given, count)
-            continue
         x_axis, y_axis = _axes_in(n)
-        beside = edges[np.abs((edges - p) @ n) < 2 * _ON_PLANE]
-        angles = [_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)] if len(beside) >= FEWEST_POINTS else []
-        angles.append(_least_rectangle((face - p) @ x_axis, (face - p) @ y_axis))
-        angles += [math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n]
-        count = _faced(half, np.arange(3), face, p, n, np.array(angles), guess, *given, count)
+        angles = [0.0]
+        if not cylinder:
+            beside = edges[np.abs((edges - p) @ n) < 2 * _ON_PLANE]
+            angles = [_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)] if len(beside) >= FEWEST_POINTS else []
+            angles.append(_least_rectangle((face - p) @ x_axis, (face - p) @ y_axis))
+            angles += [math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n]
+        firsts = [math.cos(angle) * x_axis + math.sin(angle) * y_axis for angle in angles]
+        sides = np.array([(first, np.cross(n, first)) for first in firsts])
+        count = _faced(half, np.array([2]) if cylinder else np.arange(3), face, p, n, sides, guess, *given, count)
     if cylinder:
         off, fewer = points - points.mean(axis=0), points[::2].copy()
         main = np.linalg.eigh(off.T @ off)[1][:, 2].copy()
