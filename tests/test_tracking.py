@@ -114,6 +114,14 @@ def test_what_is_known_stands_until_something_explains_more() -> None:
     assert lost == ("sugar_box_1",)
 
 
+def test_what_is_known_gives_way_to_what_a_detector_is_sure_of() -> None:
+    known, _, across = side_by_side()
+    sure = replace(across, detections=tuple(replace(d, sure=True) for d in across.detections))
+    observation, lost = tracked(known, sure)
+    assert {d.X_TO for d in observation.detections} == {d.X_TO for d in across.detections}
+    assert lost == ()
+
+
 def test_what_was_missed_once_but_looks_the_same_is_still_in_view() -> None:
     known, seen, _ = side_by_side()
     observation, _ = tracked(known, replace(seen, detections=seen.detections[:1]))

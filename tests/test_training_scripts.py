@@ -76,7 +76,7 @@ def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("drake", [False, True])
 def test_a_set_of_scenes(drake: bool, tmp_path: Path) -> None:
     script, work = training_script("make_scenes"), tmp_path / "work" if drake else None
-    options = {"agent": "random", "nodes": 12, "work": work}
+    options = {"agent": "random", "nodes": 10, "work": work}
     script.main(tmp_path / "first.json", count=2, seed=1, **options)
     first = load_scene_set(tmp_path / "first.json", CATALOGUE)
     assert first.about["judge"] == ("drake" if drake else "fast")

@@ -74,7 +74,7 @@ class Row:
 ROWS = [
     Row(perception, motion, scenes, agent, first, count)
     for scenes, agent, first, count in (("sg_star_25", "student", 60, 100), ("sg_14", "student-14", 50, 50))
-    for perception, motion in (("depth", "settle"), ("labels", "arm"), ("depth", "arm"))
+    for perception, motion in (("depth-color", "settle"), ("depth-color", "arm"), ("labels", "arm"), ("depth", "arm"))
 ]
 
 

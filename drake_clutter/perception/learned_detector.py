@@ -47,10 +47,21 @@ LEAST_SHARE = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
 
 
+SURE_VOTES, VOTE_WITHIN = 0.8, 0.03
+"""A detection is sure if such a share of its pixels, by their chances of its class, votes for its middle within so many m."""
+TWO_INSTEAD = 0.1
+"""Of the pixels in which a pose is seen, that in which the camera sees past it, if two may be there instead."""
+
+
 class _Candidate(NamedTuple):
     object_class: ObjectClass
     fitted: FittedPose
     explains: Explanation
+
+
+def _seen_past(explains: Explanation) -> bool:
+    """Whether the camera sees past so much of a pose that two smaller objects may lie side by side there."""
+    return explains.past > TWO_INSTEAD * int(np.count_nonzero(explains.seen))
 
 
 def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Candidate]:
@@ -106,6 +117,7 @@ class LearnedDetector:
                 classes = [network.classes.index(one.object_class.name) for one in best]
                 masks += doubtful(surface, explained, classes, chances)
             else:
+                masks += [mask for one, mask in zip(best, explained, strict=True) if _seen_past(one.explains)]
                 masks = [half for mask in masks for half in halves(mask, votes_T)]
             poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
@@ -116,7 +128,10 @@ class LearnedDetector:
             mask = e.mask(depth.shape)
             counted[name] += 1
             clean[mask] = e.away[e.seen]
-            found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask))
+            answers = coarse(mask[window.rows, window.columns])
+            here = np.linalg.norm(votes_T[answers] - candidate.fitted.X_TO.p, axis=1) < VOTE_WITHIN  # false where it is NaN
+            sure = bool(np.sum(here * chances[network.classes.index(name)][answers]) > SURE_VOTES * np.count_nonzero(answers))
+            found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask, sure))
         return Observation(clean, tuple(found), self._camera, self._tray_side)
 
     def _guessed(

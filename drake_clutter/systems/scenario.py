@@ -22,7 +22,7 @@ class Scenario:
         catalogue: a folder with object classes of one's own, or "".
         generator, objects, nodes: as for `drake-clutter generate`.
         agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
-        perception: what sees: labels, the perfect detector; depth, the trained one; or the file of a checkpoint.
+        perception: what sees: labels, the perfect detector; depth or depth-color, trained ones; or the file of a checkpoint.
             A trained one recognises classes of `objects`.
         camera_noise: whether what a trained network is given has a depth camera's noise.
         max_moves: after which it ends.
@@ -44,7 +44,10 @@ class Scenario:
     arm: ArmConfig = field(default_factory=ArmConfig)
 
 
-DETECTORS = {"depth": "training/checkpoints/detector_depth.safetensors"}
+DETECTORS = {
+    "depth": "training/checkpoints/detector_depth.safetensors",
+    "depth-color": "training/checkpoints/detector_color.safetensors",
+}
 """The shipped detectors, by name."""
 
 

@@ -80,7 +80,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
     """An image with the known objects that are still where they were, also those that were not recognised in it.
 
     A detector in doubt may say one thing now and another then: two boxes side by side may be two that lie across them. What is
-    known stands as long as the depth is as it should be there, and no detection explains more of it.
+    known stands as long as the depth is as it should be there, and no detection is sure of something else or explains more.
     """
     recognised_now, familiar = set[str](), set[str]()
     for object_class in {o.object_class for o in known}:
@@ -105,7 +105,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         within = (np.count_nonzero(d.mask & detection.mask) for d in still.values() if np.count_nonzero(d.mask) > MORE * size)
         return bool(size) and (explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within))
 
-    kept = [d for d in observation.detections if d.name in familiar or not no_better(d)]
+    kept = [d for d in observation.detections if d.name in familiar or d.sure or not no_better(d)]
     taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
     steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
     return replace(observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady)))

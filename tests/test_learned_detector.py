@@ -1,0 +1,44 @@
+"""The shipped networks in images that nobody has learned from."""
+
+import numpy as np
+import pytest
+from conftest import CATALOGUE, resting, scene_of
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.learned_detector import LearnedDetector
+from drake_clutter.perception.segmentation import SegmentationNetwork
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.systems.scenario import DETECTORS
+
+
+@pytest.fixture(scope="module", params=DETECTORS)
+def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
+    network = SegmentationNetwork.load(shipped_path(DETECTORS[request.param]))
+    return LearnedDetector(network, CATALOGUE.object_set("ycb7"), config.camera, config.layout.tray_side)
+
+
+def heap() -> Scene:
+    """Two small boxes side by side, whose tops together look like a larger one's, and other things about them."""
+    boxes = [resting("gelatin_box", Orientation.FLAT_0, (0.0, y), name=f"gelatin_box_{y}") for y in (-0.0375, 0.0375)]
+    others = [resting("sugar_box", Orientation.FLAT_90, (-0.2, 0.1)), resting("tomato_soup_can", xy=(0.2, 0.15))]
+    return scene_of(*boxes, *others, resting("cracker_box", Orientation.FLAT_0, (0.2, -0.2)))
+
+
+def test_it_sees_what_is_there_and_is_sure_of_it(detector: LearnedDetector, config: ClutterConfig) -> None:
+    scene = heap()
+    images = OverheadCamera(config.camera).render(scene)
+    seen = detector.detect(images.depth, images.color)
+    assert sorted(d.object_class.name for d in seen.detections) == sorted(o.object_class.name for o in scene.objects)
+    for o in scene.objects:
+        nearest = min(seen.detections, key=lambda d: float(np.linalg.norm(d.X_TO.p - o.X_TO.p)))
+        assert nearest.object_class.name == o.object_class.name
+        assert np.linalg.norm(nearest.X_TO.p - o.X_TO.p) < 0.005
+    assert sum(d.sure for d in seen.detections) >= len(scene.objects) - 1
+
+
+def test_an_empty_tray_is_empty(detector: LearnedDetector, config: ClutterConfig) -> None:
+    images = OverheadCamera(config.camera).render(scene_of())
+    assert detector.detect(images.depth, images.color).detections == ()
