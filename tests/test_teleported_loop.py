@@ -56,14 +56,14 @@ def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
 def test_rows_of_the_results() -> None:
     script = training_script("closed_loop_results")
     episode = {"hidden": 2, "found": 2, "moves": 4, "robot": 60.0, "wall": 9.0, "not_planned": {}, "results": {}, "arm_can": True}
-    episode |= {"objects": 5, "known": 6, "recognised": 4}
+    episode |= {"objects": 5, "known": 6, "recognised": 4, "commit": "abc"}
     episodes = [
         episode | {"ended": "all found"},
         episode | {"ended": "all found", "arm_can": False},
         episode | {"ended": "collapsed", "found": 1, "results": {MoveResult.DROPPED.value: 1}},
         episode | {"ended": "out of moves", "found": 0, "not_planned": {"no seal": 3}},
         episode | {"ended": "nothing feasible", "found": 0, "arm_can": False},
-        {"ended": "exception", "wall": 1.0, "arm_can": True},
+        {"ended": "exception", "wall": 1.0, "arm_can": True, "commit": "def"},
     ]
     row = script.row_of(script.ROWS[0], episodes)
     assert (row["success"], row["arm_can"], row["success_of_arm_can"]) == (2 / 6, 4 / 6, 1 / 4)
@@ -72,6 +72,7 @@ def test_rows_of_the_results() -> None:
     assert (row["dropped"], row["not_planned"]) == (1, {"no seal": 3})
     held, refused = "what is left lies behind what no cup holds", "moves that the arm cannot plan"
     assert row["failed_of"] == {"collapsed": 1, refused: 1, held: 1, "exception": 1}
+    assert row["commits"] == ["abc", "def"]
     assert json.dumps(row)
     nothing = script.row_of(script.ROWS[0], episodes[-1:])
     assert (nothing["success"], nothing["found"], nothing["robot_minutes"], nothing["failed_of"]) == (

@@ -1,14 +1,16 @@
 """The closed loop on frozen sets: perfect or learned perception, moves teleported and settled, or carried out by the arm.
 
-    python training/closed_loop_results.py runs/closed_loop --workers 2
+    python training/closed_loop_results.py --workers 2
     python training/closed_loop_results.py runs/closed_loop --only arm --count 20 --out runs/part.json
 
-Every episode is a file; a run that was stopped goes on with what is missing. An episode that ends in an exception is counted as
-one. An episode is a success when a referee, who knows the truth, has seen every object in view; `list_recall` and
-`list_precision` say how right the agent's own list of objects then is: class, and place within 4 cm. `arm_can` says of a scene
-that nothing hidden stays behind objects that no cup holds, or that carry such: more than that no arm finds.
+Every episode is a line of a file in training/results/closed_loop, a file for each row; what is there is not played again. An
+episode that ends in an exception is counted as one. An episode is a success when a referee, who knows the truth, has seen every
+object in view; `list_recall` and `list_precision` say how right the agent's own list of objects then is: class, and place within
+4 cm. `arm_can` says of a scene that nothing hidden stays behind objects that no cup holds, or that carry such: more than that no
+arm finds.
 """
 
+import hashlib
 import json
 import time
 from collections import Counter
@@ -24,26 +26,28 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.fast.judge import FastJudge
-from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
+from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.scenes.seams import CannotJudge, MoveResult
 from drake_clutter.systems.closed_loop import ClosedLoop
-from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
+from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
 from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 HERE = Path(__file__).parent
-OUT = HERE / "results" / "closed_loop.json"
+OUT, EPISODES = HERE / "results" / "closed_loop.json", HERE / "results" / "closed_loop"
 
 
 @dataclass(frozen=True)
@@ -74,21 +78,20 @@ class Row:
 ROWS = [
     Row(perception, motion, scenes, agent, first, count)
     for scenes, agent, first, count in (("sg_star_25", "student", 60, 100), ("sg_14", "student-14", 50, 50))
-    for perception, motion in (("depth-color", "settle"), ("depth-color", "arm"), ("labels", "arm"), ("depth", "arm"))
+    for perception, motion in (("depth", "settle"), ("depth-color", "settle"), ("depth", "arm"), ("labels", "arm"))
 ]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """One episode: a scene of a row's set, and where its result goes."""
+    """One episode: a scene of a row's set."""
 
     row: Row
     number: int
-    path: Path
 
 
 class Player:
-    """Plays episodes, one file each; a worker for the runner."""
+    """Plays episodes; a worker for the runner."""
 
     def __init__(self) -> None:
         self._catalogue = load_catalogue()
@@ -97,8 +100,8 @@ class Player:
         self._judge = FastJudge(Scenario().world)
         self._search = FullKnowledgeSearch(Scenario().world, self._judge)
 
-    def __call__(self, asked: Asked) -> None:
-        """Plays one."""
+    def __call__(self, asked: Asked) -> dict[str, Any]:
+        """Plays one, and tells how it went."""
         row, number = asked.row, asked.number
         held: SceneSet = self._set(row.scenes)
         scenario = Scenario(agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number)
@@ -115,7 +118,7 @@ class Player:
                 "robot": robot,
                 "ended": task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value,
             }
-        write_json(asked.path, told | {"wall": time.perf_counter() - begun})
+        return told | {"wall": time.perf_counter() - begun}
 
     def _played(
         self, scene: Scene, scenario: Scenario, motion: str
@@ -139,6 +142,30 @@ class Player:
                 fixed |= below
         in_view = self._judge.rays.observe(scene)[0].detections
         return self._search.never_found(scene, [d.name for d in in_view], fixed)
+
+
+def played(row: Row, count: int, workers: int, path: Path) -> list[dict[str, Any]]:
+    """The first episodes of a row; those that the file has not got are played, and written as they end.
+
+    Raises:
+        InputError: the file holds episodes of other networks or scenes.
+    """
+    scenes = load_scene_set(HERE / "scenes" / f"{row.scenes}.json", load_catalogue())
+    networks = [checkpoint_path(row.agent, TRAINED)]
+    if row.perception != "labels":
+        networks.append(checkpoint_path(row.perception, DETECTORS))
+    asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256}
+    asked |= {"weights": [hashlib.sha256(file.read_bytes()).hexdigest() for file in networks]}
+    lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
+    if json.loads(lines[0]) != asked:
+        raise InputError(f"{path}: holds episodes of other networks or scenes; give another folder as DIR")
+    missing = [Asked(row, row.first + k) for k in range(len(lines) - 1, count)]
+    commit, done = git_commit(), len(lines) - 1
+    made = map_ordered(Player, missing, workers=workers)
+    for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
+        lines.append(json.dumps(told | {"commit": commit}))
+        write_text(path, "\n".join(lines) + "\n")
+    return [json.loads(line) for line in lines[1 : 1 + count]]
 
 
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:
@@ -178,7 +205,9 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     played, able = [e for e in episodes if e["ended"] != "exception"], [k for k, e in enumerate(episodes) if e["arm_can"]]
     won_able = sum(won[k] for k in able)
     told = {
+        "name": row.name,
         **asdict(row),
+        "commits": sorted({e["commit"] for e in episodes}),
         "episodes": len(episodes),
         "success": sum(won) / len(won),
         "success_ci95": wilson_interval(sum(won), len(won)),
@@ -225,7 +254,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = EPISODES,
     workers: Annotated[int, typer.Option(min=1)] = 1,
     count: Annotated[int | None, typer.Option(min=1, help="Of each row's scenes, at most.")] = None,
     only: Annotated[str | None, typer.Option(help="Of rows whose name contains this.")] = None,
@@ -235,24 +264,20 @@ def main(
     out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
 ) -> None:
     """Plays what is missing and prints the table."""
-    if out == OUT and (only or count or perception):
-        raise InputError(f"--out {out}: is the whole table's; give another file for a part of it")
+    if out == OUT and (perception or folder != EPISODES):
+        raise InputError(f"--out {out}: is of the shipped detectors and the episodes in {EPISODES}; give another file")
     rows = [row for row in ROWS if only is None or only in row.name]
     if not rows:
         raise InputError(f"--only {only}; allowed is a part of one of {', '.join(row.name for row in ROWS)}")
-    told = list[dict[str, Any]]()
+    folder.mkdir(parents=True, exist_ok=True)
+    told = json.loads(out.read_text())["rows"] if out.exists() else []
     for row in rows:
         if perception is not None and row.perception != "labels":
             row = replace(row, perception=perception)
-        numbers = range(row.first, row.first + min(row.count, count or row.count))
-        asked = [Asked(row, k, folder / row.name / f"{k:04d}.json") for k in numbers]
-        missing = [one for one in asked if not one.path.exists()]
-        (folder / row.name).mkdir(parents=True, exist_ok=True)
-        made = map_ordered(Player, missing, workers=workers)
-        for _ in track(made, row.name, len(asked), len(asked) - len(missing), console=Console(stderr=True)):
-            pass
-        told.append(row_of(row, [json.loads(one.path.read_text()) for one in asked]))
-        write_json(out, {"commit": git_commit(), "rows": told})
+        there = min(row.count, count or row.count)
+        made = row_of(row, played(row, there, workers, folder / f"{row.name}.jsonl"))
+        told = sorted([made, *(other for other in told if other["name"] != row.name)], key=lambda other: str(other["name"]))
+        write_json(out, {"rows": told})
     Console(width=180).print(table_of(told))
 
 

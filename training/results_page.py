@@ -232,15 +232,16 @@ def closed_loop() -> str:
             cells += [with_interval(row, "success_of_arm_can", "success_of_arm_can_ci95"), number(row["found_of_hidden"])]
             cells += [number(row.get("list_recall")), number(row.get("list_precision")), number(row["moves_of_successes"], 1)]
             failures = ", ".join(f"{count} {reason}" for reason, count in row["failed_of"].items())
+            commits = ", ".join(row.get("commits", [held.get("commit")]))
             minutes = number(row["robot_minutes"], 1) if row["motion"] == "arm" else ""
-            told.append([*cells, minutes, number(row["wall_seconds"], 0), failures or "none", f"`{path.name}`, {held['commit']}"])
+            told.append([*cells, minutes, number(row["wall_seconds"], 0), failures or "none", f"`{path.name}`, {commits}"])
     head = ["set", "perception", "motion", "episodes", "success", "arm can", "success of these", "found of hidden", "list recall"]
     head += ["list precision", "moves", "robot min", "wall s", "the others", "from"]
     return f"""## The closed loop
 
 Within 20 moves. *Arm can*: scenes in which nothing stays hidden behind what no cup holds. *List*: of the objects that the agent
 knows by class and place when all has been in view.
-`python training/closed_loop_results.py runs/closed_loop`
+`python training/closed_loop_results.py --workers 2`
 
 {table(head, told)}"""
 
