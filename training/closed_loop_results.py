@@ -28,23 +28,20 @@ from rich.table import Table
 
 from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.agents.generation import mean_interval, wilson_interval
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
-from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
+from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.scenes.seams import CannotJudge, MoveResult
+from drake_clutter.scenes.seams import MoveResult
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
 from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
+from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 HERE = Path(__file__).parent
 OUT, EPISODES = HERE / "results" / "closed_loop.json", HERE / "results" / "closed_loop"
@@ -97,8 +94,7 @@ class Player:
         self._catalogue = load_catalogue()
         self._set = cache(lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue))
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
-        self._judge = FastJudge(Scenario().world)
-        self._search = FullKnowledgeSearch(Scenario().world, self._judge)
+        self._ceiling = ArmCeiling(Scenario().world, Scenario().arm)
 
     def __call__(self, asked: Asked) -> dict[str, Any]:
         """Plays one, and tells how it went."""
@@ -108,7 +104,7 @@ class Player:
         scene = held.settled(number, held.grammar, scenario.world.layout)
         begun = time.perf_counter()
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
-        told["arm_can"] = not self._never_found_by_arm(scene, scenario)
+        told["arm_can"] = not self._ceiling.never_found(scene)
         try:
             task, known, robot, end = self._played(scene, scenario, row.motion)
         except Exception as error:  # whatever it is, it is a result
@@ -131,17 +127,6 @@ class Player:
             return loop.task, loop.known, timing.robot, timing.end
         assert perceive is not None, "labels with settle are not in the rows"
         return *explore_images(scene, choose, perceive, **options), 0.0, ""
-
-    def _never_found_by_arm(self, scene: Scene, scenario: Scenario) -> tuple[str, ...]:
-        """What stays hidden behind what no cup holds, and what carries that."""
-        planner = PickPlacePlanner(scenario.arm, PlannerConfig(), scene.tray_side, scenario.world.camera.altitude)
-        fixed = {o.name for o in scene.objects if not planner.holds(o)}
-        supports = self._judge.supports(scene)
-        if not isinstance(supports, CannotJudge):
-            while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
-                fixed |= below
-        in_view = self._judge.rays.observe(scene)[0].detections
-        return self._search.never_found(scene, [d.name for d in in_view], fixed)
 
 
 def played(row: Row, count: int, workers: int, path: Path) -> list[dict[str, Any]]:

@@ -1,0 +1,30 @@
+"""What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
+
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.planner import PickPlacePlanner
+from drake_clutter.arm.station import ArmConfig
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
+
+
+class ArmCeiling:
+    """Knows everything of a scene, and what the cup holds."""
+
+    def __init__(self, world: ClutterConfig, arm: ArmConfig) -> None:
+        """For scenes in a world, with an arm."""
+        self._world, self._arm, self._judge = world, arm, FastJudge(world)
+        self._search = FullKnowledgeSearch(world, self._judge)
+
+    def never_found(self, scene: Scene) -> tuple[str, ...]:
+        """What stays hidden behind what no cup holds, and behind what carries that; the scene is at rest."""
+        planner = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, self._world.camera.altitude)
+        fixed = {o.name for o in scene.objects if not planner.holds(o)}
+        supports = self._judge.supports(scene)
+        if not isinstance(supports, CannotJudge):
+            while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
+                fixed |= below
+        in_view = self._judge.rays.observe(scene)[0].detections
+        return self._search.never_found(scene, [d.name for d in in_view], fixed)
