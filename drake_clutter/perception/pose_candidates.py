@@ -81,16 +81,36 @@ def _fullest_plane(points):  # type: ignore[no-untyped-def]
     return normal, point
 
 
+@njit(cache=True, nogil=True)
+def _on_plane(points, n, p):  # type: ignore[no-untyped-def]
+    """Which of the points (N, 3) are on a plane, how many, their mean (3,), and their scatter (3, 3) about it."""
+    member, mean, scatter = np.zeros(len(points), np.bool_), np.zeros(3), np.zeros((3, 3))
+    total = 0
+    for k in range(len(points)):
+        q = points[k]
+        if abs((q[0] - p[0]) * n[0] + (q[1] - p[1]) * n[1] + (q[2] - p[2]) * n[2]) < _ON_PLANE:
+            member[k] = True
+            total += 1
+            for i in range(3):
+                mean[i] += q[i]
+    for i in range(3):
+        mean[i] /= max(total, 1)
+    for k in range(len(points)):
+        if member[k]:
+            for i in range(3):
+                for j in range(3):
+                    scatter[i, j] += (points[k, i] - mean[i]) * (points[k, j] - mean[j])
+    return member, total, mean, scatter
+
+
 def _plane(points: Floats, altitude: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
     n, p = _fullest_plane(points)
     for _ in range(2):
-        member = np.abs((points - p) @ n) < _ON_PLANE
-        if member.sum() < 3:
+        member, total, mean, scatter = _on_plane(points, n, p)
+        if total < 3:
             break
-        p = points[member].mean(axis=0)
-        off = points[member] - p
-        n = np.linalg.eigh(off.T @ off)[1][:, 0].copy()
+        n, p = np.linalg.eigh(scatter)[1][:, 0].copy(), mean
     return (n if n[2] * altitude >= n @ p else -n), p, member
 
 
@@ -105,11 +125,18 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
     return along[cut], along[len(points) - 1 - cut]
 
 
-def _axes_in(n: Floats) -> tuple[Floats, Floats]:
+@njit(cache=True, nogil=True)
+def _crossed(a, b):  # type: ignore[no-untyped-def]
+    """The cross product of two vectors (3,): NumPy's own takes as long as a hundred of it."""
+    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
+@njit(cache=True, nogil=True)
+def _axes_in(n):  # type: ignore[no-untyped-def]
     """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
-    x_axis = np.cross((0.0, 1.0, 0.0) if abs(n[1]) < 0.9 else (1.0, 0.0, 0.0), n)
-    x_axis /= np.linalg.norm(x_axis)
-    return x_axis, np.cross(n, x_axis)
+    x_axis = _crossed(np.array((0.0, 1.0, 0.0)) if abs(n[1]) < 0.9 else np.array((1.0, 0.0, 0.0)), n)
+    x_axis /= math.sqrt(x_axis[0] * x_axis[0] + x_axis[1] * x_axis[1] + x_axis[2] * x_axis[2])
+    return x_axis, _crossed(n, x_axis)
 
 
 @njit(cache=True, nogil=True)
@@ -186,7 +213,7 @@ def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no
     if level < 0.2:
         return count
     across = np.array([-axis[1] / level, axis[0] / level, 0.0])
-    up = np.cross(axis, across)
+    up = _crossed(axis, across)
     low, high = _extent(points, guess, axis)
     left, right = _extent(points, guess, across)
     top = _extent(points, guess, up)[1]
@@ -242,7 +269,7 @@ def candidates(
             angles.append(_least_rectangle((face - p) @ x_axis, (face - p) @ y_axis))
             angles += [math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n]
         firsts = [math.cos(angle) * x_axis + math.sin(angle) * y_axis for angle in angles]
-        sides = np.array([(first, np.cross(n, first)) for first in firsts])
+        sides = np.array([(first, _crossed(n, first)) for first in firsts])
         count = _faced(half, np.array([2]) if cylinder else np.arange(3), face, p, n, sides, guess, *given, count)
     if cylinder:
         off, fewer = points - points.mean(axis=0), points[::2].copy()
