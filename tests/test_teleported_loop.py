@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from conftest import resting, scene_of, training_script
 from drake_clutter.agents.exploration import LargestClear
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import MoveResult, Observation
@@ -83,6 +85,23 @@ def test_rows_of_the_results() -> None:
         {"exception": 1},
     )
     script.table_of([row, nothing])
+
+
+def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And one of other networks is not taken for it."""
+    script, path = training_script("closed_loop_results"), tmp_path / "row.jsonl"
+    made = list[int]()
+
+    def play(asked: Any) -> dict[str, int]:
+        made.append(asked.number)
+        return {"number": asked.number}
+
+    monkeypatch.setattr(script, "Player", lambda: play)
+    row = script.ROWS[0]
+    assert [e["number"] for e in script.episodes_of(row, 2, 1, path)] == [row.first, row.first + 1]
+    assert [e["number"] for e in script.episodes_of(row, 3, 1, path)] == made == [row.first + k for k in range(3)]
+    with pytest.raises(InputError, match=r"row\.jsonl: holds episodes of other networks, scenes or settings"):
+        script.episodes_of(replace(row, agent="student-dagger"), 3, 1, path)
 
 
 def test_what_the_arm_can() -> None:

@@ -129,21 +129,23 @@ class Player:
         return *explore_images(scene, choose, perceive, **options), 0.0, ""
 
 
-def played(row: Row, count: int, workers: int, path: Path) -> list[dict[str, Any]]:
+def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str, Any]]:
     """The first episodes of a row; those that the file has not got are played, and written as they end.
 
     Raises:
-        InputError: the file holds episodes of other networks or scenes.
+        InputError: the file holds episodes of other networks, scenes or settings.
     """
     scenes = load_scene_set(HERE / "scenes" / f"{row.scenes}.json", load_catalogue())
     networks = [checkpoint_path(row.agent, TRAINED)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))
-    asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256}
+    scenario = asdict(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
+    scenario.pop("seed")  # each episode's own: the scene's number
+    asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": json.loads(json.dumps(scenario))}
     asked |= {"weights": [hashlib.sha256(file.read_bytes()).hexdigest() for file in networks]}
     lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
     if json.loads(lines[0]) != asked:
-        raise InputError(f"{path}: holds episodes of other networks or scenes; give another folder as DIR")
+        raise InputError(f"{path}: holds episodes of other networks, scenes or settings; give another folder as DIR")
     missing = [Asked(row, row.first + k) for k in range(len(lines) - 1, count)]
     commit, done = git_commit(), len(lines) - 1
     made = map_ordered(Player, missing, workers=workers)
@@ -260,7 +262,7 @@ def main(
         if perception is not None and row.perception != "labels":
             row = replace(row, perception=perception)
         there = min(row.count, count or row.count)
-        made = row_of(row, played(row, there, workers, folder / f"{row.name}.jsonl"))
+        made = row_of(row, episodes_of(row, there, workers, folder / f"{row.name}.jsonl"))
         told = sorted([made, *(other for other in told if other["name"] != row.name)], key=lambda other: str(other["name"]))
         write_json(out, {"rows": told})
     Console(width=180).print(table_of(told))
