@@ -1,5 +1,6 @@
 """`drake-clutter run` and `demo`: the closed loop, from images to the arm's motion, with a page to watch."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,11 @@ SCENE_TRIES = 50
 """Scenes that a generator may make until one is stable and hides something."""
 
 
-def scene_of(scenario: Scenario, first: int = 0) -> tuple[Scene, int]:
-    """The scenario's scene at rest, and the index under which the generator made it; from `first` on.
+def scene_of(scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] = lambda _: True) -> tuple[Scene, int]:
+    """The scenario's scene at rest, and the index under which the generator made it; from `first` on, the first that suits.
 
     Raises:
-        InputError: a scene file that cannot be used, or a generator that makes no stable scene that hides something.
+        InputError: a scene file that cannot be used, or a generator that makes no such scene that is stable and hides something.
     """
     catalogue = Path(scenario.catalogue) if scenario.catalogue else None
     if scenario.scene:
@@ -37,9 +38,9 @@ def scene_of(scenario: Scenario, first: int = 0) -> tuple[Scene, int]:
     generate = SceneGenerator(job)
     for index in range(first, first + SCENE_TRIES):
         made = generate(index)
-        if made.verdict.hidden:
-            return made.scene.at(made.verdict.settled), index
-    raise InputError(f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable and hides something")
+        if made.verdict.hidden and suits(scene := made.scene.at(made.verdict.settled)):
+            return scene, index
+    raise InputError(f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable, hides something and suits")
 
 
 def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
@@ -74,9 +75,7 @@ def demo(seed: int, nodes: int, out: Path, report: Report) -> dict[str, Any]:
     scenario, index = Scenario(nodes=nodes, seed=seed, perception="depth"), -1
     ceiling = ArmCeiling(scenario.world, scenario.arm)
     for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
-        scene, index = scene_of(scenario, index + 1)
-        while ceiling.never_found(scene):
-            scene, index = scene_of(scenario, index + 1)
+        scene, index = scene_of(scenario, index + 1, lambda scene: not ceiling.never_found(scene))
         task, timing = play(scenario, scene, report)
         if task.end is EpisodeEnd.ALL_FOUND:
             break
