@@ -45,8 +45,6 @@ IN_EACH_OTHER = 0.010
 """m; what penetrates deeper is not there together."""
 LEAST_SHARE = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
-
-
 SURE_VOTES, VOTE_WITHIN = 0.8, 0.03
 """A detection is sure if such a share of its pixels, by their chances of its class, votes for its middle within so many m."""
 TWO_INSTEAD = 0.1
@@ -62,6 +60,12 @@ class _Candidate(NamedTuple):
 def _seen_past(explains: Explanation) -> bool:
     """Whether the camera sees past so much of a pose that two smaller objects may lie side by side there."""
     return explains.past > TWO_INSTEAD * int(np.count_nonzero(explains.seen))
+
+
+def _sure(X_TO: Pose, chances: NDArray[np.float32], votes_T: NDArray[np.float32]) -> bool:
+    """Whether the network's answers, chances (n,) of the class and votes (n, 3) m for the middle, say so of a pose."""
+    here = np.linalg.norm(votes_T - X_TO.p, axis=1) < VOTE_WITHIN  # false where it is NaN
+    return bool((here * chances).sum() > SURE_VOTES * len(chances))
 
 
 def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Candidate]:
@@ -129,8 +133,7 @@ class LearnedDetector:
             counted[name] += 1
             clean[mask] = e.away[e.seen]
             answers = coarse(mask[window.rows, window.columns])
-            here = np.linalg.norm(votes_T[answers] - candidate.fitted.X_TO.p, axis=1) < VOTE_WITHIN  # false where it is NaN
-            sure = bool(np.sum(here * chances[network.classes.index(name)][answers]) > SURE_VOTES * np.count_nonzero(answers))
+            sure = _sure(candidate.fitted.X_TO, chances[network.classes.index(name)][answers], votes_T[answers])
             found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask, sure))
         return Observation(clean, tuple(found), self._camera, self._tray_side)
 

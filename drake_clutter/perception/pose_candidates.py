@@ -127,7 +127,7 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _crossed(a, b):  # type: ignore[no-untyped-def]
-    """The cross product of two vectors (3,): NumPy's own takes as long as a hundred of it."""
+    """The cross product of two vectors (3,): NumPy's own is slow for so few."""
     return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
