@@ -25,6 +25,7 @@ import numpy as np
 import pybullet
 import typer
 from numpy.typing import NDArray
+from pybullet_world import label_image, load, poses
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -37,7 +38,7 @@ from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng
-from drake_clutter.scenes.scene import Pose, Scene, jittered, tilt_between
+from drake_clutter.scenes.scene import Scene, jittered, tilt_between
 from drake_clutter.scenes.seams import CannotJudge
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
@@ -166,44 +167,16 @@ def asked(
     return np.median(np.reshape(seconds, (repeats, -1)), axis=0).tolist(), answers[: len(cases)]
 
 
-def bullet_label() -> Any:
-    """The body that the overhead camera sees in each pixel of PyBullet's world."""
-    camera = CONFIG.camera
-    view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
-    projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
-    engine = pybullet.ER_TINY_RENDERER
-    return pybullet.getCameraImage(camera.width, camera.height, view, projection, shadow=0, renderer=engine)[4]
-
-
-def bullet_load(path: Path) -> None:
-    """Makes a world of an export."""
-    pybullet.connect(pybullet.DIRECT)
-    for body in pybullet.loadSDF(str(path)):
-        pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(0.5))  # those of the two that touch are multiplied
-    pybullet.setGravity(0, 0, -9.81)
-    pybullet.setTimeStep(1 / 240)
-
-
-def bullet_poses(scene: Scene) -> list[Pose]:
-    """X_TO of the scene's objects."""
-    poses = []
-    for body in range(1, len(scene.objects) + 1):
-        X_TCm, X_OCm = pybullet.getBasePositionAndOrientation(body), pybullet.getDynamicsInfo(body, -1)[3:5]
-        p, (x, y, z, w) = pybullet.multiplyTransforms(*X_TCm, *pybullet.invertTransform(*X_OCm))
-        poses.append(Pose(p, (w, x, y, z)))
-    return poses
-
-
 def in_bullet(case: Case) -> tuple[float, float, float, Found]:
     """PyBullet's seconds for loading a scene, a frame and 2 s of stepping; and its verdict."""
     scene, limits = case.start, CONFIG.settle
     with tempfile.TemporaryDirectory() as folder:
-        load, _ = timed(bullet_load, export_scene(scene, ExportFormat.SDF, Path(folder)))
-        bullet_label()
-        frame, _ = timed(bullet_label)
-        first = bullet_poses(scene)
+        loading, _ = timed(load, export_scene(scene, ExportFormat.SDF, Path(folder)))
+        label_image()
+        frame, _ = timed(label_image)
+        first = poses(scene)
         steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(360)])
-        late = bullet_poses(scene)
+        late = poses(scene)
         more_steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(120)])
         stayed = all(
             max(abs(X.p[:2])) <= scene.tray_side / 2
@@ -211,10 +184,10 @@ def in_bullet(case: Case) -> tuple[float, float, float, Found]:
             and np.linalg.norm(X.p - X_first.p) < limits.max_displacement
             and np.linalg.norm(X.p - X_late.p) <= limits.rest_drift
             and tilt_between(o.object_class, X_first, X) < math.radians(limits.max_tilt_deg)
-            for o, X, X_first, X_late in zip(scene.objects, bullet_poses(scene), first, late, strict=True)
+            for o, X, X_first, X_late in zip(scene.objects, poses(scene), first, late, strict=True)
         )
         pybullet.disconnect()
-    return load, frame, steps + more_steps, (stayed, None)
+    return loading, frame, steps + more_steps, (stayed, None)
 
 
 def figures(seconds: Sequence[float]) -> Row:
