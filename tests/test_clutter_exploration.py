@@ -22,6 +22,7 @@ from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explor
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
 from drake_clutter.scenes.seams import Move
@@ -246,6 +247,30 @@ def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
     agent = make_explorers(str(path), ClutterConfig())(environment.task)
     with pytest.raises(InputError, match="was not trained with"):
         play(environment.task, agent, np.random.default_rng(0))
+
+
+def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig) -> None:
+    """Among 39 objects the tray is soon full."""
+    scenes = ROOT / "training/scenes/sg_star_40.json"
+    environment = ClutterExploration(scenes, config=config, max_moves=20, most_objects=39)
+    explorers = make_explorers("student", config)
+    rng, on_the_tray = np.random.default_rng(0), set()
+    for number in range(3):
+        environment.reset(options={"scene": number})
+        task = environment.task
+        agent = explorers(task)
+        while task.end is None:
+            observation = task.look.observation
+            move = agent.choose(observation, [step.move for step in task.steps], rng, task.failed).move
+            room = {m for m in legal_moves(observation) if choose_placement(observation, m, config.exploration, rng)}
+            if move is None:
+                assert not room
+                break
+            assert move in room
+            assert move.place == TRAY or Move(move.pick, TRAY) not in room
+            on_the_tray.add(move.place == TRAY)
+            task.step(move, rng)
+    assert on_the_tray == {True, False}
 
 
 def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig) -> None:

@@ -145,7 +145,7 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
     path = checkpoint_path(name, TRAINED)
     from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
-    return LearnedExplorers(path)
+    return LearnedExplorers(path, config.exploration)
 
 
 def play(

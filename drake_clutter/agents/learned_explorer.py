@@ -1,4 +1,8 @@
-"""Trained explorers at work: the student, which knows what the camera has shown, and the teacher, which knows everything."""
+"""Trained explorers at work: the student, which knows what the camera has shown, and the teacher, which knows everything.
+
+Both look before they move: where the camera sees no free place, nothing is put, and what finds one on the tray goes there. On
+another object it might topple, and would hide more; it is put there when the tray is full.
+"""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -7,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
+from drake_clutter.config import ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.tasks.exploration import Decision, ExplorationTask
@@ -51,18 +57,24 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
 
 
 class LearnedExplorer:
-    """Takes the likeliest move (an `ExplorationAgent`); one instance plays one episode."""
+    """Takes the likeliest pick and place for which there is room (an `ExplorationAgent`); one instance plays one episode."""
 
     def __init__(
-        self, network: ExplorerNetwork, numbers: dict[str, int], path: Path, task: ExplorationTask | None = None
+        self,
+        network: ExplorerNetwork,
+        numbers: dict[str, int],
+        path: Path,
+        config: ExplorationConfig,
+        task: ExplorationTask | None = None,
     ) -> None:
         """Begins an episode.
 
         Args:
             network, numbers: see `load_explorer`; path: of the checkpoint, for errors.
+            config: how objects are put down.
             task: whose scene the agent knows all of; None: it knows K_t.
         """
-        self._network, self._numbers, self._path, self._task = network, numbers, path, task
+        self._network, self._numbers, self._path, self._config, self._task = network, numbers, path, config, task
         self._known: tuple[SceneObject, ...] = ()
 
     def choose(
@@ -85,12 +97,18 @@ class LearnedExplorer:
         if unknown:
             raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
         graph = exploration_graph(shown, observation, tried, self._numbers, failed)
-        if not graph["allowed"].any():
-            return Decision(None)
-        moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
-        x, y = moves[0].tolist()
-        chances = {o.name: float(picks[0, k]) for k, o in enumerate(shown, start=1) if graph["allowed"][k].any()}
-        return Decision(Move(shown[x - 1].name, shown[y - 1].name if y else TRAY), chances, tuple(o.name for o in shown))
+        allowed, names = graph["allowed"], tuple(o.name for o in shown)
+        some = np.random.default_rng(0)  # it decides where, not whether
+        while allowed.any():
+            moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
+            x, y = moves[0].tolist()
+            for place in (0, y):
+                move = Move(names[x - 1], names[place - 1] if place else TRAY)
+                if allowed[x, place] and choose_placement(observation, move, self._config, some) is not None:
+                    chances = {name: float(picks[0, k]) for k, name in enumerate(names, start=1) if allowed[k].any()}
+                    return Decision(move, chances, names)
+                allowed[x, place] = 0
+        return Decision(None)
 
 
 class LearnedExplorers:
@@ -100,21 +118,26 @@ class LearnedExplorers:
         privileged: whether it knows everything.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, config: ExplorationConfig) -> None:
         """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
+
+        Args:
+            path: of the checkpoint.
+            config: how objects are put down.
 
         Raises:
             InputError: it cannot be read, or is none of an explorer.
         """
-        self._path = path
+        self._path, self._config = path, config
         checkpoint = load_checkpoint(path)
         self._network, self._numbers = load_explorer(checkpoint, path)
         self.privileged = checkpoint.about["kind"] == TEACHER
 
     def __call__(self, task: ExplorationTask) -> LearnedExplorer:
         """For an episode."""
-        return LearnedExplorer(self._network, self._numbers, self._path, task if self.privileged else None)
+        known_to = task if self.privileged else None
+        return LearnedExplorer(self._network, self._numbers, self._path, self._config, known_to)
 
     def student(self) -> LearnedExplorer:
         """One that knows what it is shown."""
-        return LearnedExplorer(self._network, self._numbers, self._path)
+        return LearnedExplorer(self._network, self._numbers, self._path, self._config)
