@@ -23,11 +23,20 @@ def shipped_path(relative: str) -> Path:
 
 
 def git_commit() -> str:
-    """The commit that is checked out around this package, marked if files differ from it; "unknown" outside of a checkout."""
+    """The commit that is checked out around this package, marked if files differ from it; "unknown" outside of a checkout.
+
+    Files of results do not count: what is measured is written into them while it is measured.
+    """
+    results = (":(top,exclude)training/results", ":(top,exclude)benchmarks/results")
     try:
-        told = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True, cwd=_PACKAGE_DIR, timeout=10
-        )
+        commit = _git("describe", "--always")
+        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", *results)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return told.stdout.strip()
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(
+        ["git", *arguments], capture_output=True, text=True, check=True, cwd=_PACKAGE_DIR, timeout=10
+    ).stdout.strip()
