@@ -39,6 +39,7 @@ def map_ordered(
     *,
     workers: int,
     ray_address: str | None = None,
+    fresh_after: int | None = None,
 ) -> Generator[Result, None, None]:
     """Yields `make_worker()(item)` for every item, in the order of the items, each as soon as it is there.
 
@@ -56,6 +57,8 @@ def map_ordered(
         items: the items; with more than one worker, or on a cluster, they and the results are pickled.
         workers: number of processes; 1 works in this process, or as one process on the cluster.
         ray_address: of the Ray cluster that the processes run on, e.g. "auto"; None: they run on this machine, without Ray.
+        fresh_after: items, after which processes on this machine are replaced by fresh ones, also a single one. pydrake never
+            frees a Diagram that holds a system written in Python: an episode of the closed loop keeps 340 MB.
 
     Raises:
         BrokenProcessPool: a worker process was killed; on a cluster, an item lost its worker three times.
@@ -67,6 +70,8 @@ def map_ordered(
         from drake_clutter.runner_ray import map_on_ray
 
         return map_on_ray(make_worker, items, workers, ray_address)
+    if fresh_after is not None:
+        return _map_in_fresh_processes(make_worker, items, workers, fresh_after)
     return _map_here(make_worker, items) if workers == 1 else _map_in_processes(make_worker, items, workers)
 
 
@@ -107,6 +112,14 @@ def _map_in_processes(
             for process in list((pool._processes or {}).values()):  # from Python 3.14: pool.terminate_workers()
                 process.terminate()
         pool.shutdown(cancel_futures=True)
+
+
+def _map_in_fresh_processes(
+    make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int, fresh_after: int
+) -> Generator[Result, None, None]:
+    remaining = iter(items)
+    while some := list(islice(remaining, workers * fresh_after)):
+        yield from _map_in_processes(make_worker, some, workers)
 
 
 @contextmanager

@@ -67,6 +67,15 @@ def make_thread_setting() -> Callable[[int], str | None]:
     return thread_setting
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_processes_are_replaced_by_fresh_ones(workers: int, tmp_path: Path) -> None:
+    done = list(map_ordered(partial(CountsFactories, tmp_path), range(5), workers=workers, fresh_after=2))
+    first, last = done[: 2 * workers], done[2 * workers :]
+    assert len(done) == 5
+    assert set(first).isdisjoint(last)
+    assert os.getpid() not in done
+
+
 def test_order_and_results_do_not_depend_on_the_number_of_workers() -> None:
     alone = list(map_ordered(Noisy, range(30), workers=1))
     assert [item for item, _ in alone] == list(range(30))

@@ -96,7 +96,7 @@ def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         made.append(asked.number)
         return {"number": asked.number}
 
-    monkeypatch.setattr(script, "Player", lambda: play)
+    monkeypatch.setattr(script, "map_ordered", lambda _, items, **options: map(play, items))
     row = script.ROWS[0]
     assert [e["number"] for e in script.episodes_of(row, 2, 1, path)] == [row.first, row.first + 1]
     assert [e["number"] for e in script.episodes_of(row, 3, 1, path)] == made == [row.first + k for k in range(3)]

@@ -44,6 +44,8 @@ from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 
 HERE = Path(__file__).parent
+EPISODES_OF_A_PROCESS = 10
+"""Each keeps hundreds of MB, see `map_ordered`."""
 OUT, EPISODES = HERE / "results" / "closed_loop.json", HERE / "results" / "closed_loop"
 
 
@@ -148,7 +150,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
         raise InputError(f"{path}: holds episodes of other networks, scenes or settings; give another folder as DIR")
     missing = [Asked(row, row.first + k) for k in range(len(lines) - 1, count)]
     commit, done = git_commit(), len(lines) - 1
-    made = map_ordered(Player, missing, workers=workers)
+    made = map_ordered(Player, missing, workers=workers, fresh_after=EPISODES_OF_A_PROCESS)
     for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
         lines.append(json.dumps(told | {"commit": commit}))
         write_text(path, "\n".join(lines) + "\n")
