@@ -179,7 +179,7 @@ def draw_curves(found: dict[str, Sequence[EpisodeResult]], title: str, path: Pat
     axes.set(xlabel="moves", ylabel="found, of the hidden objects", ylim=(0, 1.02), xlim=(0, max(LIMITS)), title=title)
     axes.set_xticks(range(0, max(LIMITS) + 1, 2))
     axes.grid(alpha=0.4)
-    axes.legend()
+    figure.legend(loc="outside right upper")
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
