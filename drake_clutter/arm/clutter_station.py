@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
+from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import Demultiplexer
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.arm.hold import HexapodHold, Hold, JointHold
 from drake_clutter.arm.kinematics import JOINTS
@@ -23,7 +25,7 @@ from drake_clutter.arm.suction import load_share, surface_under_lip, unevenness
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import ArmState
-from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
+from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +43,11 @@ class ClutterStation(Diagram):
     """The arm among objects.
 
     Input port: command (18,), desired state, rad and rad/s, and feed-forward torque, N m.
-    Output ports: state, of the whole plant; body_poses, of all its bodies; query, of the geometry.
+    Output ports: state, of the whole plant; body_poses, of all its bodies; with visuals query, of `looks`.
+
+    Attributes:
+        looks: the geometry that cameras see, or None. It is apart from that of the contacts, and asked for poses only when a camera
+            looks: renderers that follow every step take more time than the step does.
     """
 
     def __init__(
@@ -69,9 +75,9 @@ class ClutterStation(Diagram):
         self.config, self.classes, self.time_step = config, dict(objects), time_step
         self._jointed = jointed
         builder = DiagramBuilder()
-        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=visuals, jointed=jointed)
+        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=False, jointed=jointed)
         self.plant = plant = self.scene.plant
-        self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True, visuals=visuals)
+        self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True, visuals=False)
         for name in JOINTS:
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
         self.hold: Hold = JointHold(plant, self.arm, self.scene.bodies[jointed]) if jointed else HexapodHold(plant, self.arm)
@@ -88,8 +94,23 @@ class ClutterStation(Diagram):
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
-        builder.ExportOutput(self.scene.scene_graph.get_query_output_port(), "query")
+        self.looks = self._add_looks(builder, objects, tray_side, camera_altitude) if visuals else None
         builder.BuildInto(self)
+
+    def _add_looks(
+        self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
+    ) -> SceneGraph:
+        """Adds the geometry that cameras see: of a twin of the plant, which is never simulated, in the plant's state."""
+        twin, looks = MultibodyPlant(self.time_step), builder.AddNamedSystem("looks", SceneGraph())
+        twin.RegisterAsSourceForSceneGraph(looks)
+        populated(twin, looks, objects, tray_side, visuals=True, jointed=self._jointed)
+        add_arm(twin, looks, self.config, camera_altitude, compliant=True, visuals=True)
+        twin.Finalize()
+        poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True))
+        builder.Connect(self.plant.get_state_output_port(), poses.get_input_port())
+        builder.Connect(poses.get_output_port(), looks.get_source_pose_port(twin.get_source_id()))
+        builder.ExportOutput(looks.get_query_output_port(), "query")
+        return looks
 
     @property
     def takeable(self) -> tuple[str, ...]:

@@ -97,6 +97,19 @@ def add_scene_plant(
         time_step=time_step, contact_model="hydroelastic_with_fallback", discrete_contact_approximation="lagged"
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
+    return populated(plant, scene_graph, objects, tray_side, visuals=visuals, jointed=jointed)
+
+
+def populated(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    objects: Sequence[tuple[str, ObjectClass]],
+    tray_side: float,
+    *,
+    visuals: bool,
+    jointed: str = "",
+) -> ScenePlant:
+    """Adds the tray and the named objects to a plant; arguments as of `add_scene_plant`."""
     (tray,) = Parser(plant).AddModelsFromString(tray_sdf(tray_side), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}

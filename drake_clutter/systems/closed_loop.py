@@ -105,9 +105,9 @@ class ClosedLoop:
             )
         )
         self.station.set_name("clutter_station")
-        scene_graph = self.station.scene.scene_graph
-        scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
-        sensor = builder.AddSystem(RgbdSensor(scene_graph.world_frame_id(), eye.X_TC, eye.color, eye.depth))
+        assert self.station.looks is not None
+        self.station.looks.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
+        sensor = builder.AddSystem(RgbdSensor(self.station.looks.world_frame_id(), eye.X_TC, eye.color, eye.depth))
         sensor.set_name("overhead_camera")
         sees: Perceive = perceive or LabelPerception(scene, self.station, world)
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
