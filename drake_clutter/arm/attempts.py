@@ -13,7 +13,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_clutter.arm.clearance import Clearance, ClearanceScene
 from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.paths import Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
+from drake_clutter.arm.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
 from drake_clutter.arm.plan import NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.arm.shorten import Wall, Way, shortened
 from drake_clutter.arm.station import ArmConfig
@@ -322,10 +322,18 @@ class Attempts:
         if phase == "carry":
             self._scene.hold(name, inverse(X_OG))
 
-    def _checked(self, phase: str, path: Trajectory, X_OG: Floats, ends: tuple[End, End], progress: int) -> Clearance | None:
-        """The least clearance along a path; None if it is too little."""
+    def _checked(
+        self,
+        phase: str,
+        path: Trajectory,
+        X_OG: Floats,
+        ends: tuple[End, End],
+        progress: int,
+        spacing: float = SPACING / 2,
+    ) -> Clearance | None:
+        """The least clearance along a path, looked at every so many radians; None if it is too little."""
         self._set_up(phase, X_OG)
-        points = sampled(path)
+        points = sampled(path, spacing)
         if phase != "carry":
             return self._free(points, End(ends[int(phase == "retreat")].at, {}), progress, phase)
         half = len(points) // 2  # what it touched at the start it has left by then
@@ -353,7 +361,8 @@ class Attempts:
         trajectory = slowed(quick, self._arm, payload) if quick else None
         if trajectory is None or trajectory.end_time() >= phase.sure:
             return phase
-        clearance = self._checked(phase.name, trajectory, X_OG, ends, 0)
+        # It goes round edges as near as it may: looked at more closely than a way that rises over everything.
+        clearance = self._checked(phase.name, trajectory, X_OG, ends, 0, SPACING / 4)
         if clearance is None:
             return phase
         return Phase(phase.name, trajectory, clearance, phase.sure)

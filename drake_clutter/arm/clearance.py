@@ -161,10 +161,10 @@ class ClearanceScene:
             gradient = np.zeros(6)
             for geometry, p_S, sign in ((pair.id_A, pair.p_ACa, 1.0), (pair.id_B, pair.p_BCb, -1.0)):
                 if joints := self._joints_that_move(self._names[geometry]):
-                    n, p_FC = sign * pair.nhat_BA_W, query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
-                    x, y, z = p_FC
-                    moment = (y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0])  # p_FC x n
-                    gradient[:joints] += np.append(moment, n) @ J[:, :joints]
+                    nx, ny, nz = sign * pair.nhat_BA_W
+                    x, y, z = query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
+                    moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
+                    gradient[:joints] += (*moment, nx, ny, nz) @ J[:, :joints]
             found.append((self._named(pair), gradient))
         return found
 

@@ -46,8 +46,8 @@ class ClutterStation(Diagram):
     Output ports: state, of the whole plant; body_poses, of all its bodies; with visuals query, of `looks`.
 
     Attributes:
-        looks: the geometry that cameras see, or None. It is apart from that of the contacts, and asked for poses only when a camera
-            looks: renderers that follow every step take more time than the step does.
+        looks: the geometry that cameras see, or None: apart from that of the contacts, as renderers that are told of poses at
+            every step take more time than the step does.
     """
 
     def __init__(

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ class PickPlacePlanner:
         self.tray_side, self._camera_altitude = tray_side, camera_altitude
         self._X_BT, self._X_GF = inverse(config.X_TB), inverse(config.X_FG)
         self._scenes: dict[Hashable, ClearanceScene] = {}
+        self._grasps = lru_cache(maxsize=256)(self._find_grasps)
 
     def clearance_scene(self, objects: Sequence[SceneObject], unseen: Sequence[UnseenBlock] = ()) -> ClearanceScene:
         """The objects and the arm; the latest of each set of objects is kept."""
@@ -101,7 +103,7 @@ class PickPlacePlanner:
         """Whether the cup can hold an object, and none of the others rests on it: without that, no plan is worth asking for."""
         return not rests_on(scene_object, objects) and self.holds(scene_object)
 
-    def _grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
+    def _find_grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
         """Where the cup seals on top and can hold, the nearest to its middle first."""
         suction = self.config.suction
         lower, upper = picked.bounds_T

@@ -3,7 +3,9 @@
 A cubic spline over joint angles is made as quick as the joints' limits and the cup's hold allow, while it keeps clear of
 everything. Distances are linear in the joint angles for a small step, and so in the spline's control points: each round takes
 them at the last round's spline, and moves no control point by more than a step (as in Schulman et al. 2014, "Motion planning with
-sequential convex optimization and convex collision checking"). The result is a proposal: who asks checks it.
+sequential convex optimization and convex collision checking"). So is every other limit, in the control points and the square of
+the duration T: over a parameter that goes from 0 to 1, q'' is bounded by a T^2, and q' by v T, of which the tangent is taken.
+The result is a proposal: who asks checks it.
 """
 
 import math
@@ -12,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import BsplineBasis
-from pydrake.planning import KinematicTrajectoryOptimization
-from pydrake.solvers import LinearConstraint, QuadraticConstraint, SnoptSolver, SolverOptions
+from pydrake.math import BsplineBasis, KnotVectorType
+from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.trajectories import BsplineTrajectory, Trajectory
+from scipy import sparse
 
 from drake_clutter.arm.paths import ACCELERATION_LIMIT, MARGIN, VELOCITY_LIMIT
 
@@ -25,7 +27,7 @@ CONTROL_POINTS = 28
 STEPS = (0.8, 0.4, 0.2)
 """rad, by which a control point may move in each round."""
 LOOKED_AT = 50
-"""Points of a spline at which distances are taken, and at half of them how the cup is accelerated."""
+"""Points of a spline at which distances are taken, and at every second of them how the cup is accelerated."""
 SETTLED = 0.02
 """rad; a round that moves no control point further is the last: the next would see the same distances."""
 UPRIGHT = 0.002
@@ -34,9 +36,20 @@ ENDS = 0.15
 """Share of a way at either end, where it may stay as close as it is: there the ends leave it no choice."""
 _TILT = np.array([[0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 _ORDER = 4
-_OPTIONS = SolverOptions()
-_OPTIONS.SetOption(SnoptSolver.id(), "Major optimality tolerance", 1e-3)
-_OPTIONS.SetOption(SnoptSolver.id(), "Major feasibility tolerance", 1e-4)
+_SMOOTH = 1e-4
+"""Weight of the squared accelerations beside T^2: of ways that are as quick it takes the smoothest."""
+_BASIS = BsplineBasis(_ORDER, CONTROL_POINTS, KnotVectorType.kClampedUniform, 0.0, 1.0)
+_CURVE = BsplineTrajectory(_BASIS, np.eye(CONTROL_POINTS))
+_SPEEDS, _ACCELERATIONS = (
+    sparse.csr_matrix(np.kron(np.array(_CURVE.MakeDerivative(order).control_points())[..., 0], np.eye(6))) for order in (1, 2)
+)
+"""(162, 168) and (156, 168): from all control points, row by row, to those of the first and the second derivative."""
+_FASTEST = np.tile(MARGIN * VELOCITY_LIMIT, CONTROL_POINTS - 1)
+_HARDEST = np.tile(MARGIN * ACCELERATION_LIMIT, CONTROL_POINTS - 2)
+_ALONG = np.linspace(0.0, 1.0, LOOKED_AT + 2)[1:-1]
+_AT = _CURVE.vector_values(_ALONG).T
+_CURVATURE_AT = _CURVE.MakeDerivative(2).vector_values(_ALONG).T
+"""(LOOKED_AT, 28) each: from control points to the spline's values and second derivatives."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +107,11 @@ def shortened(way: Way) -> BsplineTrajectory | None:
     return BsplineTrajectory(BsplineBasis(_ORDER, duration * np.array(_BASIS.knots())), points.T)
 
 
-_BASIS = KinematicTrajectoryOptimization(6, CONTROL_POINTS, _ORDER, 1.0).basis()
-_SECOND = BsplineTrajectory(_BASIS, np.eye(CONTROL_POINTS)).MakeDerivative(2)
-
-
 def _fitted(sure: Trajectory, still: int) -> Floats:
     """Control points (n, 6) of the spline that is nearest to a timed way; the first, and the last, `still` of them are one."""
     s = np.linspace(0.0, 1.0, 120)
     q = sure.vector_values(s * sure.end_time()).T
-    B = np.array([_BASIS.EvaluateLinearInControlPoints(x).ravel() for x in s])
+    B = _CURVE.vector_values(s).T
     points = np.empty((CONTROL_POINTS, 6))
     points[:still], points[-still:] = q[0], q[-1]
     at_ends = [*range(still), *range(CONTROL_POINTS - still, CONTROL_POINTS)]
@@ -110,51 +119,74 @@ def _fitted(sure: Trajectory, still: int) -> Floats:
     return points
 
 
+class _Rows:
+    """Linear inequalities A x <= b of x, which is all control points, (28, 6) row by row, and then T^2."""
+
+    def __init__(self) -> None:
+        self._A, self._b = list[sparse.csr_matrix](), list[Floats]()
+
+    def add(self, of_points: sparse.csr_matrix, of_square: Floats, b: Floats) -> None:
+        """Some more: (n, 168), (n,) and (n,)."""
+        self._A.append(sparse.hstack([of_points, sparse.csr_matrix(of_square[:, None])]))
+        self._b.append(b)
+
+    def add_both(self, of_points: sparse.csr_matrix, bound: Floats, b: Floats | None = None) -> None:
+        """-bound T^2 - b <= A p <= bound T^2 + b."""
+        for sign in (1, -1):
+            self.add(sign * of_points, -bound, np.zeros_like(bound) if b is None else b)
+
+    def impose(self, prog: MathematicalProgram, x: NDArray[np.object_]) -> None:
+        """Adds them to a program."""
+        b = np.concatenate(self._b)
+        prog.AddLinearConstraint(sparse.vstack(self._A, format="csc"), np.full(len(b), -np.inf), b, x)
+
+
+def _of_points(weights: Floats, directions: Floats) -> sparse.csr_matrix:
+    """(n, 168), from all control points to what splines of these weights (n, 28) go in directions (n, 6)."""
+    return sparse.csr_matrix((weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1))
+
+
+def _limits(way: Way, points: Floats, duration: float) -> _Rows:
+    """Of speed, acceleration and distances, at a spline near which they hold."""
+    rows, q = _Rows(), _AT @ points
+    # T is at most the tangent to the root of its square, at the last round's.
+    rows.add_both(_SPEEDS, _FASTEST / (2 * duration), _FASTEST * duration / 2)
+    rows.add_both(_ACCELERATIONS, _HARDEST)
+    if seen := [(k, wall) for k, s in enumerate(_ALONG) for wall in way.walls(q[k], s)]:
+        at, gradients = np.array([k for k, _ in seen]), np.array([wall.gradient for _, wall in seen])
+        room = np.array([wall.room for _, wall in seen])
+        room = np.where(np.minimum(_ALONG, 1 - _ALONG)[at] < ENDS, np.maximum(room, 0.0), room)
+        rows.add(_of_points(-_AT[at], gradients), np.zeros(len(at)), room - (gradients * q[at]).sum(axis=1))
+    if math.isfinite(way.acceleration):
+        at = np.repeat(np.arange(0, LOOKED_AT, 2), 3)
+        J = np.vstack([way.jacobian(q[k])[3:] for k in at[::3]])
+        rows.add_both(_of_points(_CURVATURE_AT[at], J), np.full(len(at), way.acceleration))
+    return rows
+
+
 def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floats, float] | None:
-    kto = KinematicTrajectoryOptimization(6, CONTROL_POINTS, _ORDER, duration)
-    prog, variables = kto.get_mutable_prog(), kto.control_points()
-    last = BsplineTrajectory(_BASIS, points.T)
-    kto.SetInitialGuess(last)
-    prog.SetInitialGuess(kto.duration(), duration)
-    kto.AddDurationCost(1.0)
-    kto.AddDurationConstraint(0.05, 2 * duration + 0.1)
-    kto.AddVelocityBounds(-MARGIN * VELOCITY_LIMIT, MARGIN * VELOCITY_LIMIT)
-    kto.AddAccelerationBounds(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
-    for k in range(CONTROL_POINTS):
-        reach = step if way.still <= k < CONTROL_POINTS - way.still else 0.0
-        prog.AddBoundingBoxConstraint(points[k] - reach, points[k] + reach, variables[:, k])
-        if way.level:
-            prog.AddLinearEqualityConstraint(_TILT, _TILT @ points[0], variables[:, k])
+    reach = np.full((CONTROL_POINTS, 6), step)
+    reach[: way.still] = reach[-way.still :] = 0.0
+    prog = MathematicalProgram()
+    x = prog.NewContinuousVariables(points.size + 1)
+    prog.AddBoundingBoxConstraint((points - reach).ravel(), (points + reach).ravel(), x[:-1])
+    prog.AddBoundingBoxConstraint(0.05**2, (2 * duration + 0.1) ** 2, x[-1:])
+    control = x[:-1].reshape(CONTROL_POINTS, 6)
     for upright, end, inwards in ((way.upright[0], 0, 1), (way.upright[1], CONTROL_POINTS - 1, -1)):
         if upright:
             J, q = way.jacobian(points[end]), points[end]
             for k, least in ((way.still, 0.0), (way.still + 1, UPRIGHT)):
-                prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, variables[:, end + inwards * k])
-                prog.AddLinearConstraint(J[5:], J[5:] @ q + least, [np.inf], variables[:, end + inwards * k])
-    for number, s in enumerate(np.linspace(0.0, 1.0, LOOKED_AT + 2)[1:-1]):
-        q = last.value(s).ravel()
-        for wall in way.walls(q, s):
-            room = max(wall.room, 0.0) if min(s, 1 - s) < ENDS else wall.room
-            bound = float(wall.gradient @ q) - room
-            kto.AddPathPositionConstraint(LinearConstraint(wall.gradient[None], [bound], [np.inf]), s)
-        if math.isfinite(way.acceleration) and number % 2 == 0:
-            _bound_cup(kto, way, q, s)
-    result = SnoptSolver().Solve(prog, prog.initial_guess(), _OPTIONS)
+                prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, control[end + inwards * k])
+                prog.AddLinearConstraint(J[5:], J[5:] @ q + least, [np.inf], control[end + inwards * k])
+    if way.level:
+        for q in control:
+            prog.AddLinearEqualityConstraint(_TILT, _TILT @ points[0], q)
+    _limits(way, points, duration).impose(prog, x)
+    prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
+    curved = sparse.diags(1 / _HARDEST) @ _ACCELERATIONS / duration**2
+    prog.AddQuadraticCost(2 * _SMOOTH * (curved.T @ curved).toarray(), np.zeros(points.size), x[:-1], is_convex=True)
+    result = ClarabelSolver().Solve(prog)
     if not result.is_success():
         return None
-    return np.asarray(result.GetSolution(variables).T), float(result.GetSolution(kto.duration()))
-
-
-def _bound_cup(kto: KinematicTrajectoryOptimization, way: Way, q: Floats, s: float) -> None:
-    """-a T^2 <= J r'' <= a T^2, at a point of the way; r'' is the spline's second derivative, J taken at q."""
-    weights = _SECOND.value(s).ravel()
-    active = np.flatnonzero(weights)
-    variables = np.append(kto.control_points()[:, active].T.ravel(), kto.duration())
-    Q = np.zeros((len(variables), len(variables)))
-    Q[-1, -1] = -2 * way.acceleration
-    for row in way.jacobian(q)[3:]:
-        b = np.append(np.outer(weights[active], row).ravel(), 0.0)
-        for sign in (1.0, -1.0):
-            kto.get_mutable_prog().AddQuadraticConstraint(
-                Q, sign * b, -np.inf, 0.0, variables, QuadraticConstraint.HessianType.kNegativeSemidefinite
-            )
+    found = result.GetSolution(x)
+    return found[:-1].reshape(points.shape), math.sqrt(found[-1])
