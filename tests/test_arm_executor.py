@@ -11,7 +11,7 @@ from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
-from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.attempts import DESCENT_SPEED, PlannerConfig
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
 from drake_clutter.arm.plan import Plan
 from drake_clutter.arm.planner import PickPlacePlanner
@@ -103,6 +103,24 @@ def test_the_schedule(plan: Plan) -> None:
     home = np.concatenate([ArmConfig().home, np.zeros(6)])
     assert schedule.command.value(0.0).ravel()[:12] == pytest.approx(home, abs=1e-3)
     assert schedule.command.value(schedule.end).ravel()[:12] == pytest.approx(home, abs=1e-3)
+
+
+@pytest.mark.parametrize("too_tall", [0.065, 0.0])
+def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(too_tall: float) -> None:
+    """A pudding box that stands shows the top of a sugar box; or it is known, and 3 mm above where it will stand."""
+    stands = resting("pudding_box", Orientation.UPRIGHT_0)
+    taken_for = resting("sugar_box", Orientation.UPRIGHT_0, floor=-too_tall, name=stands.name) if too_tall else stands
+    X_TO = Pose((0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion)
+    guarded = PickPlacePlanner(ArmConfig(), PlannerConfig(descent=0.08), 0.70, 1.60)
+    plan = guarded.plan([taken_for], taken_for.name, X_TO)
+    assert isinstance(plan, Plan)
+    simulation = ArmSimulation(ArmConfig(), scene_of(stands), plan, camera_altitude=1.6)
+    carried = simulation.run()
+    touched = simulation.running.touched * DESCENT_SPEED
+    assert touched == pytest.approx(too_tall + 0.003, abs=0.003)
+    assert simulation.vacuum.let_go is not None
+    assert simulation.vacuum.let_go.translation[2] == pytest.approx(0.055, abs=0.002)
+    assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
 
 
 def test_an_executor_without_a_plan_stays_at_home() -> None:

@@ -13,7 +13,7 @@ from pydrake.systems.primitives import ConstantValueSource
 
 from drake_clutter.arm.attempts import PlannerConfig
 from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
-from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, Schedule
+from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, Running, Schedule
 from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
@@ -98,7 +98,7 @@ def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], 
 
 def taking_part(schedule: Schedule, beside_pick: Set[str], beside_place: Set[str], time: float) -> set[str]:
     """The names of what may move at a time since a plan was begun, s; see `disturbed_by`."""
-    on, off = schedule.suction_on - AHEAD, schedule.suction_off - AHEAD
+    on, off = schedule.suction_on - AHEAD, schedule.descends - AHEAD
     wanted = set[str]()
     if on <= time <= schedule.suction_on + DWELL + LIFTED:
         wanted |= beside_pick
@@ -138,10 +138,16 @@ class ArmSimulation:
         source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(plan)))
         builder.Connect(source.get_output_port(), self.executor.GetInputPort("plan"))
         builder.Connect(self.executor.GetOutputPort("command"), self.station.GetInputPort("command"))
+        builder.Connect(self.station.GetOutputPort("cup"), self.executor.GetInputPort("cup"))
         self.diagram: Diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         self._suction = self.executor.GetOutputPort("suction")
         self.vacuum = Vacuum(self.station, self._vacuum_wanted)
+
+    @property
+    def running(self) -> Running:
+        """What the executor is doing now."""
+        return self.executor.running(self.executor.GetMyContextFromRoot(self.simulator.get_context()))
 
     def _vacuum_wanted(self, root: Context) -> bool:
         return bool(self._suction.Eval(self.executor.GetMyContextFromRoot(root))[0] > 0.5)
@@ -156,15 +162,17 @@ class ArmSimulation:
         motion, tracking, freedom = list[Frame](), 0.0, Freedom(station, self.vacuum)
         freedom.begin(root)
         self.simulator.Initialize()
-        schedule = self.executor.running(self.executor.GetMyContextFromRoot(root)).schedule
+        k, schedule = 0, self.running.schedule
         assert schedule is not None, "the executor begins with the plan that it is given"
-        for k in range(1, math.ceil((schedule.end + SETTLE_TIME) / LOOK) + 1):
+        while k * LOOK < schedule.end + SETTLE_TIME:
+            k += 1
             time = root.get_time()
             wanted = taking_part(schedule, beside_pick, beside_place, time)
             freedom.update(root, wanted, must_hold=time >= schedule.suction_on + LOOK)
             self.simulator.AdvanceTo(k * LOOK + self._time_step / 2)
             now = command.Eval(self.executor.GetMyContextFromRoot(root))[:6]
             tracking = max(tracking, float(np.abs(now - station.joint_angles(context)).max()))
+            schedule = self.running.schedule or schedule  # a descent that has ended makes another
             if record:
                 state = station.arm_state(context, self._vacuum_wanted(root))
                 motion.append(Frame(root.get_time(), station.scene.poses(context), state))

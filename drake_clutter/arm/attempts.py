@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.trajectories import Trajectory
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_clutter.arm.clearance import Clearance, ClearanceScene
 from drake_clutter.arm.kinematics import forward_kinematics
@@ -35,6 +35,7 @@ class PlannerConfig:
         attempts: of grasp, yaw, branch and height, at most.
         least_acceleration: m/s^2, that a grasp must bear.
         time_limit: s; so long that it decides nothing: the same question has the same answer on any machine.
+        descent: m, at most, that an object is lowered from its place until it touches something; 0: it is let go there.
         optimise: whether the sure way is made quicker by trajectory optimisation, see `arm/shorten.py`.
     """
 
@@ -47,6 +48,7 @@ class PlannerConfig:
     attempts: int = 400
     least_acceleration: float = 0.3
     time_limit: float = 600.0
+    descent: float = 0.0
     optimise: bool = True
 
 
@@ -60,6 +62,8 @@ NEAR = 0.06
 """m; what is further away is not looked at when a way is optimised."""
 _VERTICAL_STEP = 0.02
 """m, between the points of a vertical way."""
+DESCENT_SPEED = 0.02
+"""m/s; at the executor's looks for a touch, half a millimetre apart."""
 
 
 def matrix(pose: Pose) -> Floats:
@@ -259,10 +263,28 @@ class Attempts:
             phases = self._phases(grasp, X_OG, up, down, branch, ends)
             if phases is not None:
                 x, y, z = (float(v) for v in inverse(X_OG)[:3, 3])
-                return Plan(
-                    name, self._picked.X_TO, self._place, X_OG, self._picked.object_class.mass, (x, y, z), phases, self.count, 0.0
-                )
+                descent = self._descent(X_place, q_place, branch)
+                mass = self._picked.object_class.mass
+                return Plan(name, self._picked.X_TO, self._place, X_OG, mass, (x, y, z), phases, self.count, 0.0, descent)
         return None
+
+    def _descent(self, X_place: Floats, q_place: Floats, branch: int) -> Trajectory | None:
+        """Straight down from the place as far as it is asked for, and the arm is free; what it holds may touch anything."""
+        steps = math.ceil(self._config.descent / _VERTICAL_STEP)
+        heights = np.linspace(0.0, self._config.descent, steps + 1)
+        self._set_up("retreat", X_place)
+        self._scene.put_one(self._picked.name, self._place.moved((0.0, 0.0, -10.0)))
+        way, at_place = [q_place], End(X_place[:2, 3], {})
+        for height in heights[1:]:
+            q = nearest_turns(self._reach(self._lifted(X_place, -height))[branch], way[-1])
+            if not np.isfinite(q).all() or self._free(q[None], at_place, 0, "the descent") is None:
+                break
+            way.append(q)
+        if len(way) == 1:
+            return None
+        rest = np.zeros((6, 1))
+        times = heights[: len(way)] / DESCENT_SPEED
+        return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, np.array(way).T, rest, rest)
 
     def _phases(
         self, grasp: Grasp, X_OG: Floats, up: Floats, down: Floats, branch: int, ends: tuple[End, End]

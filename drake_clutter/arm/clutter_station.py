@@ -23,9 +23,9 @@ from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.station import ArmConfig, add_arm, joint_numbers
 from drake_clutter.arm.suction import load_share, surface_under_lip, unevenness
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.seams import ArmState
-from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
+from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, pose_of, rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +43,8 @@ class ClutterStation(Diagram):
     """The arm among objects.
 
     Input port: command (18,), desired state, rad and rad/s, and feed-forward torque, N m.
-    Output ports: state, of the whole plant; body_poses, of all its bodies; with visuals query, of `looks`.
+    Output ports: state, of the whole plant; body_poses, of all its bodies; cup (2,), how far the bellows are pulled out, m, and
+        how fast, m/s; with visuals query, of `looks`.
 
     Attributes:
         looks: the geometry that cameras see, or None: apart from that of the contacts, as renderers that are told of poses at
@@ -94,6 +95,7 @@ class ClutterStation(Diagram):
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+        builder.ExportOutput(plant.get_state_output_port(self.arm.tool), "cup")
         self.looks = self._add_looks(builder, objects, tray_side, camera_altitude) if visuals else None
         builder.BuildInto(self)
 
@@ -203,7 +205,7 @@ class Vacuum:
         taken: the name of the one that did since the vacuum was last switched on, or "".
         sealed: whether one did since the vacuum was last switched on; dropped: when it came off by its load since then, s.
         largest_share: of what the cup can bear, since then.
-        slip: m, between cup and object from when it was taken to when it was let go.
+        slip: m, between cup and object from when it was taken to when it was let go. let_go: X_TO of the object then, or None.
     """
 
     station: ClutterStation
@@ -214,6 +216,7 @@ class Vacuum:
     dropped: float = math.nan
     largest_share: float = 0.0
     slip: float = math.nan
+    let_go: Pose | None = None
     _on: bool = False
     _overloaded: int = 0  # looks in a row
     _looked: float = -math.inf  # s
@@ -228,7 +231,7 @@ class Vacuum:
         wanted = self.wanted(root)
         if wanted and not self._on:
             self.sealed, self.dropped, self.largest_share, self.slip, self._overloaded = False, math.nan, 0.0, math.nan, 0
-            self.taken = ""
+            self.taken, self.let_go = "", None
         self._on = wanted
         if wanted and not self.held and math.isnan(self.dropped):
             self._take(context)
@@ -262,6 +265,7 @@ class Vacuum:
 
     def _release(self, context: Context) -> None:
         self.slip = float(np.linalg.norm(self._grasp(context, self.held)[:3, 3] - self._X_OG[:3, 3]))
+        self.let_go = pose_of(self.station.scene.bodies[self.held].EvalPoseInWorld(context))
         self.station.hold.release(context)
         self.held = ""
 

@@ -1,12 +1,13 @@
 """Carrying out plans in a running diagram."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
-from pydrake.trajectories import PiecewisePolynomial
+from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.arm.paths import Payload, dynamics_plant, motion, torques
 from drake_clutter.arm.plan import Plan
@@ -18,6 +19,8 @@ DWELL = 0.15
 """s, that the arm waits for the vacuum to build up, and to be gone."""
 PERIOD = 0.025
 """s, of the looks for a new plan."""
+PRESSED = 0.0005
+"""m, by which the bellows give way, from how what hangs on them had pulled them: the object touches something, with 1 N."""
 SAMPLE_PERIOD = 0.01
 """s, of the samples of reference and feed-forward torque, interpolated linearly."""
 
@@ -28,12 +31,13 @@ class Schedule:
 
     Attributes:
         command: (18,), desired state, rad and rad/s, and feed-forward torque, N m.
-        suction_on, suction_off, end: s.
+        suction_on, descends, suction_off, end: s; if it does not descend, `descends` is `suction_off`.
         starts: name and start, s, of each phase and dwell.
     """
 
     command: PiecewisePolynomial
     suction_on: float
+    descends: float
     suction_off: float
     end: float
     starts: tuple[tuple[str, float], ...]
@@ -43,33 +47,55 @@ class Schedule:
         return "idle" if time >= self.end else [name for name, start in self.starts if start <= time + 1e-9][-1]
 
 
-def scheduled(plan: Plan, config: ArmConfig) -> Schedule:
-    """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take."""
+def scheduled(plan: Plan, config: ArmConfig, touched: float = math.inf) -> Schedule:
+    """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take.
+
+    Args:
+        plan, config: what to carry out.
+        touched: s, after which the descent has ended; afterwards the arm rises again as far as it went down.
+    """
     approach, carry, retreat = plan.phases
     mass, p_GCm = plan.mass, plan.p_GCm
     parts, t_parts, at_rest = list[Floats](), list[Floats](), np.zeros((2, 6))
     starts, time = list[tuple[str, float]](), 0.0
     empty, loaded = Payload(), Payload(mass, p_GCm)
-    for name, phase, payload in (
-        ("approach", approach, empty),
+    down = plan.descent and _until(plan.descent, touched)
+    up = down and _backwards(down)
+    for name, trajectory, payload in (
+        ("approach", approach.trajectory, empty),
         ("grasp", None, empty),
-        ("carry", carry, loaded),
+        ("carry", carry.trajectory, loaded),
+        *([("descend", down, loaded)] if down else []),
         ("release", None, loaded),
-        ("retreat", retreat, empty),
+        *([("rise", up, empty)] if up else []),
+        ("retreat", retreat.trajectory, empty),
     ):
         starts.append((name, time))
-        duration = phase.duration if phase else DWELL
-        if phase:
-            q, v, a = motion(phase.trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
+        duration = float(trajectory.end_time()) if trajectory else DWELL
+        if trajectory:
+            q, v, a = motion(trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
         else:
             q, v, a = np.repeat(parts[-1][-1:, :6], 2, axis=0), at_rest, at_rest
         t_parts.append(time + np.linspace(0.0, duration, len(q)))
         parts.append(np.column_stack([q, v, torques(dynamics_plant(config, payload), q, v, a)]))
         time += duration
-    on, off = starts[1][1], starts[3][1]
+    at = dict(starts)
     # Neighbouring parts share a time: the later sample is left a moment later.
     t = np.concatenate([part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)])
-    return Schedule(PiecewisePolynomial.FirstOrderHold(t, np.vstack(parts).T), on, off, time, tuple(starts))
+    command = PiecewisePolynomial.FirstOrderHold(t, np.vstack(parts).T)
+    return Schedule(command, at["grasp"], at.get("descend", at["release"]), at["release"], time, tuple(starts))
+
+
+def _until(trajectory: Trajectory, time: float) -> Trajectory:
+    """The part up to a time, s; it may end in motion."""
+    end = min(time, trajectory.end_time())
+    return PathParameterizedTrajectory(trajectory, PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]]))
+
+
+def _backwards(trajectory: Trajectory) -> Trajectory:
+    """The same way back."""
+    end = trajectory.end_time()
+    return PathParameterizedTrajectory(trajectory, PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]]))
 
 
 @dataclass(frozen=True)
@@ -79,12 +105,16 @@ class Running:
     Attributes:
         plan, schedule: of it; None before the first.
         begun: s. count: of the plans begun so far.
+        hung: m, how far what is carried had pulled the bellows when the descent began; NaN before.
+        touched: s, of the descent, until something was touched; infinite before.
     """
 
     plan: Plan | None = None
     schedule: Schedule | None = None
     begun: float = 0.0
     count: int = 0
+    hung: float = math.nan
+    touched: float = math.inf
 
     def __deepcopy__(self, memo: object) -> "Running":
         """Itself, as of `Plan`."""
@@ -94,7 +124,8 @@ class Running:
 class PickPlaceExecutor(LeafSystem):
     """Runs one plan after the other.
 
-    Input port: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended.
+    Input ports: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended. cup (2,),
+        how far the bellows are pulled out, m, and how fast, m/s: a descent ends when they give way, or where it was planned to.
     Output ports: command (18,), desired state, rad and rad/s, and feed-forward torque, N m; suction (1,), 1 for on; status,
         abstract, the phase; finished (1,), how many plans have ended.
     """
@@ -106,6 +137,7 @@ class PickPlaceExecutor(LeafSystem):
         home, still = np.array(config.home)[None], np.zeros((1, 6))
         self._at_home = np.hstack([home, still, torques(dynamics_plant(config, Payload()), home, still, still)]).ravel()
         self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
+        self._cup = self.DeclareVectorInputPort("cup", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(Running()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
@@ -123,13 +155,29 @@ class PickPlaceExecutor(LeafSystem):
         return system
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        running = self.running(context)
+        now = self.running(context)
+        after = self._felt(context, now)
         plan = self._plan_port.Eval(context) if self._plan_port.HasValue(context) else None
-        over = running.schedule is None or context.get_time() >= running.begun + running.schedule.end
-        if plan is not None and plan is not running.plan and over:
-            begun = Running(plan, scheduled(plan, self._config), context.get_time(), running.count + 1)
-            state.get_mutable_abstract_state(int(self._state)).set_value(begun)
+        over = now.schedule is None or context.get_time() >= now.begun + now.schedule.end
+        if plan is not None and plan is not now.plan and over:
+            after = Running(plan, scheduled(plan, self._config), context.get_time(), now.count + 1)
+        if after is not now:
+            state.get_mutable_abstract_state(int(self._state)).set_value(after)
         return EventStatus.Succeeded()
+
+    def _felt(self, context: Context, now: Running) -> Running:
+        """With an end of the descent, if the cup feels that the object has touched something."""
+        if now.schedule is None or now.plan is None or not self._cup.HasValue(context) or math.isfinite(now.touched):
+            return now
+        descended = context.get_time() - now.begun - now.schedule.descends
+        if not 0 < descended < now.schedule.suction_off - now.schedule.descends:
+            return now
+        pulled = float(self._cup.Eval(context)[0])
+        if math.isnan(now.hung):
+            return replace(now, hung=pulled)
+        if pulled > now.hung - PRESSED:
+            return now
+        return replace(now, touched=descended, schedule=scheduled(now.plan, self._config, descended))
 
     def running(self, context: Context) -> Running:
         """What is being carried out, or was last."""

@@ -1,7 +1,8 @@
 """What a planner answers: how a move is carried out, or why it cannot be.
 
 Frames: T the tray, G the cup, O the picked object. A move is three paths between rests: `approach` from home to the grasp,
-`carry` from there to where the object is let go, `retreat` back home.
+`carry` from there to where the object is let go, `retreat` back home. Between the last two there may be a guarded descent, for
+who does not know how tall things are.
 """
 
 import math
@@ -83,6 +84,7 @@ class Plan:
         X_OG: (4, 4) the grasp.
         mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
         phases: in order.
+        descent: q (6,) rad over time, s: straight down from the place, to be run until the object touches something; or None.
         attempts: grasps and branches that were looked at.
         seconds: that planning took.
     """
@@ -96,10 +98,11 @@ class Plan:
     phases: tuple[Phase, ...]
     attempts: int
     seconds: float
+    descent: Trajectory | None = None
 
     @property
     def duration(self) -> float:
-        """s, of the motion."""
+        """s, of the motion, but for the descent."""
         return sum(phase.duration for phase in self.phases)
 
     @property

@@ -35,6 +35,9 @@ from drake_clutter.tasks.exploration import ExplorationTask, Step
 
 LATENCY = 1.15
 """s, from an image to the plan: 0.15 for perception, 1 for planning."""
+DESCENT = 0.08
+"""m, by which an object that is known from images may be lowered until it touches something: of a box in a pile they show the
+top, and with a wrong class its height is wrong."""
 PATIENCE = 1.0
 """s, after a plan's end, for which what has fallen is followed."""
 
@@ -112,7 +115,8 @@ class ClosedLoop:
         sees: Perceive = perceive or LabelPerception(scene, self.station, world)
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
         self._tracks = perceive is not None
-        self._ways = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, camera.altitude)
+        ways = PlannerConfig(descent=DESCENT if self._tracks else 0.0)
+        self._ways = PickPlacePlanner(self._arm, ways, scene.tray_side, camera.altitude)
         self.agent = ExplorationAgent.AddToBuilder(
             builder,
             choose=choose,
@@ -133,6 +137,7 @@ class ClosedLoop:
             (self.agent, planner, {"request": "request"}),
             (planner, self.executor, {"plan": "plan"}),
             (self.executor, self.station, {"command": "command"}),
+            (self.station, self.executor, {"cup": "cup"}),
         ):
             for output, input_ in ports.items():
                 builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
@@ -238,7 +243,9 @@ class ClosedLoop:
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
         X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
-        outcome = judged(before, after, picked, X_TO_place, came_off, self._world.settle)
+        let_go = self.vacuum.let_go
+        X_TO_let_go = X_TO_place if came_off or let_go is None else let_go
+        outcome = judged(before, after, picked, X_TO_let_go, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"
