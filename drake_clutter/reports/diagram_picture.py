@@ -35,7 +35,7 @@ def connections(diagram: Diagram) -> nx.DiGraph:
         found[writer.get_name(), reader.get_name()].append(output if output == input_ else f"{output} → {input_}")
     graph = nx.DiGraph()
     graph.add_nodes_from(system.get_name() for system in diagram.GetSystems())
-    graph.add_edges_from((a, b, {"ports": sorted(ports)}) for (a, b), ports in found.items())
+    graph.add_edges_from((a, b, {"ports": sorted(ports)}) for (a, b), ports in sorted(found.items()))
     return graph
 
 
@@ -43,6 +43,8 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     """Draws a diagram to a file of a kind that Matplotlib knows."""
     graph = connections(diagram)
     loop = max(nx.simple_cycles(graph), key=len)
+    first = loop.index(min(loop))
+    loop = loop[first:] + loop[:first]
     order = [*loop, *(name for name in graph if name not in loop)]
     angles = np.pi / 2 - 2 * np.pi * np.arange(len(order)) / len(order)
     at = {name: np.array([6.2 * np.cos(a), 3.6 * np.sin(a)]) for name, a in zip(order, angles, strict=True)}
@@ -57,9 +59,9 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     for a, b, ports in graph.edges(data="ports"):
         way = at[b] - at[a]
         aside = _AWAY * np.array([way[1], -way[0]]) / np.linalg.norm(way) if graph.has_edge(b, a) else np.zeros(2)
-        start, end = _at_box(at[a], way) + aside, _at_box(at[b], -way) + aside
+        start, end = _at_box(at[a], way, aside), _at_box(at[b], -way, aside)
         arrow = {"arrowstyle": "-|>", "linewidth": 2, "color": "#30507a", "mutation_scale": 20, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", end, start, arrowprops=arrow, zorder=1)
+        axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=arrow, zorder=1)
         middle = (start + end) / 2 + 2.2 * aside
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
         axes.text(middle[0], middle[1], "\n".join(ports), ha="center", va="center", size=11, bbox=box, zorder=2)
@@ -69,11 +71,11 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     plt.close(figure)
 
 
-def _at_box(middle: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Where a line from the middle of a box leaves it."""
+def _at_box(middle: np.ndarray, way: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    """Where a line that goes past the middle of a box, so far aside of it, leaves the box."""
     with np.errstate(divide="ignore"):
-        scale = np.min(np.array([_WIDTH, _HEIGHT]) / 2 / np.abs(way))
-    return np.asarray(middle + scale * way)
+        scale = np.min((np.copysign(np.array([_WIDTH, _HEIGHT]) / 2, way) - aside) / way)
+    return np.asarray(middle + aside + scale * way)
 
 
 if __name__ == "__main__":
