@@ -4,6 +4,7 @@ import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
-from drake_clutter.arm.attempts import DESCENT_SPEED, PlannerConfig
+from drake_clutter.arm.attempts import PlannerConfig
+from drake_clutter.arm.clutter_station import ClutterStation
 from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
 from drake_clutter.arm.plan import Plan
 from drake_clutter.arm.planner import PickPlacePlanner
@@ -116,11 +118,52 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(too_
     assert isinstance(plan, Plan)
     simulation = ArmSimulation(ArmConfig(), scene_of(stands), plan, camera_altitude=1.6)
     carried = simulation.run()
-    touched = simulation.running.touched * DESCENT_SPEED
-    assert touched == pytest.approx(too_tall + 0.003, abs=0.003)
-    assert simulation.vacuum.let_go is not None
-    assert simulation.vacuum.let_go.translation[2] == pytest.approx(0.055, abs=0.002)
+    assert simulation.running.lowered == pytest.approx(too_tall + 0.003, abs=0.003)
     assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
+
+
+def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
+    """The support is believed 10.5 mm too low, more than the bellows give way; and a way that was optimised hits too hard."""
+    box, support = SCENE["sugar_box"], resting("cracker_box", xy=(0.2, -0.2))
+    top = support.top
+    X_TO = Pose((0.2, -0.2, top - 0.0105 + 0.0875), box.X_TO.quaternion)
+    slow = PlannerConfig(descent=0.08, optimise=False)
+    plan = PickPlacePlanner(ArmConfig(), slow, 0.70, 1.60).plan([box], box.name, X_TO)
+    assert isinstance(plan, Plan)
+    simulation = ArmSimulation(ArmConfig(), scene_of(box, support), plan, camera_altitude=1.6)
+    carried = simulation.run()
+    assert simulation.running.lowered < 0.002
+    assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
+    assert carried.displaced[support.name] < 0.005
+
+
+def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
+    guarded = PickPlacePlanner(ArmConfig(), PlannerConfig(descent=0.08), 0.70, 1.60).plan(SCENE.objects, "sugar_box", PLACE)
+    assert isinstance(guarded, Plan)
+    assert guarded.depth == pytest.approx(0.08)
+    simulation = ArmSimulation(ArmConfig(suction=SuctionConfig(unevenness=-1.0)), SCENE, guarded, camera_altitude=1.6)
+    simulation.run()
+    assert simulation.running.lowered < 0.002
+
+
+@pytest.mark.parametrize("jointed", ["", "sugar_box"])
+def test_cameras_see_things_where_they_are(jointed: str) -> None:
+    classes = [(o.name, o.object_class) for o in SCENE.objects]
+    options: dict[str, Any] = {"tray_side": 0.7, "camera_altitude": 1.6, "time_step": 0.01, "jointed": jointed, "visuals": True}
+    station = ClutterStation(ArmConfig(), classes, **options)
+    root = station.CreateDefaultContext()
+    station.set_scene(root, np.array(ArmConfig().home), SCENE.objects)
+    query, poses = (station.GetOutputPort(name).Eval(root) for name in ("query", "body_poses"))
+    inspector, compared = query.inspector(), 0
+    for geometry in inspector.GetAllGeometryIds():
+        name = inspector.GetName(inspector.GetFrameId(geometry))
+        for model in (f"{o.name}::{o.object_class.name}" for o in SCENE.objects):
+            if name.startswith(model):
+                body = station.scene.bodies[model.split("::")[0]]
+                X_TB = query.GetPoseInWorld(inspector.GetFrameId(geometry))
+                assert X_TB.IsNearlyEqualTo(poses[int(body.index())], 1e-9)
+                compared += 1
+    assert compared >= len(SCENE.objects)
 
 
 def test_an_executor_without_a_plan_stays_at_home() -> None:

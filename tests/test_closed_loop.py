@@ -65,7 +65,7 @@ class Bench:
         context = self.simulator.get_mutable_context()
         self.agent.GetInputPort("observation").FixValue(context, observation)
         self.agent.GetInputPort("answer").FixValue(context, answer)
-        self.agent.GetInputPort("finished").FixValue(context, [finished])
+        self.agent.GetInputPort("finished").FixValue(context, [finished, 0.0])
 
     def after(self, seconds: float) -> AgentState:
         self.time += seconds

@@ -18,7 +18,7 @@ from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.arm.planner import PickPlacePlanner
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.config import ClutterConfig, SettleConfig
-from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.geometry import carried, touching_groups
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
 from drake_clutter.scenes.seams import Frame, Instability, Move, MoveResult, Observation, Outcome
@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 
 SETTLE_TIME = 0.1
 """s, that is simulated after the arm is home."""
+TOUCHING_LOOKS = 0.01
+"""m, between the places at which a descent is looked at for what it may touch."""
 UNTOUCHED = 1e-4
 """m; what moved less is not settled again."""
 LOOK = 0.025
@@ -86,19 +88,23 @@ def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], 
     The picked one is among both.
     """
     picked = nearest(objects, plan.X_TO_pick)
-    placed = replace(picked, X_TO=plan.X_TO_place)
+    X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
+    lowered = np.linspace(0.0, plan.depth, math.ceil(plan.depth / TOUCHING_LOOKS) + 1)
+    placed = [replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()]
     groups = touching_groups(objects, TOUCHING_MARGIN)
 
-    def near(end: SceneObject) -> set[str]:
-        close = [g for g in groups if any(o.name != end.name and len(touching_groups([end, o], TOUCHING_MARGIN)) == 1 for o in g)]
-        return {o.name for g in close for o in g}
+    def near(ends: Sequence[SceneObject]) -> set[str]:
+        def close(o: SceneObject) -> bool:
+            return o is not picked and any(len(touching_groups([end, o], TOUCHING_MARGIN)) == 1 for end in ends)
 
-    return near(picked) | {picked.name}, near(placed) | {picked.name}
+        return {picked.name, *(o.name for group in groups if any(close(o) for o in group) for o in group)}
+
+    return near([picked]), near(placed)
 
 
 def taking_part(schedule: Schedule, beside_pick: Set[str], beside_place: Set[str], time: float) -> set[str]:
     """The names of what may move at a time since a plan was begun, s; see `disturbed_by`."""
-    on, off = schedule.suction_on - AHEAD, schedule.descends - AHEAD
+    on, off = schedule.suction_on - AHEAD, schedule.descent_start - AHEAD
     wanted = set[str]()
     if on <= time <= schedule.suction_on + DWELL + LIFTED:
         wanted |= beside_pick
@@ -138,7 +144,7 @@ class ArmSimulation:
         source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(plan)))
         builder.Connect(source.get_output_port(), self.executor.GetInputPort("plan"))
         builder.Connect(self.executor.GetOutputPort("command"), self.station.GetInputPort("command"))
-        builder.Connect(self.station.GetOutputPort("cup"), self.executor.GetInputPort("cup"))
+        builder.Connect(self.station.GetOutputPort("bellows"), self.executor.GetInputPort("bellows"))
         self.diagram: Diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         self._suction = self.executor.GetOutputPort("suction")
@@ -237,10 +243,11 @@ class ArmExecutor:
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
             return Outcome(result, scene, detail="" if no_spot else str(plan))
         simulation = ArmSimulation(self._arm, scene, plan, camera_altitude=self._config.camera.altitude)
-        carried = simulation.run(record=True)
-        came_off = not carried.sealed or not math.isnan(carried.dropped)
-        outcome = judged(scene, scene.at(carried.poses), move.pick, plan.X_TO_place, came_off, self._config.settle)
-        return replace(outcome, motion=carried.motion, detail=str(carried))
+        told = simulation.run(record=True)
+        came_off = not told.sealed or not math.isnan(told.dropped)
+        X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulation.running.lowered))
+        outcome = judged(scene, scene.at(told.poses), move.pick, X_TO_place, came_off, self._config.settle)
+        return replace(outcome, motion=told.motion, detail=str(told))
 
 
 def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: bool, config: SettleConfig) -> Outcome:

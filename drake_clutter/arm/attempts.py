@@ -14,7 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_clutter.arm.clearance import Clearance, ClearanceScene
 from drake_clutter.arm.kinematics import forward_kinematics
 from drake_clutter.arm.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
-from drake_clutter.arm.plan import NoPlan, Phase, Plan, PlanFailure
+from drake_clutter.arm.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.arm.shorten import Wall, Way, shortened
 from drake_clutter.arm.station import ArmConfig
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -62,8 +62,10 @@ NEAR = 0.06
 """m; what is further away is not looked at when a way is optimised."""
 _VERTICAL_STEP = 0.02
 """m, between the points of a vertical way."""
-DESCENT_SPEED = 0.02
-"""m/s; at the executor's looks for a touch, half a millimetre apart."""
+_DESCENT_STEP = 0.005
+"""m, between the points of a guarded descent."""
+_JUMP = 0.5
+"""rad, from one point of a vertical way to the next: the branch goes on elsewhere."""
 
 
 def matrix(pose: Pose) -> Floats:
@@ -185,7 +187,7 @@ class Attempts:
         q[0] = start
         for k in range(1, len(q)):
             q[k] = nearest_turns(q[k], q[k - 1])
-        return None if np.abs(np.diff(q, axis=0)).max() > 0.5 else q
+        return None if np.abs(np.diff(q, axis=0)).max() > _JUMP else q
 
     def _free(self, way: Floats, end: End, progress: int, what: str) -> Clearance | None:
         """The least clearance along a way; None, and the reason is remembered, if it is less than it must be.
@@ -263,28 +265,26 @@ class Attempts:
             phases = self._phases(grasp, X_OG, up, down, branch, ends)
             if phases is not None:
                 x, y, z = (float(v) for v in inverse(X_OG)[:3, 3])
-                descent = self._descent(X_place, q_place, branch)
+                descent = self._descent(X_OG, q_place, branch)
                 mass = self._picked.object_class.mass
                 return Plan(name, self._picked.X_TO, self._place, X_OG, mass, (x, y, z), phases, self.count, 0.0, descent)
         return None
 
-    def _descent(self, X_place: Floats, q_place: Floats, branch: int) -> Trajectory | None:
+    def _descent(self, X_OG: Floats, q_place: Floats, branch: int) -> Trajectory | None:
         """Straight down from the place as far as it is asked for, and the arm is free; what it holds may touch anything."""
-        steps = math.ceil(self._config.descent / _VERTICAL_STEP)
-        heights = np.linspace(0.0, self._config.descent, steps + 1)
-        self._set_up("retreat", X_place)
+        X_place, way = matrix(self._place) @ X_OG, [q_place]
+        heights = np.arange(0.0, self._config.descent + 1e-9, _DESCENT_STEP)
+        self._set_up("retreat", X_OG)
         self._scene.put_one(self._picked.name, self._place.moved((0.0, 0.0, -10.0)))
-        way, at_place = [q_place], End(X_place[:2, 3], {})
         for height in heights[1:]:
             q = nearest_turns(self._reach(self._lifted(X_place, -height))[branch], way[-1])
-            if not np.isfinite(q).all() or self._free(q[None], at_place, 0, "the descent") is None:
+            jumps = not np.abs(q - way[-1]).max() < _JUMP  # also if it is out of reach, and so not a number
+            if jumps or self._free(q[None], End(X_place[:2, 3], {}), 0, "the descent") is None:
                 break
             way.append(q)
         if len(way) == 1:
             return None
-        rest = np.zeros((6, 1))
-        times = heights[: len(way)] / DESCENT_SPEED
-        return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, np.array(way).T, rest, rest)
+        return PiecewisePolynomial.FirstOrderHold(heights[: len(way)] / DESCENT_SPEED, np.array(way).T)
 
     def _phases(
         self, grasp: Grasp, X_OG: Floats, up: Floats, down: Floats, branch: int, ends: tuple[End, End]

@@ -6,26 +6,26 @@ monitor.
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import PdControllerGains
+from pydrake.multibody.tree import PdControllerGains, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.arm.hold import HexapodHold, Hold, JointHold
 from drake_clutter.arm.kinematics import JOINTS
-from drake_clutter.arm.station import ArmConfig, add_arm, joint_numbers
+from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
 from drake_clutter.arm.suction import load_share, surface_under_lip, unevenness
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.seams import ArmState
-from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, pose_of, rigid_transform
+from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -43,12 +43,12 @@ class ClutterStation(Diagram):
     """The arm among objects.
 
     Input port: command (18,), desired state, rad and rad/s, and feed-forward torque, N m.
-    Output ports: state, of the whole plant; body_poses, of all its bodies; cup (2,), how far the bellows are pulled out, m, and
-        how fast, m/s; with visuals query, of `looks`.
+    Output ports: state, of the whole plant; body_poses, of all its bodies; bellows (2,), how far they are pulled out, m, and
+        how fast, m/s; with visuals query, of `camera_scene_graph`.
 
     Attributes:
-        looks: the geometry that cameras see, or None: apart from that of the contacts, as renderers that are told of poses at
-            every step take more time than the step does.
+        camera_scene_graph: the geometry that cameras see, or None: apart from that of the contacts, as renderers that are told of
+            poses at every step take more time than the step does.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ClutterStation(Diagram):
         self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True, visuals=False)
         for name in JOINTS:
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
-        self.hold: Hold = JointHold(plant, self.arm, self.scene.bodies[jointed]) if jointed else HexapodHold(plant, self.arm)
+        self.hold = _hold(plant, self.arm, self.scene.bodies, jointed)
         plant.Finalize()
         bodies = self.scene.bodies.items()
         lockable = [(n, b) for n, b in bodies if n != jointed]
@@ -95,24 +95,25 @@ class ClutterStation(Diagram):
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
-        builder.ExportOutput(plant.get_state_output_port(self.arm.tool), "cup")
-        self.looks = self._add_looks(builder, objects, tray_side, camera_altitude) if visuals else None
+        builder.ExportOutput(plant.get_state_output_port(self.arm.tool), "bellows")
+        self.camera_scene_graph = self._add_camera_geometry(builder, objects, tray_side, camera_altitude) if visuals else None
         builder.BuildInto(self)
 
-    def _add_looks(
+    def _add_camera_geometry(
         self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
     ) -> SceneGraph:
         """Adds the geometry that cameras see: of a twin of the plant, which is never simulated, in the plant's state."""
-        twin, looks = MultibodyPlant(self.time_step), builder.AddNamedSystem("looks", SceneGraph())
-        twin.RegisterAsSourceForSceneGraph(looks)
-        populated(twin, looks, objects, tray_side, visuals=True, jointed=self._jointed)
-        add_arm(twin, looks, self.config, camera_altitude, compliant=True, visuals=True)
+        twin, seen = MultibodyPlant(self.time_step), builder.AddNamedSystem("camera_scene_graph", SceneGraph())
+        twin.RegisterAsSourceForSceneGraph(seen)
+        bodies = populated(twin, seen, objects, tray_side, visuals=True, jointed=self._jointed).bodies
+        arm = add_arm(twin, seen, self.config, camera_altitude, compliant=True, visuals=True)
+        _hold(twin, arm, bodies, self._jointed)  # with it the states are alike
         twin.Finalize()
         poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True))
         builder.Connect(self.plant.get_state_output_port(), poses.get_input_port())
-        builder.Connect(poses.get_output_port(), looks.get_source_pose_port(twin.get_source_id()))
-        builder.ExportOutput(looks.get_query_output_port(), "query")
-        return looks
+        builder.Connect(poses.get_output_port(), seen.get_source_pose_port(twin.get_source_id()))
+        builder.ExportOutput(seen.get_query_output_port(), "query")
+        return seen
 
     @property
     def takeable(self) -> tuple[str, ...]:
@@ -194,6 +195,11 @@ class ClutterStation(Diagram):
                 self._joints[name].Unlock(context)
 
 
+def _hold(plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], jointed: str) -> Hold:
+    """For the one object that is jointed, or for any."""
+    return JointHold(plant, arm, bodies[jointed]) if jointed else HexapodHold(plant, arm)
+
+
 @dataclass
 class Vacuum:
     """Switches the cup's hold on and off in a running simulation; to be called as its monitor.
@@ -205,7 +211,7 @@ class Vacuum:
         taken: the name of the one that did since the vacuum was last switched on, or "".
         sealed: whether one did since the vacuum was last switched on; dropped: when it came off by its load since then, s.
         largest_share: of what the cup can bear, since then.
-        slip: m, between cup and object from when it was taken to when it was let go. let_go: X_TO of the object then, or None.
+        slip: m, between cup and object from when it was taken to when it was let go.
     """
 
     station: ClutterStation
@@ -216,7 +222,6 @@ class Vacuum:
     dropped: float = math.nan
     largest_share: float = 0.0
     slip: float = math.nan
-    let_go: Pose | None = None
     _on: bool = False
     _overloaded: int = 0  # looks in a row
     _looked: float = -math.inf  # s
@@ -231,7 +236,7 @@ class Vacuum:
         wanted = self.wanted(root)
         if wanted and not self._on:
             self.sealed, self.dropped, self.largest_share, self.slip, self._overloaded = False, math.nan, 0.0, math.nan, 0
-            self.taken, self.let_go = "", None
+            self.taken = ""
         self._on = wanted
         if wanted and not self.held and math.isnan(self.dropped):
             self._take(context)
@@ -265,7 +270,6 @@ class Vacuum:
 
     def _release(self, context: Context) -> None:
         self.slip = float(np.linalg.norm(self._grasp(context, self.held)[:3, 3] - self._X_OG[:3, 3]))
-        self.let_go = pose_of(self.station.scene.bodies[self.held].EvalPoseInWorld(context))
         self.station.hold.release(context)
         self.held = ""
 
@@ -285,6 +289,7 @@ class Freedom:
         self._station, self._vacuum = station, vacuum
         self.free = set[str]()
         self._before = deque[tuple[float, dict[str, Floats]]](maxlen=self.LOOKS)
+        self._hit = deque[set[str]](maxlen=self.LOOKS)
 
     def begin(self, root: Context) -> None:
         """Locks all."""
@@ -301,9 +306,9 @@ class Freedom:
         moving = {name for name, speed in self._speeds(root).items() if speed > self.AT_REST}
         lost = not math.isnan(self._vacuum.dropped) or (must_hold and not self._vacuum.sealed)
         held = {self._vacuum.held} - {""}
-        # What is run into is freed as well: a locked object that is hit would stand like a rock.
-        hit = self._station.touched(self._station.plant_context(root)) - self.free if self.free else set()
-        free = set(self._station.classes) if lost else {*wanted, *moving, *held, *hit}
+        # What is run into is freed as well, for long enough to see whether it moves: locked it would stand like a rock.
+        self._hit.append(self._station.touched(self._station.plant_context(root)) - self.free if self.free else set())
+        free = set(self._station.classes) if lost else {*wanted, *moving, *held}.union(*self._hit)
         if free != self.free:
             self._station.lock_all_but(root, free)
             self.free = free

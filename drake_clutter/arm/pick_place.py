@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Even
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.arm.paths import Payload, dynamics_plant, motion, torques
-from drake_clutter.arm.plan import Plan
+from drake_clutter.arm.plan import DESCENT_SPEED, Plan
 from drake_clutter.arm.station import ArmConfig
 
 Floats = NDArray[np.float64]
@@ -19,8 +19,9 @@ DWELL = 0.15
 """s, that the arm waits for the vacuum to build up, and to be gone."""
 PERIOD = 0.025
 """s, of the looks for a new plan."""
-PRESSED = 0.0005
-"""m, by which the bellows give way, from how what hangs on them had pulled them: the object touches something, with 1 N."""
+PRESSED, HANGS = 0.0005, 0.0002
+"""m; in a descent the object touches something when the bellows give way so far (1 N, and three more of damping until the arm
+stands still), or are hardly pulled out: then it is held up already, or nothing hangs there (the lightest box pulls half a mm)."""
 SAMPLE_PERIOD = 0.01
 """s, of the samples of reference and feed-forward torque, interpolated linearly."""
 
@@ -31,13 +32,13 @@ class Schedule:
 
     Attributes:
         command: (18,), desired state, rad and rad/s, and feed-forward torque, N m.
-        suction_on, descends, suction_off, end: s; if it does not descend, `descends` is `suction_off`.
+        suction_on, descent_start, suction_off, end: s; without a descent its start is `suction_off`.
         starts: name and start, s, of each phase and dwell.
     """
 
     command: PiecewisePolynomial
     suction_on: float
-    descends: float
+    descent_start: float
     suction_off: float
     end: float
     starts: tuple[tuple[str, float], ...]
@@ -59,15 +60,15 @@ def scheduled(plan: Plan, config: ArmConfig, touched: float = math.inf) -> Sched
     parts, t_parts, at_rest = list[Floats](), list[Floats](), np.zeros((2, 6))
     starts, time = list[tuple[str, float]](), 0.0
     empty, loaded = Payload(), Payload(mass, p_GCm)
-    down = plan.descent and _until(plan.descent, touched)
-    up = down and _backwards(down)
+    let_go = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
+    if plan.descent is not None:
+        down = _until(plan.descent, touched)
+        let_go = [("steady", None, loaded), ("descend", down, loaded), *let_go, ("rise", _backwards(down), empty)]
     for name, trajectory, payload in (
         ("approach", approach.trajectory, empty),
         ("grasp", None, empty),
         ("carry", carry.trajectory, loaded),
-        *([("descend", down, loaded)] if down else []),
-        ("release", None, loaded),
-        *([("rise", up, empty)] if up else []),
+        *let_go,
         ("retreat", retreat.trajectory, empty),
     ):
         starts.append((name, time))
@@ -106,7 +107,7 @@ class Running:
         plan, schedule: of it; None before the first.
         begun: s. count: of the plans begun so far.
         hung: m, how far what is carried had pulled the bellows when the descent began; NaN before.
-        touched: s, of the descent, until something was touched; infinite before.
+        touched: s, of the descent, until something was touched; infinite if nothing was.
     """
 
     plan: Plan | None = None
@@ -116,6 +117,11 @@ class Running:
     hung: float = math.nan
     touched: float = math.inf
 
+    @property
+    def lowered(self) -> float:
+        """m, that the object goes down from its place."""
+        return 0.0 if self.plan is None else min(self.plan.depth, self.touched * DESCENT_SPEED)
+
     def __deepcopy__(self, memo: object) -> "Running":
         """Itself, as of `Plan`."""
         return self
@@ -124,10 +130,10 @@ class Running:
 class PickPlaceExecutor(LeafSystem):
     """Runs one plan after the other.
 
-    Input ports: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended. cup (2,),
-        how far the bellows are pulled out, m, and how fast, m/s: a descent ends when they give way, or where it was planned to.
+    Input ports: plan, abstract, a `Plan` or None; one that differs from the last is begun as soon as that has ended. bellows
+        (2,), how far they are pulled out, m, and how fast, m/s: a descent ends when they give way, or where it was planned to.
     Output ports: command (18,), desired state, rad and rad/s, and feed-forward torque, N m; suction (1,), 1 for on; status,
-        abstract, the phase; finished (1,), how many plans have ended.
+        abstract, the phase; finished (2,), how many plans have ended, and how far the latest has lowered its object, m.
     """
 
     def __init__(self, *, config: ArmConfig) -> None:
@@ -137,14 +143,14 @@ class PickPlaceExecutor(LeafSystem):
         home, still = np.array(config.home)[None], np.zeros((1, 6))
         self._at_home = np.hstack([home, still, torques(dynamics_plant(config, Payload()), home, still, still)]).ravel()
         self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
-        self._cup = self.DeclareVectorInputPort("cup", 2)
+        self._bellows = self.DeclareVectorInputPort("bellows", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(Running()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         of = {self.all_state_ticket(), self.time_ticket()}
         self.DeclareVectorOutputPort("command", 18, self._calc_command, of)
         self.DeclareVectorOutputPort("suction", 1, self._calc_suction, of)
-        self.DeclareVectorOutputPort("finished", 1, self._calc_finished, of)
+        self.DeclareVectorOutputPort("finished", 2, self._calc_finished, of)
         self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status, of)
 
     @staticmethod
@@ -167,17 +173,17 @@ class PickPlaceExecutor(LeafSystem):
 
     def _felt(self, context: Context, now: Running) -> Running:
         """With an end of the descent, if the cup feels that the object has touched something."""
-        if now.schedule is None or now.plan is None or not self._cup.HasValue(context) or math.isfinite(now.touched):
+        if now.schedule is None or now.plan is None or not self._bellows.HasValue(context) or math.isfinite(now.touched):
             return now
-        descended = context.get_time() - now.begun - now.schedule.descends
-        if not 0 < descended < now.schedule.suction_off - now.schedule.descends:
+        start = now.schedule.descent_start
+        descended = context.get_time() - now.begun - start
+        if not 0 < descended < now.schedule.suction_off - start:
             return now
-        pulled = float(self._cup.Eval(context)[0])
-        if math.isnan(now.hung):
-            return replace(now, hung=pulled)
-        if pulled > now.hung - PRESSED:
-            return now
-        return replace(now, touched=descended, schedule=scheduled(now.plan, self._config, descended))
+        pulled = float(self._bellows.Eval(context)[0])
+        hung = pulled if math.isnan(now.hung) else now.hung
+        if pulled > max(hung - PRESSED, HANGS):
+            return replace(now, hung=hung)
+        return replace(now, hung=hung, touched=descended, schedule=scheduled(now.plan, self._config, descended))
 
     def running(self, context: Context) -> Running:
         """What is being carried out, or was last."""
@@ -200,8 +206,8 @@ class PickPlaceExecutor(LeafSystem):
 
     def _calc_finished(self, context: Context, output: BasicVector) -> None:
         schedule, time = self._now(context)
-        ended = schedule is not None and time >= schedule.end
-        output.SetFromVector([self.running(context).count - (schedule is not None and not ended)])
+        running, ended = self.running(context), schedule is not None and time >= schedule.end
+        output.SetFromVector([running.count - (schedule is not None and not ended), running.lowered])
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         schedule, time = self._now(context)

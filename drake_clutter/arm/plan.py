@@ -19,6 +19,9 @@ from drake_clutter.scenes.scene import Pose
 
 Floats = NDArray[np.float64]
 
+DESCENT_SPEED = 0.02
+"""m/s, of a guarded descent; half a millimetre between two of the executor's looks for a touch."""
+
 
 class PlanFailure(Enum):
     """Why there is no plan."""
@@ -84,7 +87,8 @@ class Plan:
         X_OG: (4, 4) the grasp.
         mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
         phases: in order.
-        descent: q (6,) rad over time, s: straight down from the place, to be run until the object touches something; or None.
+        descent: q (6,) rad over time, s: straight down from the place at `DESCENT_SPEED`, to be run until the object touches
+            something; or None.
         attempts: grasps and branches that were looked at.
         seconds: that planning took.
     """
@@ -104,6 +108,11 @@ class Plan:
     def duration(self) -> float:
         """s, of the motion, but for the descent."""
         return sum(phase.duration for phase in self.phases)
+
+    @property
+    def depth(self) -> float:
+        """m, of the descent."""
+        return 0.0 if self.descent is None else DESCENT_SPEED * float(self.descent.end_time())
 
     @property
     def sure(self) -> float:
@@ -141,6 +150,7 @@ def plan_fields(found: Plan | NoPlan) -> dict[str, Any]:
         "place": {"translation": list(pose.translation), "quaternion": list(pose.quaternion)},
         "X_OG": found.X_OG.tolist(),
         "duration": found.duration,
+        "descent": found.depth,
         "phases": phases,
         "attempts": found.attempts,
         "seconds": found.seconds,

@@ -3,9 +3,10 @@
 A cubic spline over joint angles is made as quick as the joints' limits and the cup's hold allow, while it keeps clear of
 everything. Distances are linear in the joint angles for a small step, and so in the spline's control points: each round takes
 them at the last round's spline, and moves no control point by more than a step (as in Schulman et al. 2014, "Motion planning with
-sequential convex optimization and convex collision checking"). So is every other limit, in the control points and the square of
-the duration T: over a parameter that goes from 0 to 1, q'' is bounded by a T^2, and q' by v T, of which the tangent is taken.
-The result is a proposal: who asks checks it.
+sequential convex optimization and convex collision checking"). So are the limits of speed and acceleration, in the control points
+and the square of the duration T: over a parameter that goes from 0 to 1, q'' is bounded by a T^2, and q' by v T. Of T the tangent
+to the root of T^2 is taken, which is a little more, until the rounds settle. The result is a proposal: who asks checks it, and
+slows it down to its limits.
 """
 
 import math
@@ -29,7 +30,7 @@ STEPS = (0.8, 0.4, 0.2)
 LOOKED_AT = 50
 """Points of a spline at which distances are taken, and at every second of them how the cup is accelerated."""
 SETTLED = 0.02
-"""rad; a round that moves no control point further is the last: the next would see the same distances."""
+"""rad; a round that moves no control point further, and changes the duration by no larger a share, is the last."""
 UPRIGHT = 0.002
 """m, that the cup moves straight up from a grasp, and straight down to a place."""
 ENDS = 0.15
@@ -40,15 +41,15 @@ _SMOOTH = 1e-4
 """Weight of the squared accelerations beside T^2: of ways that are as quick it takes the smoothest."""
 _BASIS = BsplineBasis(_ORDER, CONTROL_POINTS, KnotVectorType.kClampedUniform, 0.0, 1.0)
 _CURVE = BsplineTrajectory(_BASIS, np.eye(CONTROL_POINTS))
-_SPEEDS, _ACCELERATIONS = (
+_TO_SPEEDS, _TO_ACCELERATIONS = (
     sparse.csr_matrix(np.kron(np.array(_CURVE.MakeDerivative(order).control_points())[..., 0], np.eye(6))) for order in (1, 2)
 )
 """(162, 168) and (156, 168): from all control points, row by row, to those of the first and the second derivative."""
-_FASTEST = np.tile(MARGIN * VELOCITY_LIMIT, CONTROL_POINTS - 1)
-_HARDEST = np.tile(MARGIN * ACCELERATION_LIMIT, CONTROL_POINTS - 2)
+_SPEED_LIMITS = np.tile(MARGIN * VELOCITY_LIMIT, CONTROL_POINTS - 1)
+_ACCELERATION_LIMITS = np.tile(MARGIN * ACCELERATION_LIMIT, CONTROL_POINTS - 2)
 _ALONG = np.linspace(0.0, 1.0, LOOKED_AT + 2)[1:-1]
-_AT = _CURVE.vector_values(_ALONG).T
-_CURVATURE_AT = _CURVE.MakeDerivative(2).vector_values(_ALONG).T
+_TO_VALUES = _CURVE.vector_values(_ALONG).T
+_TO_CURVATURES = _CURVE.MakeDerivative(2).vector_values(_ALONG).T
 """(LOOKED_AT, 28) each: from control points to the spline's values and second derivatives."""
 
 
@@ -99,11 +100,13 @@ def shortened(way: Way) -> BsplineTrajectory | None:
     for step in STEPS:
         found = _round(way, points, duration, step)
         if found is None:
-            return None
-        moved = np.abs(found[0] - points).max()
-        points, duration = found
-        if moved < SETTLED:
             break
+        settled = np.abs(found[0] - points).max() < SETTLED and abs(found[1] - duration) < SETTLED * duration
+        points, duration = found
+        if settled:
+            break
+    if duration >= way.sure.end_time():
+        return None
     return BsplineTrajectory(BsplineBasis(_ORDER, duration * np.array(_BASIS.knots())), points.T)
 
 
@@ -148,19 +151,19 @@ def _of_points(weights: Floats, directions: Floats) -> sparse.csr_matrix:
 
 def _limits(way: Way, points: Floats, duration: float) -> _Rows:
     """Of speed, acceleration and distances, at a spline near which they hold."""
-    rows, q = _Rows(), _AT @ points
+    rows, q = _Rows(), _TO_VALUES @ points
     # T is at most the tangent to the root of its square, at the last round's.
-    rows.add_both(_SPEEDS, _FASTEST / (2 * duration), _FASTEST * duration / 2)
-    rows.add_both(_ACCELERATIONS, _HARDEST)
+    rows.add_both(_TO_SPEEDS, _SPEED_LIMITS / (2 * duration), _SPEED_LIMITS * duration / 2)
+    rows.add_both(_TO_ACCELERATIONS, _ACCELERATION_LIMITS)
     if seen := [(k, wall) for k, s in enumerate(_ALONG) for wall in way.walls(q[k], s)]:
         at, gradients = np.array([k for k, _ in seen]), np.array([wall.gradient for _, wall in seen])
         room = np.array([wall.room for _, wall in seen])
         room = np.where(np.minimum(_ALONG, 1 - _ALONG)[at] < ENDS, np.maximum(room, 0.0), room)
-        rows.add(_of_points(-_AT[at], gradients), np.zeros(len(at)), room - (gradients * q[at]).sum(axis=1))
+        rows.add(_of_points(-_TO_VALUES[at], gradients), np.zeros(len(at)), room - (gradients * q[at]).sum(axis=1))
     if math.isfinite(way.acceleration):
         at = np.repeat(np.arange(0, LOOKED_AT, 2), 3)
         J = np.vstack([way.jacobian(q[k])[3:] for k in at[::3]])
-        rows.add_both(_of_points(_CURVATURE_AT[at], J), np.full(len(at), way.acceleration))
+        rows.add_both(_of_points(_TO_CURVATURES[at], J), np.full(len(at), way.acceleration))
     return rows
 
 
@@ -183,7 +186,7 @@ def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floa
             prog.AddLinearEqualityConstraint(_TILT, _TILT @ points[0], q)
     _limits(way, points, duration).impose(prog, x)
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
-    curved = sparse.diags(1 / _HARDEST) @ _ACCELERATIONS / duration**2
+    curved = sparse.diags(1 / _ACCELERATION_LIMITS) @ _TO_ACCELERATIONS / duration**2
     prog.AddQuadraticCost(2 * _SMOOTH * (curved.T @ curved).toarray(), np.zeros(points.size), x[:-1], is_convex=True)
     result = ClarabelSolver().Solve(prog)
     if not result.is_success():

@@ -38,6 +38,8 @@ LATENCY = 1.15
 DESCENT = 0.08
 """m, by which an object that is known from images may be lowered until it touches something: of a box in a pile they show the
 top, and with a wrong class its height is wrong."""
+ABOVE = 0.007
+"""m, by which it begins to be lowered higher than where it is to be let go: what it stands on may be a little higher, too."""
 PATIENCE = 1.0
 """s, after a plan's end, for which what has fallen is followed."""
 
@@ -108,9 +110,10 @@ class ClosedLoop:
             )
         )
         self.station.set_name("clutter_station")
-        assert self.station.looks is not None
-        self.station.looks.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
-        sensor = builder.AddSystem(RgbdSensor(self.station.looks.world_frame_id(), eye.X_TC, eye.color, eye.depth))
+        seen = self.station.camera_scene_graph
+        assert seen is not None
+        seen.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
+        sensor = builder.AddSystem(RgbdSensor(seen.world_frame_id(), eye.X_TC, eye.color, eye.depth))
         sensor.set_name("overhead_camera")
         sees: Perceive = perceive or LabelPerception(scene, self.station, world)
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
@@ -137,7 +140,7 @@ class ClosedLoop:
             (self.agent, planner, {"request": "request"}),
             (planner, self.executor, {"plan": "plan"}),
             (self.executor, self.station, {"command": "command"}),
-            (self.station, self.executor, {"cup": "cup"}),
+            (self.station, self.executor, {"bellows": "bellows"}),
         ):
             for output, input_ in ports.items():
                 builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
@@ -170,6 +173,8 @@ class ClosedLoop:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
         if X_TO is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
+        if self._tracks:
+            X_TO = X_TO.moved((0.0, 0.0, ABOVE))
         unseen = unseen_blocks(request.known, request.observation, self._empty)
         found = self._ways.plan(request.known, request.move.pick, X_TO, unseen)
         self._planning += found.seconds
@@ -241,11 +246,10 @@ class ClosedLoop:
         picked = self.vacuum.taken or nearest(before.objects, plan.X_TO_pick).name
         move, decision = replace(move, pick=picked), replace(decision, move=replace(move, pick=picked))
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
-        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
+        lowered = self.executor.running(self.executor.GetMyContextFromRoot(root)).lowered
+        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO).moved((0.0, 0.0, -lowered))
         came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
-        let_go = self.vacuum.let_go
-        X_TO_let_go = X_TO_place if came_off or let_go is None else let_go
-        outcome = judged(before, after, picked, X_TO_let_go, came_off, self._world.settle)
+        outcome = judged(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"

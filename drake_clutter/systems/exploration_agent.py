@@ -168,8 +168,8 @@ class AgentState:
 class ExplorationAgent(LeafSystem):
     """Chooses moves until nothing is left to do.
 
-    Input ports: observation, abstract, an `Observation`; answer, abstract, the planner's `Answer`; finished (1,), how many plans
-        have been carried out.
+    Input ports: observation, abstract, an `Observation`; answer, abstract, the planner's `Answer`; finished (2,), how many plans
+        have been carried out, and how far below its place the latest has let go of its object, m.
     Output ports: request, abstract, the latest `Request` or None; state, abstract, the `AgentState`.
     """
 
@@ -198,7 +198,7 @@ class ExplorationAgent(LeafSystem):
         self._hopeless = hopeless
         self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(None))
         self._answer = self.DeclareAbstractInputPort("answer", AbstractValue.Make(Answer()))
-        self._finished = self.DeclareVectorInputPort("finished", 1)
+        self._finished = self.DeclareVectorInputPort("finished", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(AgentState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         of = {self.all_state_ticket()}
@@ -233,9 +233,10 @@ class ExplorationAgent(LeafSystem):
                 return now
             if isinstance(answer.plan, NoPlan):
                 return replace(now.refused, look_at=time)
-            if self._finished.Eval(context)[0] > now.carried_out:
+            finished, lowered = self._finished.Eval(context)
+            if finished > now.carried_out:
                 assert isinstance(answer.plan, Plan)
-                return replace(now.placed(answer.plan.X_TO_place), look_at=time + self._rest)
+                return replace(now.placed(answer.plan.X_TO_place.moved((0.0, 0.0, -lowered))), look_at=time + self._rest)
         return now
 
     def looked(self, now: AgentState, observation: Observation) -> tuple[AgentState, Observation]:
