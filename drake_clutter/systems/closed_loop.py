@@ -173,11 +173,13 @@ class ClosedLoop:
         X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
         if X_TO is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
-        if self._tracks:
-            X_TO = X_TO.moved((0.0, 0.0, ABOVE))
         unseen = unseen_blocks(request.known, request.observation, self._empty)
-        found = self._ways.plan(request.known, request.move.pick, X_TO, unseen)
-        self._planning += found.seconds
+        # Where the arm has no room to go down, the object is let go where it is to be.
+        for above in (ABOVE, 0.0) if self._tracks else (0.0,):
+            found = self._ways.plan(request.known, request.move.pick, X_TO.moved((0.0, 0.0, above)), unseen)
+            self._planning += found.seconds
+            if isinstance(found, NoPlan) or found.depth >= above:
+                break
         return found
 
     def _agent_state(self, root: Context) -> AgentState:
