@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import resting, scene_of
+from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
@@ -21,12 +21,15 @@ from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import InputError
+from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import Move, MoveResult, Observation
+from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
-from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase
+from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase, Request
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scenario import Scenario, policy_of
+from drake_clutter.systems.scene_perception import for_who_sees
 from drake_clutter.tasks.exploration import Decision, EpisodeEnd, legal_moves
 from drake_clutter.tasks.exploration_graph import seen
 
@@ -234,6 +237,22 @@ def test_a_random_explorer_plays(config: ClutterConfig) -> None:
     task, timing = play(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
     assert len(task.steps) == 1
     assert timing.robot > 0
+
+
+@pytest.mark.parametrize("descent", [0.08, 0.0])
+def test_without_room_to_go_down_it_is_let_go_at_its_place(
+    descent: float, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closed_loop, "DESCENT", descent)
+    loop = ClosedLoop(COVERED, first_allowed, perceive=lambda *_: BEFORE, max_moves=1, seed=0, world=config)
+    move, known = Move("cracker_box"), seen((), BEFORE)
+    plan = loop._plan(Request(1, move, BEFORE, known, Decision(move)), rng(0))
+    assert isinstance(plan, Plan)
+    place = choose_placement(BEFORE, move, for_who_sees(config).exploration, rng(0))
+    assert place is not None
+    above = plan.X_TO_place.translation[2] - place.translation[2]
+    assert above == pytest.approx(closed_loop.ABOVE if descent else 0.0)
+    assert (plan.depth >= closed_loop.ABOVE) == (descent > 0)
 
 
 def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 
 SETTLE_TIME = 0.1
 """s, that is simulated after the arm is home."""
-TOUCHING_LOOKS = 0.01
+_DESCENT_LOOK = 0.01
 """m, between the places at which a descent is looked at for what it may touch."""
 UNTOUCHED = 1e-4
 """m; what moved less is not settled again."""
@@ -89,7 +89,7 @@ def disturbed_by(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], 
     """
     picked = nearest(objects, plan.X_TO_pick)
     X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
-    lowered = np.linspace(0.0, plan.depth, math.ceil(plan.depth / TOUCHING_LOOKS) + 1)
+    lowered = np.linspace(0.0, plan.depth, math.ceil(plan.depth / _DESCENT_LOOK) + 1)
     placed = [replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()]
     groups = touching_groups(objects, TOUCHING_MARGIN)
 
