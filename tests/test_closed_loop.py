@@ -243,7 +243,7 @@ def test_a_random_explorer_plays(config: ClutterConfig) -> None:
 def test_without_room_to_go_down_it_is_let_go_at_its_place(
     descent: float, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closed_loop, "DESCENT", descent)
+    monkeypatch.setattr(closed_loop, "GUARDED", PlannerConfig(descent=descent, above=0.007))
     loop = ClosedLoop(COVERED, first_allowed, perceive=lambda *_: BEFORE, max_moves=1, seed=0, world=config)
     move, known = Move("cracker_box"), seen((), BEFORE)
     plan = loop._plan(Request(1, move, BEFORE, known, Decision(move)), rng(0))
@@ -251,8 +251,8 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
     place = choose_placement(BEFORE, move, for_who_sees(config).exploration, rng(0))
     assert place is not None
     above = plan.X_TO_place.translation[2] - place.translation[2]
-    assert above == pytest.approx(closed_loop.ABOVE if descent else 0.0)
-    assert (plan.depth >= closed_loop.ABOVE) == (descent > 0)
+    assert above == pytest.approx(0.007 if descent else 0.0)
+    assert (plan.depth >= 0.007) == (descent > 0)
 
 
 def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:

@@ -36,6 +36,7 @@ class PlannerConfig:
         least_acceleration: m/s^2, that a grasp must bear.
         time_limit: s; so long that it decides nothing: the same question has the same answer on any machine.
         descent: m, at most, that an object is lowered from its place until it touches something; 0: it is let go there.
+        above: m, over its place, that this descent begins; where there is no room to go down, it is let go at its place.
         optimise: whether the sure way is made quicker by trajectory optimisation, see `arm/shorten.py`.
     """
 
@@ -49,6 +50,7 @@ class PlannerConfig:
     least_acceleration: float = 0.3
     time_limit: float = 600.0
     descent: float = 0.0
+    above: float = 0.0
     optimise: bool = True
 
 

@@ -19,7 +19,7 @@ from drake_clutter.arm.station import ArmConfig
 from drake_clutter.arm.time_optimal import squared_speeds
 from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
 from drake_clutter.resources import shipped_path
-from drake_clutter.simulation.plant import physics_sdf
+from drake_clutter.simulation.plant import sdf_text
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], bas
     config = ArmConfig(base=list(base))
     config.suction.extension = extension
     plant = MultibodyPlant(0.0)
-    (robot,) = Parser(plant).AddModelsFromString(physics_sdf(shipped_path("models/ur10.sdf")), "sdf")
+    (robot,) = Parser(plant).AddModelsFromString(sdf_text(shipped_path("models/ur10.sdf"), visuals=False), "sdf")
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=False), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), RigidTransform(config.X_TB))
     plant.WeldFrames(plant.GetFrameByName("flange", robot), plant.GetFrameByName("body", tool))

@@ -60,7 +60,10 @@ class PickPlacePlanner:
         """
         begun = time.perf_counter()
         picked = next(o for o in objects if o.name == pick)
-        found = self._plan(objects, picked, X_TO_place, unseen, begun)
+        for above in dict.fromkeys((self.planner.above, 0.0)):
+            found = self._plan(objects, picked, X_TO_place.moved((0.0, 0.0, above)), unseen)
+            if isinstance(found, NoPlan) or found.depth >= above:
+                break
         return replace(found, seconds=time.perf_counter() - begun)
 
     def _plan(
@@ -69,8 +72,8 @@ class PickPlacePlanner:
         picked: SceneObject,
         X_TO_place: Pose,
         unseen: Sequence[UnseenBlock],
-        begun: float,
     ) -> Plan | NoPlan:
+        begun = time.perf_counter()
         if carried := rests_on(picked, objects):
             return NoPlan(PlanFailure.CARRIES_OTHERS, ", ".join(carried))
         grasps = self._grasps(picked)

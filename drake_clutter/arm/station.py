@@ -20,7 +20,7 @@ from drake_clutter.arm.kinematics import JOINTS
 from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.assets.tray import RIM_THICKNESS
 from drake_clutter.resources import shipped_path
-from drake_clutter.simulation.plant import physics_sdf
+from drake_clutter.simulation.plant import sdf_text
 
 Floats = NDArray[np.float64]
 
@@ -100,8 +100,8 @@ def add_arm(
         compliant: see `epick_sdf`.
         visuals: whether cameras are to see the arm, see `add_scene_plant`.
     """
-    parser, model = Parser(plant), shipped_path("models/ur10.sdf")
-    (robot,) = parser.AddModels(str(model)) if visuals else parser.AddModelsFromString(physics_sdf(model), "sdf")
+    ur10 = sdf_text(shipped_path("models/ur10.sdf"), visuals=visuals)
+    (robot,) = Parser(plant).AddModelsFromString(ur10, "sdf")
     (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=compliant), "sdf")
     world, X_TB = plant.world_body(), RigidTransform(config.X_TB)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), X_TB)

@@ -34,11 +34,14 @@ def pose_of(X_AB: RigidTransform) -> Pose:
 
 
 @lru_cache(maxsize=256)
-def physics_sdf(path: Path) -> str:
-    """The SDF model at `path` without its visuals, URIs made absolute: reading a textured mesh costs 30 times the rest."""
+def sdf_text(path: Path, *, visuals: bool) -> str:
+    """The SDF model at `path` with or without its visuals, URIs made absolute.
+
+    Drake parses the text in a millisecond or two, the file it came from in sixty.
+    """
     ElementTree.register_namespace("drake", "drake.mit.edu")  # else the prefix is renamed, and Drake no longer knows it
     root = ElementTree.parse(path).getroot()
-    for link in root.iter("link"):
+    for link in () if visuals else root.iter("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
     for uri in root.iter("uri"):
@@ -90,7 +93,7 @@ def add_scene_plant(
         objects: (name, class) of each.
         tray_side: m, inner side of the tray.
         time_step: s; hydroelastic contact, lagged approximation, as DRAKE_NOTES found to be the truth.
-        visuals: whether the textured meshes are read, for cameras and Meshcat; slow.
+        visuals: whether the textured meshes are added, for cameras and Meshcat.
         jointed: the name of an object that the caller gives a joint.
     """
     config = MultibodyPlantConfig(
@@ -114,11 +117,8 @@ def populated(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:
-        parser = Parser(plant, model_name_prefix=name)
-        if visuals:
-            (instance,) = parser.AddModels(str(object_class.sdf_path))
-        else:
-            (instance,) = parser.AddModelsFromString(physics_sdf(object_class.sdf_path), "sdf")
+        text = sdf_text(object_class.sdf_path, visuals=visuals)
+        (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
         if name != jointed and object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
             radius = object_class.size[0] / 2

@@ -35,11 +35,9 @@ from drake_clutter.tasks.exploration import ExplorationTask, Step
 
 LATENCY = 1.15
 """s, from an image to the plan: 0.15 for perception, 1 for planning."""
-DESCENT = 0.08
-"""m, by which an object that is known from images may be lowered until it touches something: of a box in a pile they show the
-top, and with a wrong class its height is wrong."""
-ABOVE = 0.007
-"""m, by which it begins to be lowered higher than where it is to be let go: what it stands on may be a little higher, too."""
+GUARDED = PlannerConfig(descent=0.08, above=0.007)
+"""For objects known from images: of a box in a pile they show the top, and with a wrong class its height is wrong; what it is to
+stand on may be a little higher, too."""
 PATIENCE = 1.0
 """s, after a plan's end, for which what has fallen is followed."""
 
@@ -118,7 +116,7 @@ class ClosedLoop:
         sees: Perceive = perceive or LabelPerception(scene, self.station, world)
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
         self._tracks = perceive is not None
-        ways = PlannerConfig(descent=DESCENT if self._tracks else 0.0)
+        ways = GUARDED if self._tracks else PlannerConfig()
         self._ways = PickPlacePlanner(self._arm, ways, scene.tray_side, camera.altitude)
         self.agent = ExplorationAgent.AddToBuilder(
             builder,
@@ -174,12 +172,8 @@ class ClosedLoop:
         if X_TO is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
         unseen = unseen_blocks(request.known, request.observation, self._empty)
-        # Where the arm has no room to go down, the object is let go where it is to be.
-        for above in (ABOVE, 0.0) if self._tracks else (0.0,):
-            found = self._ways.plan(request.known, request.move.pick, X_TO.moved((0.0, 0.0, above)), unseen)
-            self._planning += found.seconds
-            if isinstance(found, NoPlan) or found.depth >= above:
-                break
+        found = self._ways.plan(request.known, request.move.pick, X_TO, unseen)
+        self._planning += found.seconds
         return found
 
     def _agent_state(self, root: Context) -> AgentState:
