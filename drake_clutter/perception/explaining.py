@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.config import CameraConfig
-from drake_clutter.perception.pose_score import distance_along, eye_in, image_bounds
+from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds
 from drake_clutter.scenes.scene import Pose
 
 _AGREES = 0.008
@@ -68,14 +68,13 @@ def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ig
     middle_u, middle_v = depth.shape[1] / 2 - 1, depth.shape[0] / 2 - 1
     said, far = np.zeros((bottom - top, right - left), np.int8), np.zeros((bottom - top, right - left), np.float32)
     e, h, alone = eye_in(R, p, altitude), (half[0], half[1], half[2]), 0
+    step, distances = (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal), np.empty(right - left)
     for v in range(top, bottom):
         y = (middle_v - v) / focal
+        ray = (R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2])
+        distances_along(cylinder, h, e, ray, step, left - middle_u, 1, distances)
         for u in range(left, right):
-            x = (u - middle_u) / focal
-            rx = R[0, 0] * x + R[1, 0] * y - R[2, 0]
-            ry = R[0, 1] * x + R[1, 1] * y - R[2, 1]
-            rz = R[0, 2] * x + R[1, 2] * y - R[2, 2]
-            away = distance_along(cylinder, h, e, rx, ry, rz)
+            away = distances[u - left]
             if away == np.inf:
                 continue
             alone += 1

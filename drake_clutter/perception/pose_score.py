@@ -47,35 +47,52 @@ class View(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _box_distance(h, e, x, y, z):  # type: ignore[no-untyped-def]
-    """m along the optical axis to a box of half sizes h, from the eye e along the ray (x, y, z), all in O; inf if missed."""
-    # Never 0: a ray along a face is turned by a hair.
-    ix = 1 / (x if abs(x) > 1e-12 else 1e-12)
-    iy = 1 / (y if abs(y) > 1e-12 else 1e-12)
-    iz = 1 / (z if abs(z) > 1e-12 else 1e-12)
-    rx, ry, rz = h[0] * abs(ix), h[1] * abs(iy), h[2] * abs(iz)
-    near = max(-e[0] * ix - rx, -e[1] * iy - ry, -e[2] * iz - rz)
-    far = min(-e[0] * ix + rx, -e[1] * iy + ry, -e[2] * iz + rz)
-    return near if near <= far else np.inf
+def _box_distances(h, e, ray, step, first, stride, away):  # type: ignore[no-untyped-def]
+    """See `distances_along`. Every choice is one between two numbers, so that the compiler does several rays at once."""
+    for k in range(len(away)):
+        u = first + k * stride
+        x, y, z = ray[0] + step[0] * u, ray[1] + step[1] * u, ray[2] + step[2] * u
+        # Never 0: a ray along a face is turned by a hair.
+        ix = 1 / (x if abs(x) > 1e-12 else 1e-12)
+        iy = 1 / (y if abs(y) > 1e-12 else 1e-12)
+        iz = 1 / (z if abs(z) > 1e-12 else 1e-12)
+        rx, ry, rz = h[0] * abs(ix), h[1] * abs(iy), h[2] * abs(iz)
+        near, far = -e[0] * ix - rx, -e[0] * ix + rx
+        near_y, far_y, near_z, far_z = -e[1] * iy - ry, -e[1] * iy + ry, -e[2] * iz - rz, -e[2] * iz + rz
+        near, far = near if near > near_y else near_y, far if far < far_y else far_y
+        near, far = near if near > near_z else near_z, far if far < far_z else far_z
+        away[k] = near if near <= far else np.inf
 
 
 @njit(cache=True, error_model="numpy")
-def _cylinder_distance(h, e, x, y, z):  # type: ignore[no-untyped-def]
-    """Likewise to a cylinder."""
-    a, b = max(x * x + y * y, 1e-20), e[0] * x + e[1] * y
-    root = b * b - a * (e[0] * e[0] + e[1] * e[1] - h[0] * h[0])
-    if root < 0:
-        return np.inf
-    root, iz = math.sqrt(root), 1 / (z if abs(z) > 1e-12 else 1e-12)
-    rz = h[2] * abs(iz)
-    near, far = max((-b - root) / a, -e[2] * iz - rz), min((-b + root) / a, -e[2] * iz + rz)
-    return near if near <= far else np.inf
+def _cylinder_distances(h, e, ray, step, first, stride, away):  # type: ignore[no-untyped-def]
+    """Likewise."""
+    c = e[0] * e[0] + e[1] * e[1] - h[0] * h[0]
+    for k in range(len(away)):
+        u = first + k * stride
+        x, y, z = ray[0] + step[0] * u, ray[1] + step[1] * u, ray[2] + step[2] * u
+        a, b = x * x + y * y, e[0] * x + e[1] * y
+        a = a if a > 1e-20 else 1e-20
+        square = b * b - a * c
+        root, iz = math.sqrt(square if square > 0 else 0.0), 1 / (z if abs(z) > 1e-12 else 1e-12)
+        rz = h[2] * abs(iz)
+        near, far = (-b - root) / a, (-b + root) / a
+        near_z, far_z = -e[2] * iz - rz, -e[2] * iz + rz
+        near, far = near if near > near_z else near_z, far if far < far_z else far_z
+        far = far if square >= 0 else -np.inf
+        away[k] = near if near <= far else np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def distance_along(cylinder, h, e, x, y, z):  # type: ignore[no-untyped-def]
-    """Likewise to a cylinder or a box."""
-    return _cylinder_distance(h, e, x, y, z) if cylinder else _box_distance(h, e, x, y, z)
+@njit(cache=True)
+def distances_along(cylinder, h, e, ray, step, first, stride, away):  # type: ignore[no-untyped-def]
+    """Fills away (n,) with distances, m along the optical axis, to a box or a cylinder of half sizes h; inf where it is missed.
+
+    Ray k goes from the eye e along ray + (first + k stride) step, all three in O.
+    """
+    if cylinder:
+        _cylinder_distances(h, e, ray, step, first, stride, away)
+    else:
+        _box_distances(h, e, ray, step, first, stride, away)
 
 
 @njit(cache=True)
@@ -122,16 +139,19 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
     stride = max(1, round(math.sqrt((window[1] - window[0]) * (window[3] - window[2]) / rays)))
     e = eye_in(R, p, view.altitude)
     h = (half[0], half[1], half[2])
-    ax, ay, az = R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal
+    step = (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal)
     speaks_for, against = 0.0, 0.0
+    row_of_rays = np.empty((column_end - column) // stride + 2)
     for v in range(row - row % stride, row_end, stride):
         if v < row:
             continue
         y = (middle_v - v) / focal
-        bx, by, bz = R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2]
-        for u in range(column - column % stride + (v // stride) % stride, column_end, stride):
-            x = u - middle_u
-            away = distance_along(cylinder, h, e, bx + ax * x, by + ay * x, bz + az * x)
+        ray = (R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2])
+        first = column - column % stride + (v // stride) % stride
+        distances = row_of_rays[: max(0, (column_end - first + stride - 1) // stride)]
+        distances_along(cylinder, h, e, ray, step, first - middle_u, stride, distances)
+        for k in range(len(distances)):
+            u, away = first + k * stride, distances[k]
             seen, ours = view.depth[v, u], view.mask[v, u]
             if away == np.inf:
                 against += 1.0 if ours else 0.0
