@@ -256,7 +256,7 @@ def detectors() -> str:
             cells += [number(row["precision"]), number(row["class_accuracy_of_found"])]
             for key in ("translation_mm", "rotation_deg", "ms_per_frame"):
                 cells.append(" / ".join(number(value, 1) for value in row[key]))
-            told.append(cells)
+            told.append([*cells, f"`{path.name}`, {held['commit']}"])
     head = ["detector", "images of", "images", "recall, in view", "precision", "class right", "translation mm", "rotation deg"]
     return f"""## Learned perception
 
@@ -264,7 +264,7 @@ Objects of which at least 30 % are seen; found is one that a detection of its cl
 frame: median / 95th percentile.
 `python training/detector_results.py --detector FILE --scenes SET --out FILE`
 
-{table([*head, "ms"], told)}"""
+{table([*head, "ms", "from"], told)}"""
 
 
 PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, detectors)
