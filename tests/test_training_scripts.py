@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import CATALOGUE, training_script
@@ -57,6 +58,19 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
         script.main(tmp_path, only="sg_star_25", agents=["random"])
     with pytest.raises(InputError, match="--only none"):
         script.main(tmp_path, only="none", out=tmp_path / "table.json")
+
+
+def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -> None:
+    script, out = training_script("explorer_results"), tmp_path / "table.json"
+    options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "equilibrium", "out": out}
+    for agent, count in (("largest-clear", 1), ("student", 2)):
+        script.main(tmp_path, agents=[agent], count=count, **options)
+    clear, student = json.loads(out.read_text())["rows"]
+    assert (clear["moves_to_largest_clear"], clear["both_with_largest_clear"], clear["episodes"]) == (1, 1, 1)
+    assert (student["both_with_largest_clear"], student["episodes"]) == (1, 2)
+    assert "moves_to_ceiling" not in student, "nobody has played that"
+    lines = (tmp_path / "sg_star_10_largest-clear.jsonl").read_text().splitlines()
+    assert len(lines) == 2, "and nothing is played for it"
 
 
 def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:

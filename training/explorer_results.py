@@ -94,7 +94,7 @@ def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -
 
 
 def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
-    """The figures of an agent on scenes; `others`: how those fared on the same whose moves its own are to be compared with."""
+    """The figures of an agent on scenes; `others`: how those fared on the first of them whose moves its own are compared with."""
     row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
     for limit in LIMITS:
         won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
@@ -115,9 +115,8 @@ def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[Episo
     row["moves_of_successes_ci95"] = mean_interval(won_moves)
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
     for name, theirs in others.items():
-        pairs = [
-            (a.moves, b.moves) for a, b in zip(results, theirs, strict=True) if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}
-        ]
+        both = zip(results, theirs, strict=False)
+        pairs = [(a.moves, b.moves) for a, b in both if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}]
         row[f"moves_to_{name}"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
         row[f"moves_to_{name}_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
         row[f"both_with_{name}"] = len(pairs)
@@ -218,14 +217,20 @@ def main(
             agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.jsonl")
             for agent in chosen
         }
-        others = {label: found[agent] for label, agent in COMPARED.items() if agent in found}
+        others = {}
+        for label, agent in COMPARED.items():
+            path = folder / f"{name}_{file_name(agent)}.jsonl"
+            if path.exists():  # what the yardstick has played; nothing is played for it
+                there = min(number, len(path.read_text().splitlines()) - 1)
+                others[label] = played(scenes, agent, there, fidelity, seed, workers, path)
         solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
         rows = []
         for agent in chosen:
             row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
             row |= row_of(found[agent], others)
             part = [found[agent][k] for k in solvable]
-            row["solvable"] = row_of(part, {label: [o[k] for k in solvable] for label, o in others.items()}) if part else None
+            compared = {label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()}
+            row["solvable"] = row_of(part, compared) if part else None
             rows.append(row)
         if curves is not None:
             draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {number} scenes, {fidelity}", curves)
