@@ -87,7 +87,7 @@ def make_sleeper() -> Callable[[float], int]:
 
 
 def wait_for(condition: Callable[[], Found]) -> Found:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240  # a busy machine takes a minute to start a worker
     while not (found := condition()):
         assert time.monotonic() < deadline
         time.sleep(0.02)
