@@ -182,8 +182,8 @@ def explorers() -> str:
     told = []
     rows = [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]
     held = {(row["set"], row["agent"]) for row in rows}
-    for name in ("explorers_100.json", "explorers_14.json"):  # measured before settling ended when all are still
-        rows += [row for row in read(name).get("rows", []) if (row["set"], row["agent"]) not in held]
+    # Measured before settling ended when all are still.
+    rows += [row for row in read("explorers_14.json").get("rows", []) if (row["set"], row["agent"]) not in held]
     for row in sorted(rows, key=lambda row: str(row["set"])):
         success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
         cells = [row["set"], row["agent"], str(row["episodes"]), number(row["hidden"], 1)]
@@ -207,8 +207,8 @@ def explorers() -> str:
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
 *to ceiling*, *to LF-clear*: moves on the scenes that both solve, to those of full knowledge and of LF-clear. Every episode is a
-line of `training/results/episodes/`, with its commit, but for older rows, which say nothing of LF-clear (`explorers_100.json`,
-`explorers_14.json`). `python training/explorer_results.py`
+line of `training/results/episodes/`, with its commit, but for an older row, which says nothing of LF-clear (`explorers_14.json`).
+`python training/explorer_results.py`
 
 {table(head, told)}
 ![What was found over the moves](images/explorers.png)
