@@ -31,6 +31,8 @@ PAPER_GENERATORS = {
 }
 """Table I of the paper and its text: objects hidden and stability, by agent, object set, and nodes (SPEC section 5)."""
 
+FEWEST_PAIRS = 10
+"""Scenes that both of two explorers solve, at least, if their moves are compared."""
 PAPER_EXPLORERS = {
     "sg_star_10": {"random": (0.05, 0.76), "largest-first": (0.88, 2.93), "student-rg": (0.92, 3.06), "student": (0.91, 3.13)},
     "sg_star_15": {"random": (0.03, 1.15), "largest-first": (0.58, 3.33), "student-rg": (0.84, 4.40), "student": (0.82, 4.27)},
@@ -193,7 +195,8 @@ def explorers() -> str:
         solvable = row["solvable"] or {}
         cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
         cells += [with_interval(row["within_20"], "collapsed", "collapsed_ci95"), number(row["moves_of_successes"], 1)]
-        cells += [number(row.get(f"moves_to_{name}")) for name in ("ceiling", "largest_clear")]
+        for name in ("ceiling", "largest_clear"):
+            cells.append(number(row[f"moves_to_{name}"]) if row.get(f"both_with_{name}", 0) >= FEWEST_PAIRS else "")
         told.append(cells)
     trainings = []
     for row in read("explorer_trainings.json").get("rows", []):
@@ -206,8 +209,9 @@ def explorers() -> str:
     return f"""## Tables II and III: explorers
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
-*to ceiling*, *to LF-clear*: moves on the scenes that both solve, to those of full knowledge and of LF-clear. Every episode is a
-line of `training/results/episodes/`, with its commit, but for an older row, which says nothing of LF-clear (`explorers_14.json`).
+*to ceiling*, *to LF-clear*: moves on the scenes that both solve, if these are ten at least, to those of full knowledge and of
+LF-clear. Every episode is a line of `training/results/episodes/`, with its commit, but for an older row, which says nothing of
+LF-clear (`explorers_14.json`).
 `python training/explorer_results.py`
 
 {table(head, told)}

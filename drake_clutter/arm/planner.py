@@ -60,7 +60,7 @@ class PickPlacePlanner:
         """
         begun = time.perf_counter()
         picked = next(o for o in objects if o.name == pick)
-        for above in dict.fromkeys((self.planner.above, 0.0)):
+        for above in dict.fromkeys((self.planner.above, 0.0)):  # once if they are the same
             found = self._plan(objects, picked, X_TO_place.moved((0.0, 0.0, above)), unseen)
             if isinstance(found, NoPlan) or found.depth >= above:
                 break
