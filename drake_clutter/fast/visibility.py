@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from drake_clutter.config import CameraConfig
 from drake_clutter.fast.shapes import Floats, Ints, Shapes
@@ -183,6 +184,12 @@ class RayCaster:
         shares = [s / a if a else 1.0 for s, a in zip(seen.tolist(), alone.tolist(), strict=True)]
         return shares, (slice(row, row_end), slice(column, column_end))
 
+    def _mask(self, index: int, rectangle: tuple[slice, slice]) -> NDArray[np.bool_]:
+        """The pixels of the last cast that show an object."""
+        mask = np.zeros(self._hit.shape, np.bool_)
+        np.equal(self._hit[rectangle], index, out=mask[rectangle])
+        return mask
+
     def shares(self, shapes: Ints, p_T: Floats) -> list[float]:
         """See `visible_shares`, of the table's shapes at p_T (n, 3) m, in their order."""
         return self._cast(shapes, p_T)[0]
@@ -218,11 +225,9 @@ class RayCaster:
         shares, rectangle = self._cast(*self._shapes.arrays(scene.objects))
         depth = np.full(self._nearest.shape, self.config.altitude, np.float32)
         depth[rectangle] = 1 / self._nearest[rectangle]
-        label = np.full(self._hit.shape, -1, np.int16)
-        label[rectangle] = self._hit[rectangle]
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))
-            if share >= self.config.hidden_below and (mask := label == index).any()
+            if share >= self.config.hidden_below and (mask := self._mask(index, rectangle)).any()
         )
         return Observation(depth, detections, self.config, scene.tray_side), dict(zip(scene.names, shares, strict=True))

@@ -86,27 +86,25 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         super().reset(seed=seed)
         number = None if options is None else options.get("scene")
         if number is None:
-            self._begin_anew()
-        elif not 0 <= number < len(self.scenes.scenes):
+            return self._begin_anew(), {}
+        if not 0 <= number < len(self.scenes.scenes):
             raise InputError(f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them")
-        else:
-            self.begin(self.scenes.settled(number, self.grammar, self._config.layout))
-        return self.observe(), {}
+        return self.begin(self.scenes.settled(number, self.grammar, self._config.layout)), {}
 
-    def _begin_anew(self) -> None:
+    def _begin_anew(self) -> GraphObservation:
         """With a scene that stands and hides something where its stacks are put now."""
         for _ in range(_TRIES):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
             scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config.layout, self.np_random)
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
-                self.begin(scene)
+                observation = self.begin(scene)
                 if self.task.end is None:
-                    return
+                    return observation
         most = self._nodes - 1
         raise InputError(f"{self.scenes.name}: of {_TRIES} scenes none stands and hides something, with at most {most} objects")
 
-    def begin(self, scene: Scene) -> None:
-        """Starts an episode on a scene at rest.
+    def begin(self, scene: Scene) -> GraphObservation:
+        """Starts an episode on a scene at rest, and looks.
 
         Raises:
             InputError: it has more objects than there is room for.
@@ -115,6 +113,12 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
         self.known = seen((), self.task.look.observation)
+        return self._noted(self.observe())
+
+    def _noted(self, observation: GraphObservation) -> GraphObservation:
+        """Keeps which moves it allows, for the next step."""
+        self._allowed = observation["allowed"].copy()
+        return observation
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -130,13 +134,13 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
     def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out."""
         x, y = (int(v) for v in action)
-        names, before = self.objects, self.observe()
-        if not before["allowed"][x, y]:
-            return before, 0.0, False, False, {}
+        names = self.objects
+        if not self._allowed[x, y]:
+            return self.observe(), 0.0, False, False, {}
         step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
         if step.outcome.result is not MoveResult.COLLAPSED:
             self.known = seen(self.known, self.task.look.observation)
-        observation, end = self.observe(), self.task.end
+        observation, end = self._noted(self.observe()), self.task.end
         if end is None and not observation["allowed"].any():
             end = EpisodeEnd.GAVE_UP
         over = end in (EpisodeEnd.ALL_FOUND, EpisodeEnd.COLLAPSED)

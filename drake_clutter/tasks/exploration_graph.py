@@ -139,5 +139,8 @@ def exploration_graph(
 def seen(known: Sequence[SceneObject], observation: Observation) -> tuple[SceneObject, ...]:
     """K_(t+1) from K_t: what is in view as it is seen, the rest as it was seen last; in the order in which it was found."""
     objects = {o.name: o for o in known}
-    objects |= {d.name: SceneObject(d.name, d.object_class, d.X_TO) for d in observation.detections}
+    for d in observation.detections:
+        there = objects.get(d.name)
+        if there is None or (there.object_class, there.X_TO) != (d.object_class, d.X_TO):  # else it keeps its corners
+            objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
     return tuple(objects.values())
