@@ -234,41 +234,38 @@ def parts(
         spent.setdefault(name, []).append((time.perf_counter() - begun) / of)
         return found
 
-    number = done = 0
-    while done < count:
+    def move_timed(number: int) -> bool:
         scene, rng = scenes(number), item_rng(seed, number, 1)
-        number += 1
         observation = detector.look(scene).observation
         choices = legal_moves(observation)
         move = choices[rng.integers(len(choices))]
         X_TO = choose_placement(observation, move, WORLD.exploration, rng)
         if X_TO is None:
-            continue
+            return False
         planner, quick = executor.planner(scene.tray_side), sure.planner(scene.tray_side)
-        timed_as("scene of distances", lambda planner=planner, scene=scene: planner.clearance_scene(scene.objects))
+        timed_as("scene of distances", lambda: planner.clearance_scene(scene.objects))
         quick.clearance_scene(scene.objects)
-        plans = [
-            timed_as(name, lambda p=p, scene=scene, move=move, X_TO=X_TO: p.plan(scene.objects, move.pick, X_TO))
-            for name, p in (("sure plan", quick), ("optimised plan", planner))
-        ]
-        if not isinstance(plans[1], Plan):
+        timed_as("sure plan", lambda: quick.plan(scene.objects, move.pick, X_TO))
+        plan = timed_as("optimised plan", lambda: planner.plan(scene.objects, move.pick, X_TO))
+        if not isinstance(plan, Plan):
             spent["sure plan"].pop(), spent["optimised plan"].pop()
-            continue
-        done += 1
-        plan, around = plans[1], planner.clearance_scene(scene.objects)
+            return False
+        around = planner.clearance_scene(scene.objects)
         q = sampled(plan.phases[1].trajectory)
         poses = ArmConfig().X_TB @ forward_kinematics(q) @ ArmConfig().X_FG
-        timed_as("forward kinematics of a pose", lambda q=q: forward_kinematics(q), len(q))
-        timed_as(
-            "inverse kinematics of a pose, eight branches", lambda planner=planner, poses=poses: planner.reach(poses), len(q)
-        )
-        timed_as("distances at joint angles", lambda around=around, q=q: [around.close(at, REPORTED) for at in q], len(q))
-        timed_as("distances with gradients", lambda around=around, q=q: [around.gradients(at, NEAR) for at in q], len(q))
-        timed_as("timing of a path without load", lambda q=q: timed(smooth(q), ArmConfig(), Payload()))
-        simulation = timed_as(
-            "simulation, built", lambda scene=scene, plan=plan: ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6)
-        )
+        timed_as("forward kinematics of a pose", lambda: forward_kinematics(q), len(q))
+        timed_as("inverse kinematics of a pose, eight branches", lambda: planner.reach(poses), len(q))
+        timed_as("distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q))
+        timed_as("distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q))
+        timed_as("timing of a path without load", lambda: timed(smooth(q), ArmConfig(), Payload()))
+        simulation = timed_as("simulation, built", lambda: ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6))
         timed_as("simulation, run", simulation.run)
+        return True
+
+    number = done = 0
+    while done < count:
+        done += move_timed(number)
+        number += 1
     fields = {
         "command": f"benchmarks/arm.py parts --count {count} --seed {seed}",
         "commit": git_commit(),

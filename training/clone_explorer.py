@@ -63,8 +63,9 @@ def main(
     one_thread_per_operation()
     chosen = device_of(device)
     scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    room = {"max_moves": given.max_moves, "most_objects": given.most_objects}
-    environment = ClutterExploration(scenes, fidelity=given.fidelity, config=given.world, **room)
+    environment = ClutterExploration(
+        scenes, fidelity=given.fidelity, config=given.world, max_moves=given.max_moves, most_objects=given.most_objects
+    )
     teacher, numbers = load_explorer(load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER)
     if numbers != environment.numbers:
         raise InputError(f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}")

@@ -79,7 +79,7 @@ def compared(
 
 
 def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
+    return int(np.count_nonzero(a & b)) / max(1, int(np.count_nonzero(a | b)))
 
 
 def summarised(objects: list[Seen], false: int, seconds: list[float]) -> dict[str, Any]:

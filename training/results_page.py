@@ -33,7 +33,7 @@ PAPER_GENERATORS = {
 
 FEWEST_PAIRS = 10
 """Scenes that both of two explorers solve, at least, if their moves are compared."""
-PAPER_EXPLORERS = {
+PAPER_EXPLORERS: dict[str, dict[str, tuple[float, float | None]]] = {
     "sg_star_10": {"random": (0.05, 0.76), "largest-first": (0.88, 2.93), "student-rg": (0.92, 3.06), "student": (0.91, 3.13)},
     "sg_star_15": {"random": (0.03, 1.15), "largest-first": (0.58, 3.33), "student-rg": (0.84, 4.40), "student": (0.82, 4.27)},
     "sg_star_20": {"random": (0.00, 0.93), "largest-first": (0.32, 3.64), "student-rg": (0.36, 4.24), "student": (0.64, 4.71)},

@@ -65,8 +65,14 @@ def main(
     given = load_typed(TrainExplorer(), config, settings or [])
     one_thread_per_operation()
     scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    room = {"max_moves": given.max_moves, "most_objects": given.most_objects}
-    environment = ClutterExploration(scenes, privileged=given.privileged, fidelity=given.fidelity, config=given.world, **room)
+    environment = ClutterExploration(
+        scenes,
+        privileged=given.privileged,
+        fidelity=given.fidelity,
+        config=given.world,
+        max_moves=given.max_moves,
+        most_objects=given.most_objects,
+    )
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
     kind = TEACHER if given.privileged else STUDENT
     if given.warm_start:
