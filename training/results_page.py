@@ -31,6 +31,8 @@ PAPER_GENERATORS = {
 }
 """Table I of the paper and its text: objects hidden and stability, by agent, object set, and nodes (SPEC section 5)."""
 
+OF_SEED = ", seed "
+"""Between a training's name and its seed, if that is not 0."""
 FEWEST_PAIRS = 10
 """Scenes that both of two explorers solve, at least, if their moves are compared."""
 PAPER_EXPLORERS: dict[str, dict[str, tuple[float, float | None]]] = {
@@ -148,7 +150,7 @@ share that falls in Drake.
 
 `sg_star_seed_1` and `_2` are other seeds of SG*, sampled at 0.28 like it; `sg_star_paper` is SG* with the paper's reward alone,
 sampled at 0.25.
-{spread(rows)}
+{spread("SG*, 25 nodes", of_seeds(rows))}
 {table(head, told)}
 {pictures}\
 The trainings; figures of 256 scenes by the fast judge at the training's temperature; what is too high or does not come apart
@@ -160,44 +162,59 @@ them; docs/generation.md has the rates without.
 """
 
 
-def of_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of Table I that are of SG* as it was trained with one seed or another, at 25 nodes."""
+def of_seeds(rows: Sequence[dict[str, Any]]) -> dict[str, tuple[list[float], int]]:
+    """Figures of SG* as it was trained with one seed or another, at 25 nodes, from the rows of Table I."""
     at_25 = [row for row in rows if row["nodes"] == 25 and row["temperature"] is None]
-    return [row for row in at_25 if row["agent"] == "sg-star" or Path(row["agent"]).stem.startswith("sg_star_seed_")]
+    seeds = [row for row in at_25 if row["agent"] == "sg-star" or Path(row["agent"]).stem.startswith("sg_star_seed_")]
+    shown = (("stability_rate", "stable", 3), ("hidden_mean", "hidden", 2), ("balanced_share", "balanced", 2))
+    return {name: ([row[key] for row in seeds], digits) for key, name, digits in shown}
 
 
-def spread(rows: Sequence[dict[str, Any]]) -> str:
-    """A sentence on the seeds of SG*, once there are several."""
-    seeds = of_seeds(rows)
-    if len(seeds) < 2:
+def spread(whose: str, figures: Mapping[str, tuple[Sequence[float], int]]) -> str:
+    """A sentence on seeds, once there are several; of every figure the values and the digits to show."""
+    count = min(len(values) for values, _ in figures.values())
+    if count < 2:
         return ""
-    told = []
-    for key, name, digits in (("stability_rate", "stable", 3), ("hidden_mean", "hidden", 2), ("balanced_share", "balanced", 2)):
-        values = [row[key] for row in seeds]
-        middle, deviation = statistics.mean(values), statistics.stdev(values)
-        told.append(f"{name} {middle:.{digits}f} ({deviation:.{digits}f})")
-    return f"Over {len(seeds)} seeds of SG*, 25 nodes, mean (standard deviation): {', '.join(told)}.\n"
+    told = [
+        f"{name} {statistics.mean(values):.{digits}f} ({statistics.stdev(values):.{digits}f})"
+        for name, (values, digits) in figures.items()
+    ]
+    return f"Over {count} seeds of {whose}, mean (standard deviation): {', '.join(told)}.\n"
+
+
+def explorer_row(row: dict[str, Any]) -> list[str]:
+    """Of Tables II and III."""
+    success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
+    cells = [row["set"], Path(row["agent"]).stem, str(row["episodes"]), number(row["hidden"], 1)]
+    for limit, in_paper in (("within_10", True), ("within_20", False)):
+        cells += [with_interval(row[limit], "success", "success_ci95"), *([number(success)] if in_paper else [])]
+        cells += [number(row[limit]["found"], 1), *([number(found, 1)] if in_paper else [])]
+    solvable = row["solvable"] or {}
+    cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
+    cells += [with_interval(row["within_20"], "collapsed", "collapsed_ci95"), number(row["moves_of_successes"], 1)]
+    for name in ("ceiling", "largest_clear"):
+        cells.append(number(row[f"moves_to_{name}"]) if row.get(f"both_with_{name}", 0) >= FEWEST_PAIRS else "")
+    return cells
+
+
+def of_explorer_seeds(rows: Sequence[dict[str, Any]], agent: str) -> dict[str, tuple[list[float], int]]:
+    """Figures of an explorer as it was trained with one seed or another."""
+    seeds = [row for row in rows if Path(row["agent"]).stem.split("_seed_")[0].replace("_", "-") == agent]
+    return {
+        "success in 10 moves": ([row["within_10"]["success"] for row in seeds], 3),
+        "in 20": ([row["within_20"]["success"] for row in seeds], 3),
+        "collapsed": ([row["within_20"]["collapsed"] for row in seeds], 3),
+        "moves": ([row["moves_of_successes"] for row in seeds], 2),
+    }
 
 
 def explorers() -> str:
-    """Tables II and III."""
-    told = []
+    """Tables II and III, other seeds of SE*, and the trainings."""
     rows = [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]
     held = {(row["set"], row["agent"]) for row in rows}
     # Measured before settling ended when all are still.
     rows += [row for row in read("explorers_14.json").get("rows", []) if (row["set"], row["agent"]) not in held]
-    for row in sorted(rows, key=lambda row: str(row["set"])):
-        success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
-        cells = [row["set"], row["agent"], str(row["episodes"]), number(row["hidden"], 1)]
-        for limit, in_paper in (("within_10", True), ("within_20", False)):
-            cells += [with_interval(row[limit], "success", "success_ci95"), *([number(success)] if in_paper else [])]
-            cells += [number(row[limit]["found"], 1), *([number(found, 1)] if in_paper else [])]
-        solvable = row["solvable"] or {}
-        cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
-        cells += [with_interval(row["within_20"], "collapsed", "collapsed_ci95"), number(row["moves_of_successes"], 1)]
-        for name in ("ceiling", "largest_clear"):
-            cells.append(number(row[f"moves_to_{name}"]) if row.get(f"both_with_{name}", 0) >= FEWEST_PAIRS else "")
-        told.append(cells)
+    told = [explorer_row(row) for row in sorted(rows, key=lambda row: str(row["set"]))]
     trainings = []
     for row in read("explorer_trainings.json").get("rows", []):
         last = row["history"][-1]
@@ -206,6 +223,10 @@ def explorers() -> str:
         trainings.append([*cells, number(last["moves_of_successes"], 1)])
     head = ["set", "agent", "episodes", "hidden", "success in 10", "paper", "found", "paper", "success in 20", "found"]
     head += ["of solvable", "of hidden", "collapsed", "moves", "to ceiling", "to LF-clear"]
+    seeds = read("explorers_seeds.json").get("rows", [])
+    spreads = "".join(
+        spread(name, of_explorer_seeds(seeds, agent)) for agent, name in (("student", "SE*"), ("student-dagger", "its clone"))
+    )
     return f"""## Tables II and III: explorers
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
@@ -217,6 +238,10 @@ LF-clear (`explorers_14.json`).
 {table(head, told)}
 ![What was found over the moves](images/explorers.png)
 
+SE* trained with other seeds, teacher and clone included, and by plain cloning (`student_bc`); the first 100 scenes, settled by
+Drake. `training/results/explorers_seeds.json`
+{spreads}
+{table(head, [explorer_row(row) for row in seeds])}
 The trainings, and 200 episodes as they ended, at fidelity `equilibrium` and within 20 moves. All had other work beside them. A
 step is a move; of a clone, a round. `training/results/explorer_trainings.json`
 
@@ -281,12 +306,17 @@ def page() -> str:
 
 
 def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]]], labels: Mapping[str, str]) -> None:
-    """How trainings went, each a line: a panel for every figure that has a label."""
+    """How trainings went, each a line, other seeds paler: a panel for every figure that has a label."""
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
     figure, panels = plt.subplots(1, len(labels), figsize=(18, 5.5), layout="constrained")
+    colours: dict[str, str] = {}
     for training, history in histories.items():
+        whose = training.split(OF_SEED)[0]
+        first = whose not in colours
+        colour = colours.setdefault(whose, f"C{len(colours)}")
         for panel, (name, label) in zip(panels, labels.items(), strict=True):
-            panel.plot([row["step"] / 1000 for row in history], [row[name] for row in history], label=training)
+            steps, values = [row["step"] / 1000 for row in history], [row[name] for row in history]
+            panel.plot(steps, values, color=colour, alpha=1 if first else 0.4, label=whose if first else None)
             panel.set(xlabel="steps / 1000", ylabel=label)
             panel.grid(alpha=0.4)
     panels[0].legend()
