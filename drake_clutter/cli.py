@@ -140,14 +140,13 @@ def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
 
 @app.command()
 def evaluate(
-    scenes: Annotated[Path, typer.Argument(help="A folder of judged scene files, as `generate` wrote them, or a frozen set.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON with the rows and every episode.")],
+    scenes: Annotated[
+        str, typer.Option(help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged.")
+    ],
     agents: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--agent", help="As for `explore`, or full-knowledge; may be repeated.", show_default="those without learning"
-        ),
-    ] = None,
+        str, typer.Option(metavar="NAME,...", help="As for `explore`, or full-knowledge.")
+    ] = "random,largest-first,largest-clear",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON to write, with the rows and every episode.")] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
     count: Annotated[int | None, typer.Option(min=1, help="Play the first so many scenes only.")] = None,
@@ -159,13 +158,12 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare explorers on scenes that hide something."""
-    from drake_clutter.agents.exploration import BASELINES
+    from drake_clutter.agents.evaluation import in_words
     from drake_clutter.commands import evaluate as command
     from drake_clutter.config import load_config
 
     world = load_config(config)
-    played = command.playable(scenes, catalogue)[:count]
-    names = agents or list(BASELINES)
+    played, names = command.playable(scenes, catalogue)[:count], agents.split(",")
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
@@ -175,17 +173,10 @@ def evaluate(
     if as_json:
         print(json.dumps(rows, indent=2))
         return
-    table = Table("agent", "episodes", "success", "95 %", "hidden", "found", "moves", "ended", title=f"{scenes}, {limit} moves")
-    for row in rows:
-        low, high = row["success_ci95"]
-        numbers = (
-            f"{row['success_rate']:.2f}",
-            f"{low:.2f} to {high:.2f}",
-            f"{row['hidden_mean']:.2f}",
-            f"{row['found_mean']:.2f}",
-        )
-        ended = ", ".join(f"{n} {why}" for why, n in row["ended"].items())
-        table.add_row(row["agent"], str(row["episodes"]), *numbers, f"{row['moves_mean']:.1f}", ended)
+    shown = [{"agent": row["agent"]} | in_words(row, command.limits(limit)) for row in rows]
+    table = Table(*shown[0], title=f"{scenes}, {limit} moves")
+    for cells in shown:
+        table.add_row(*cells.values())
     out_console.print(table)
 
 

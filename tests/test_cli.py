@@ -122,18 +122,26 @@ def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / f"scenes/{name}.yaml").write_text(broken(verdict=verdict))
     alone, together = tmp_path / "alone.json", tmp_path / "together.json"
-    agents = ("--agent", "random", "--agent", "largest-first")
-    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--out", alone)
-    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--workers", "2", "--out", together)
+    given = ("evaluate", "--scenes", tmp_path / "scenes", "--agents", "random,largest-first", "--max-moves", "2")
+    run(*given, "--out", alone)
+    run(*given, "--workers", "2", "--out", together)
     assert alone.read_bytes() == together.read_bytes()
     written = json.loads(alone.read_text())
     files = [tmp_path / "scenes/one.yaml", tmp_path / "scenes/two.yaml"]
     assert written["scenes"] == {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     random, largest_first = written["rows"]
     assert random["agent"] == "random"
-    assert largest_first["success_rate"] == 1.0
-    assert largest_first["moves_mean"] == 1.0
-    assert largest_first["hidden_mean"] == largest_first["found_mean"] == 1.0
+    assert largest_first["within_2"]["success"] == 1.0
+    assert largest_first["moves_of_successes"] == 1.0
+    assert largest_first["hidden"] == largest_first["within_2"]["found"] == 1.0
+
+
+def test_evaluate_knows_the_frozen_sets_by_name() -> None:
+    shown = run("evaluate", "--scenes", "sg_star_10", "--count", "2", "--agents", "largest-clear", "--fidelity", "fast", "--json")
+    (row,) = json.loads(shown.stdout)
+    assert (row["agent"], row["episodes"]) == ("largest-clear", 2)
+    assert row["hidden"] > 0
+    assert "sg_star_25" in run("evaluate", "--scenes", "sg_star_9", code=2).stderr
 
 
 def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
@@ -185,7 +193,7 @@ def broken(**changes: object) -> str:
         (("explore", "unknown.yaml", "--out", "new"), ("unknown.yaml", "objects[0].class", "teapot")),
         (("explore", "overlap.yaml", "--out", "new"), ("overlap.yaml", "above", "below", "mm")),
         (("explore", "unstable.yaml", "--out", "new"), ("not stable",)),
-        (("evaluate", "full", "--out", "new.json"), ("full", "no scene files")),
+        (("evaluate", "--scenes", "full", "--out", "new.json"), ("full", "no scene files")),
         (("move", "scene.yaml", "--pick", "below", "--place", "tray", "--out", "new"), ("below", "not in view")),
         (("move", "scene.yaml", "--pick", "above", "--out", "new"), ("--pick", "--moves")),
         (("export", "scene.yaml", "--format", "glb", "--out", "full"), ("full", "not empty")),

@@ -23,9 +23,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult
+from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, in_words, ratio_interval, summarise_episodes
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
-from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
@@ -85,35 +84,9 @@ def file_name(agent: str) -> str:
     return f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
 
 
-def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> tuple[float, float]:
-    """95 % confidence interval of a ratio of sums over scenes, by bootstrap."""
-    scenes = np.random.default_rng(0).integers(len(numerators), size=(2000, len(numerators)))
-    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(axis=1)
-    low, high = np.quantile(ratios, [0.025, 0.975]).tolist()
-    return low, high
-
-
 def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
     """The figures of an agent on scenes; `others`: how those fared on the first of them whose moves its own are compared with."""
-    row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
-    for limit in LIMITS:
-        won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
-        found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
-        fallen = [r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results]
-        row[f"within_{limit}"] = {
-            "success": sum(won) / len(won),
-            "success_ci95": wilson_interval(sum(won), len(won)),
-            "found": float(np.mean(found)),
-            "found_ci95": mean_interval(found),
-            "found_of_hidden": sum(found) / sum(r.hidden for r in results),
-            "found_of_hidden_ci95": ratio_interval(found, [r.hidden for r in results]),
-            "collapsed": sum(fallen) / len(results),
-            "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
-        }
-    won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
-    row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
-    row["moves_of_successes_ci95"] = mean_interval(won_moves)
-    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
+    row = summarise_episodes(results, LIMITS)
     for name, theirs in others.items():
         both = zip(results, theirs, strict=False)
         pairs = [(a.moves, b.moves) for a, b in both if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}]
@@ -142,25 +115,14 @@ def add_rows(path: Path, held: dict[str, Any], rows: Sequence[dict[str, Any]]) -
 
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """For the screen."""
-    table = Table(
-        "set", "agent", "episodes", "hidden", *(f"{what} in {n}" for n in LIMITS for what in ("success", "found", "of hidden"))
-    )
-    for column in ("collapsed", "moves", *(f"to {name}" for name in COMPARED)):
-        table.add_column(column)
-    columns = ("moves_of_successes", *(f"moves_to_{name}" for name in COMPARED))
+    told = []
     for row in rows:
-        numbers = []
-        for limit in LIMITS:
-            part = row[f"within_{limit}"]
-            low, high = part["success_ci95"]
-            numbers += [
-                f"{part['success']:.2f} ({low:.2f} to {high:.2f})",
-                f"{part['found']:.2f}",
-                f"{part['found_of_hidden']:.2f}",
-            ]
-        last = [f"{row[f'within_{LIMITS[-1]}']['collapsed']:.2f}"]
-        last += ["" if row.get(key) is None else f"{row[key]:.2f}" for key in columns]
-        table.add_row(row["set"], row["agent"], str(row["episodes"]), f"{row['hidden']:.2f}", *numbers, *last)
+        ratios = {f"to {name}": row.get(f"moves_to_{name}") for name in COMPARED}
+        cells = {"set": row["set"], "agent": row["agent"]} | in_words(row, LIMITS)
+        told.append(cells | {name: "" if ratio is None else f"{ratio:.2f}" for name, ratio in ratios.items()})
+    table = Table(*told[0])
+    for cells in told:
+        table.add_row(*cells.values())
     return table
 
 

@@ -1,6 +1,5 @@
 """Playing explorers on many scenes, in parallel, the same for any number of workers."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -104,19 +103,52 @@ class EpisodePlayer:
         )
 
 
-def summarise_episodes(results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """One agent's row: success rate, objects found, how episodes ended, with 95 % intervals."""
-    successes = sum(result.ended == EpisodeEnd.ALL_FOUND.value for result in results)
-    hidden = sum(result.hidden for result in results)
-    return {
-        "agent": results[0].agent,
-        "episodes": len(results),
-        "success_rate": successes / len(results),
-        "success_ci95": wilson_interval(successes, len(results)),
-        "hidden_mean": hidden / len(results),
-        "found_mean": float(np.mean([result.found for result in results])),
-        "found_ci95": mean_interval([result.found for result in results]),
-        "found_share": sum(result.found for result in results) / hidden if hidden else None,
-        "moves_mean": float(np.mean([result.moves for result in results])),
-        "ended": dict(Counter(result.ended for result in results).most_common()),
-    }
+def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> tuple[float, float]:
+    """95 % confidence interval of a ratio of sums over scenes, by bootstrap."""
+    scenes = np.random.default_rng(0).integers(len(numerators), size=(2000, len(numerators)))
+    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(axis=1)
+    low, high = np.quantile(ratios, [0.025, 0.975]).tolist()
+    return low, high
+
+
+def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) -> dict[str, Any]:
+    """An agent's row: what it had found within so many moves, whether all, and collapses, with 95 % intervals.
+
+    Args:
+        results: of one agent, on scenes that hide something.
+        limits: of moves, at most those that were allowed.
+    """
+    row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
+    for limit in limits:
+        won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
+        found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
+        fallen = [r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results]
+        row[f"within_{limit}"] = {
+            "success": sum(won) / len(won),
+            "success_ci95": wilson_interval(sum(won), len(won)),
+            "found": float(np.mean(found)),
+            "found_ci95": mean_interval(found),
+            "found_of_hidden": sum(found) / sum(r.hidden for r in results),
+            "found_of_hidden_ci95": ratio_interval(found, [r.hidden for r in results]),
+            "collapsed": sum(fallen) / len(results),
+            "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
+        }
+    won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
+    row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
+    row["moves_of_successes_ci95"] = mean_interval(won_moves)
+    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
+    return row
+
+
+def in_words(row: dict[str, Any], limits: Sequence[int]) -> dict[str, str]:
+    """A row of `summarise_episodes` for people: cells of a table by its columns."""
+    cells = {"episodes": str(row["episodes"]), "hidden": f"{row['hidden']:.2f}"}
+    for limit in limits:
+        part = row[f"within_{limit}"]
+        low, high = part["success_ci95"]
+        cells[f"success in {limit}"] = f"{part['success']:.2f} ({low:.2f} to {high:.2f})"
+        cells[f"found in {limit}"] = f"{part['found']:.2f}"
+        cells[f"of hidden in {limit}"] = f"{part['found_of_hidden']:.2f}"
+    cells["collapsed"] = f"{row[f'within_{limits[-1]}']['collapsed']:.2f}"
+    cells["moves"] = "" if row["moves_of_successes"] is None else f"{row['moves_of_successes']:.1f}"
+    return cells

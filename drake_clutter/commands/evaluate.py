@@ -12,19 +12,36 @@ from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
-from drake_clutter.resources import git_commit
+from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
 
+_READ_AT = 10
+"""Moves at which a longer search is read, too (SPEC section 6)."""
 
-def playable(scenes: Path, catalogue_folder: Path | None) -> list[tuple[Path, int | None]]:
-    """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set's file with each number.
+
+def limits(max_moves: int) -> list[int]:
+    """Numbers of moves for which there are figures."""
+    return sorted({min(_READ_AT, max_moves), max_moves})
+
+
+def playable(named: str, catalogue_folder: Path | None) -> list[tuple[Path, int | None]]:
+    """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set with each number.
+
+    Args:
+        named: a folder, a set's file, or the name of a set that is shipped.
+        catalogue_folder: with object classes of one's own.
 
     Raises:
-        InputError: no scene files, one that is broken, or none that can be played.
+        InputError: nothing of that name, no scene files, one that is broken, or none that can be played.
     """
-    catalogue = load_catalogue(catalogue_folder)
+    catalogue, scenes = load_catalogue(catalogue_folder), Path(named)
+    if not scenes.exists():
+        sets = {path.stem: path for path in shipped_path("training/scenes").glob("*.json") if not path.stem.startswith("train_")}
+        if named not in sets:
+            raise InputError(f"--scenes {named}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}")
+        scenes = sets[named]
     if scenes.is_file():
         return [(scenes, number) for number in range(len(load_scene_set(scenes, catalogue).scenes))]
     paths = sorted(scenes.glob("*.yaml"))
@@ -47,12 +64,12 @@ def evaluate(
     config: ClutterConfig,
     catalogue_folder: Path | None,
     workers: int,
-    out: Path,
+    out: Path | None,
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
     ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Plays every agent on every scene and writes the rows, every episode, and commit and hashes of the scenes, as JSON."""
-    if not out.parent.is_dir():
+    """Plays every agent on every scene; `out`: JSON with the rows, every episode, and commit and hashes of the scenes."""
+    if out is not None and not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; give a file in one that exists")
     for agent in agents:
         make_explorers(agent, config)  # says what is wrong before anything is played
@@ -60,7 +77,12 @@ def evaluate(
     make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = list(progress(played, len(episodes)))
-    rows = [summarise_episodes([result for result in results if result.agent == agent]) for agent in agents]
+    rows = [
+        {"agent": agent} | summarise_episodes([result for result in results if result.agent == agent], limits(max_moves))
+        for agent in agents
+    ]
+    if out is None:
+        return rows
     files = sorted({path for path, _ in scenes})
     fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
     fields |= {"commit": git_commit(), "scenes": {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}}
