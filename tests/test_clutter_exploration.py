@@ -25,9 +25,10 @@ from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
-from drake_clutter.scenes.seams import Move
+from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration import EpisodeEnd, legal_moves
+from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, legal_moves
+from drake_clutter.tasks.exploration_graph import FEATURES
 
 ROOT = Path(__file__).parents[1]
 
@@ -97,6 +98,30 @@ def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
         assert (reward, over, out_of_moves) == (0.0, False, False)
         assert all(np.array_equal(again[name], observation[name]) for name in observation)
     assert environment.task.steps == []
+
+
+def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneSet) -> None:
+    environment = ClutterExploration(scenes, max_moves=3)
+    observation, _ = environment.reset(seed=0)
+    for number in range(1, 4):
+        *_, over, out_of_moves, info = environment.step(
+            (0, 0) if number < 3 else random_move(observation, np.random.default_rng(1))
+        )
+        assert (over, out_of_moves) == (False, number == 3)
+    assert info["end"] is EpisodeEnd.OUT_OF_MOVES
+    assert len(environment.task.steps) == 1
+
+
+@pytest.mark.parametrize("fidelity", sorted(EXECUTORS))
+def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
+    environment = ClutterExploration(scenes, fidelity=fidelity)
+    before, _ = environment.reset(options={"scene": 2})
+    height = before["feature"][:, FEATURES.index("z")]
+    highest = max(np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node]))
+    after, *_, info = environment.step((highest, 0))
+    assert info["step"].outcome.result is MoveResult.PLACED
+    assert after["feature"][highest, FEATURES.index("z")] < height[highest] - 0.05
+    assert after["glob"].tolist() == [pytest.approx(1 / 20)]
 
 
 def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -> None:

@@ -29,7 +29,8 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
 
     Observation: see `exploration_graph`, with room for `most_objects`; of K_t (pose and class of what has ever been in view), or,
         if `privileged`, of all objects as they are. Node 0 is the tray. Nodes keep their numbers while an episode lasts.
-    Action: (x, y), nodes: x goes onto y. `allowed` of the observation says which moves may be made; any other changes nothing.
+    Action: (x, y), nodes: x goes onto y. `allowed` of the observation says which moves may be made; any other changes nothing but
+        counts as one of `max_moves`.
     Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`, or when
         no move is left that has not failed.
     The `info` of a step has the `step` (a `tasks.exploration.Step`) and, when the episode is over, the `end`.
@@ -112,13 +113,18 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         if len(scene.objects) >= self._nodes:
             raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
-        self.known = seen((), self.task.look.observation)
+        self.known, self._refused = seen((), self.task.look.observation), 0
         return self._noted(self.observe())
 
     def _noted(self, observation: GraphObservation) -> GraphObservation:
         """Keeps which moves it allows, for the next step."""
         self._allowed = observation["allowed"].copy()
         return observation
+
+    @property
+    def _spent(self) -> bool:
+        """Whether all moves have been made, those included that were not allowed."""
+        return len(self.task.steps) + self._refused >= self._max_moves
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -132,15 +138,18 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         return exploration_graph(shown, self.task.look.observation, tried, self.numbers, self.task.failed, nodes=self._nodes)
 
     def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Carries a move out."""
+        """Carries a move out; one that is not allowed changes nothing, but counts towards the number of moves."""
         x, y = (int(v) for v in action)
         names = self.objects
         if not self._allowed[x, y]:
-            return self.observe(), 0.0, False, False, {}
+            self._refused += 1
+            return self.observe(), 0.0, False, self._spent, {"end": EpisodeEnd.OUT_OF_MOVES} if self._spent else {}
         step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
         if step.outcome.result is not MoveResult.COLLAPSED:
             self.known = seen(self.known, self.task.look.observation)
         observation, end = self._noted(self.observe()), self.task.end
+        if end is None and self._spent:
+            end = EpisodeEnd.OUT_OF_MOVES
         if end is None and not observation["allowed"].any():
             end = EpisodeEnd.GAVE_UP
         over = end in (EpisodeEnd.ALL_FOUND, EpisodeEnd.COLLAPSED)
