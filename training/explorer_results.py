@@ -79,9 +79,15 @@ def weights_of(agent: str) -> str:
     return hashlib.sha256((shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent)).read_bytes()).hexdigest()
 
 
-def file_name(agent: str) -> str:
-    """Of an agent's episodes."""
-    return f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
+def file_of(folder: Path, name: str, agent: str) -> Path:
+    """Of an agent's episodes on a set."""
+    told = f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
+    return folder / f"{name}_{told}.jsonl"
+
+
+def commits_of(path: Path, count: int) -> list[str]:
+    """At which a file's first episodes were played."""
+    return list(dict.fromkeys(json.loads(line)["commit"] for line in path.read_text().splitlines()[1 : 1 + count]))
 
 
 def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
@@ -175,13 +181,10 @@ def main(
         scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
         number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or agents_of_table
-        found = {
-            agent: played(scenes, agent, number, fidelity, seed, workers, folder / f"{name}_{file_name(agent)}.jsonl")
-            for agent in chosen
-        }
+        found = {agent: played(scenes, agent, number, fidelity, seed, workers, file_of(folder, name, agent)) for agent in chosen}
         others = {}
         for label, agent in COMPARED.items():
-            path = folder / f"{name}_{file_name(agent)}.jsonl"
+            path = file_of(folder, name, agent)
             if path.exists():  # what the yardstick has played; nothing is played for it
                 there = min(number, len(path.read_text().splitlines()) - 1)
                 others[label] = played(scenes, agent, there, fidelity, seed, workers, path)
@@ -189,7 +192,7 @@ def main(
         rows = []
         for agent in chosen:
             row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
-            row |= row_of(found[agent], others)
+            row |= row_of(found[agent], others) | {"commits": commits_of(file_of(folder, name, agent), number)}
             part = [found[agent][k] for k in solvable]
             compared = {label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()}
             row["solvable"] = row_of(part, compared) if part else None

@@ -197,6 +197,19 @@ def explorer_row(row: dict[str, Any]) -> list[str]:
     return cells
 
 
+def gap_row(fast: dict[str, Any], settled: dict[str, Any]) -> list[str]:
+    """How the same explorer fares on the same scenes when they are judged fast, and when Drake settles them."""
+    cells = [fast["set"], Path(fast["agent"]).stem, str(fast["episodes"])]
+    for limit, name in (
+        ("within_10", "success"),
+        ("within_20", "success"),
+        ("within_20", "found_of_hidden"),
+        ("within_20", "collapsed"),
+    ):
+        cells.append(f"{number(fast[limit][name])} / {number(settled[limit][name])}")
+    return [*cells, f"{number(fast['moves_of_successes'], 1)} / {number(settled['moves_of_successes'], 1)}"]
+
+
 def of_explorer_seeds(rows: Sequence[dict[str, Any]], agent: str) -> dict[str, tuple[list[float], int]]:
     """Figures of an explorer as it was trained with one seed or another."""
     seeds = [row for row in rows if Path(row["agent"]).stem.split("_seed_")[0].replace("_", "-") == agent]
@@ -211,10 +224,10 @@ def of_explorer_seeds(rows: Sequence[dict[str, Any]], agent: str) -> dict[str, t
 def explorers() -> str:
     """Tables II and III, other seeds of SE*, and the trainings."""
     rows = [row for name in ("table2.json", "table3.json") for row in read(name).get("rows", [])]
-    held = {(row["set"], row["agent"]) for row in rows}
-    # Measured before settling ended when all are still.
-    rows += [row for row in read("explorers_14.json").get("rows", []) if (row["set"], row["agent"]) not in held]
     told = [explorer_row(row) for row in sorted(rows, key=lambda row: str(row["set"]))]
+    settled = {(row["set"], row["agent"], row["episodes"]): row for row in rows}
+    judged_fast = read("explorers_fast.json").get("rows", [])
+    gaps = [gap_row(row, there) for row in judged_fast if (there := settled.get((row["set"], row["agent"], row["episodes"])))]
     trainings = []
     for row in read("explorer_trainings.json").get("rows", []):
         last = row["history"][-1]
@@ -231,13 +244,16 @@ def explorers() -> str:
 
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
 *to ceiling*, *to LF-clear*: moves on the scenes that both solve, if these are ten at least, to those of full knowledge and of
-LF-clear. Every episode is a line of `training/results/episodes/`, with its commit, but for an older row, which says nothing of
-LF-clear (`explorers_14.json`).
+LF-clear. Every episode is a line of `training/results/episodes/`, with its commit.
 `python training/explorer_results.py`
 
 {table(head, told)}
 ![What was found over the moves](images/explorers.png)
 
+From `fast` to `settle`: the same scenes, chances and explorers, judged fast (`training/results/explorers_fast.json`) / settled by
+Drake.
+
+{table(["set", "agent", "scenes", "success in 10", "in 20", "of hidden", "collapsed", "moves"], gaps)}
 SE* trained with other seeds, teacher and clone included, and by plain cloning (`student_bc`); the first 100 scenes, settled by
 Drake. `training/results/explorers_seeds.json`
 {spreads}

@@ -99,13 +99,15 @@ class LearnedExplorer:
         graph = exploration_graph(shown, observation, tried, self._numbers, failed)
         allowed, names = graph["allowed"], tuple(o.name for o in shown)
         some = np.random.default_rng(0)  # it decides where, not whether
+        chances: dict[str, float] = {}
         while allowed.any():
             moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
+            # As the network had it first: what has no room and is passed over stays among them.
+            chances = chances or {name: float(picks[0, k]) for k, name in enumerate(names, start=1) if allowed[k].any()}
             x, y = moves[0].tolist()
             for place in (0, y):
                 move = Move(names[x - 1], names[place - 1] if place else TRAY)
                 if allowed[x, place] and choose_placement(observation, move, self._config, some) is not None:
-                    chances = {name: float(picks[0, k]) for k, name in enumerate(names, start=1) if allowed[k].any()}
                     return Decision(move, chances, names)
                 allowed[x, place] = 0
         return Decision(None)

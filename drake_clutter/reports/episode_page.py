@@ -183,6 +183,10 @@ def _beliefs(decision: Decision | None, scene: Scene, found: Sequence[str]) -> s
     html = f'<div class="bars">{"".join(bar for bar in bars if bar not in unlikely)}</div>'
     if unlikely:
         html += f'<details><summary>{len(unlikely)} less likely</summary><div class="bars">{"".join(unlikely)}</div></details>'
+    picked = 0.0 if decision.move is None else decision.picks[decision.move.pick]
+    if no_room := [name for name, chance in likeliest if chance > picked]:
+        html += f'<p class="soft">Passed over, as there was no room for it: {escape(_listed(no_room))}.</p>'
+    html += f"<details><summary>What it knew</summary><p>{escape(_listed(decision.known))}.</p></details>"
     what = f"it knew {len(decision.known)} of {len(scene.objects)} objects, and found {len(found)} more by this move"
     return f"<h4>The agent's choice of what to pick; {what}</h4>{html}"
 
