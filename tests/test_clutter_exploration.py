@@ -286,7 +286,9 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
         agent = explorers(task)
         while task.end is None:
             observation = task.look.observation
-            move = agent.choose(observation, [step.move for step in task.steps], rng, task.failed).move
+            decision = agent.choose(observation, [step.move for step in task.steps], rng, task.failed)
+            move = decision.move
+            assert sum(decision.picks.values()) in (0, pytest.approx(1)), "as the network had it, without room or with"
             room = {m for m in legal_moves(observation) if choose_placement(observation, m, config.exploration, rng)}
             if move is None:
                 assert not room

@@ -180,6 +180,18 @@ def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
     assert "No move was made." in text
 
 
+def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
+    (step,) = task.steps
+    other = next(name for name in task.known if name != step.move.pick)
+    decision = Decision(step.move, {other: 0.6, step.move.pick: 0.4}, (other, step.move.pick))
+    write_episode_page(tmp_path, "Believed", task.start, task.first_look, [replace(step, decision=decision)], {})
+    text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
+    assert f"it knew 2 of {len(task.scene.objects)} objects" in text
+    assert text.index("60%") < text.index("40%")
+    assert f"Passed over, as there was no room for it: {humanised(other)}." in text
+    assert f"What it knew{humanised(other)}, {humanised(step.move.pick)}." in text
+
+
 def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
     (step,) = task.steps
     seen = task.first_look.observation
