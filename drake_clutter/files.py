@@ -1,5 +1,6 @@
 """Writing files and folders so that an interrupted or failed run leaves nothing half-written."""
 
+import hashlib
 import json
 import os
 import secrets
@@ -72,3 +73,8 @@ def output_directory(path: Path, *, may_hold: frozenset[str] = frozenset()) -> P
     if strangers:
         raise InputError(f"--out {path}: is not empty (holds {strangers[0]}); give a folder that is new or empty")
     return path
+
+
+def sha256_of(path: Path) -> str:
+    """The hash of a file's bytes, in hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -70,14 +70,14 @@ def main(
     if numbers != environment.numbers:
         raise InputError(f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}")
     learner = Cloning(environment, teacher.to(chosen), given.learning, given.seed, chosen)
-    run = TrainingRun(out, given, learner, given.learning.rounds)
+    run = TrainingRun(out, given, learner, given.learning.rounds, [Path(given.scenes), Path(given.teacher)])
     while learner.step < given.learning.rounds:
         learner.advance()
         if learner.step == given.learning.rounds or learner.step % given.evaluate_every == 0:
             episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
             run.report(figures(episodes), learner.losses)
             run.save()
-    about = {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
+    about = {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width)}
     run.finish(CHECKPOINT, learner.network, about)
 
 

@@ -10,7 +10,6 @@ object in view; `list_recall` and `list_precision` say how right the agent's own
 arm finds.
 """
 
-import hashlib
 import json
 import time
 from collections import Counter
@@ -29,7 +28,7 @@ from rich.table import Table
 from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
+from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json, write_text
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
@@ -144,7 +143,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     scenario = asdict(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
     scenario.pop("seed")  # each episode's own: the scene's number
     asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": json.loads(json.dumps(scenario))}
-    asked |= {"weights": [hashlib.sha256(file.read_bytes()).hexdigest() for file in networks]}
+    asked |= {"weights": [sha256_of(file) for file in networks]}
     lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
     if json.loads(lines[0]) != asked:
         raise InputError(f"{path}: holds episodes of other networks, scenes or settings; give another folder as DIR")

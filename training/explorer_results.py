@@ -5,7 +5,6 @@
 Every episode is a line of a file in training/results/episodes, a file for each set and agent; what is there is not played again.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,7 +26,7 @@ from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResul
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, told_in_one_line, write_json, write_text
+from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json, write_text
 from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
@@ -76,7 +75,7 @@ def weights_of(agent: str) -> str:
     """The hash of a trained agent's weights; "" for the others."""
     if agent not in TRAINED and not agent.endswith(".safetensors"):
         return ""
-    return hashlib.sha256((shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent)).read_bytes()).hexdigest()
+    return sha256_of(shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent))
 
 
 def file_of(folder: Path, name: str, agent: str) -> Path:

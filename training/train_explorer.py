@@ -80,7 +80,8 @@ def main(
         if (numbers, len(begun.mark)) != (environment.numbers, given.learning.width):
             raise InputError(f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same")
         learner.network.load_state_dict(begun.state_dict())
-    run = TrainingRun(out, given, learner, given.learning.steps)
+    files = [Path(file) for file in (given.scenes, given.warm_start) if file]
+    run = TrainingRun(out, given, learner, given.learning.steps, files)
     while learner.step < given.learning.steps:
         before = learner.step
         learner.advance()
@@ -89,7 +90,7 @@ def main(
             episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
             run.report(figures(episodes), learner.losses)
             run.save()
-    about = {"kind": kind, "network": about_explorer(environment.numbers, given.learning.width), "scenes": scenes.sha256}
+    about = {"kind": kind, "network": about_explorer(environment.numbers, given.learning.width)}
     run.finish(CHECKPOINT, learner.network, about)
 
 

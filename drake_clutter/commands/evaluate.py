@@ -1,6 +1,5 @@
 """`drake-clutter evaluate`: explorers on scenes at rest that hide something."""
 
-import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -11,7 +10,7 @@ from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResul
 from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, write_json
+from drake_clutter.files import InputError, sha256_of, write_json
 from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_file import load_scene
@@ -85,6 +84,6 @@ def evaluate(
         return rows
     files = sorted({path for path, _ in scenes})
     fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
-    fields |= {"commit": git_commit(), "scenes": {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}}
+    fields |= {"commit": git_commit(), "scenes": {str(file): sha256_of(file) for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

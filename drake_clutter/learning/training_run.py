@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,7 +13,7 @@ from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from drake_clutter.config import config_yaml
-from drake_clutter.files import InputError, output_directory, write_json, write_text
+from drake_clutter.files import InputError, output_directory, sha256_of, write_json, write_text
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
 
@@ -39,21 +39,26 @@ class TrainingRun:
         history: a row for each evaluation.
     """
 
-    def __init__(self, out: Path, config: Any, learner: Learner, steps: int) -> None:
+    def __init__(self, out: Path, config: Any, learner: Learner, steps: int, files: Sequence[Path] = ()) -> None:
         """Begins a run, or takes up the one that is in the folder.
 
         Args:
             out: the folder; config: a dataclass; learner: as it begins; steps: at which it ends.
+            files: that the config names and the run learns from; must be the same when it is taken up.
 
         Raises:
-            InputError: the folder holds something else, or a run of another config.
+            InputError: the folder holds something else, or a run of another config or of other files.
         """
         self._out, self._config, self._learner, self._steps = out, config, learner, steps
+        self._files = {str(file): sha256_of(file) for file in files}
+        told = config_yaml(config) + "".join(f"# {file}: sha256 {digest}\n" for file, digest in self._files.items())
         if not (out / CONFIG).exists():
             output_directory(out)
-            write_text(out / CONFIG, config_yaml(config))
-        elif (out / CONFIG).read_text() != config_yaml(config):
-            raise InputError(f"--out {out}: holds a run of another config, see {CONFIG}; give the same one or another folder")
+            write_text(out / CONFIG, told)
+        elif (out / CONFIG).read_text() != told:
+            raise InputError(
+                f"--out {out}: holds a run of another config or other files, see {CONFIG}; give the same ones or another folder"
+            )
         self.history: list[dict[str, Any]] = []
         if (out / STATE).exists():
             learner.load(out / STATE)
@@ -85,10 +90,12 @@ class TrainingRun:
         self._learner.save(self._out / STATE)
 
     def finish(self, name: str, network: nn.Module, about: Mapping[str, Any]) -> None:
-        """Writes the checkpoint, with config, last figures and commits, and the state."""
+        """Writes the checkpoint, with config, hashes of files, last figures and commits, and the state."""
         metrics, commits = self.history[-1], list(dict.fromkeys(row["commit"] for row in self.history))
         save_checkpoint(
-            self._out / name, network, {**about, "config": asdict(self._config), "metrics": metrics, "commits": commits}
+            self._out / name,
+            network,
+            {**about, "config": asdict(self._config), "files": self._files, "metrics": metrics, "commits": commits},
         )
         self.save()
 
