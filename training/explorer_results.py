@@ -1,4 +1,4 @@
-"""Tables II and III: every explorer on every frozen set of scenes, moves settled by Drake; and how much was found over the moves.
+"""Tables II and III: every explorer on every frozen set of scenes, moves settled by Drake.
 
     python training/explorer_results.py --workers 2
 
@@ -12,11 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import track
@@ -131,25 +126,6 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def draw_curves(found: dict[str, Sequence[EpisodeResult]], title: str, path: Path) -> None:
-    """Share of what was hidden that was found, over the moves, for each agent."""
-    plt.rcParams.update({"font.size": 20, "lines.linewidth": 3})
-    figure, axes = plt.subplots(figsize=(12, 7), layout="constrained")
-    moves = np.arange(max(LIMITS) + 1)
-    for agent, results in found.items():
-        hidden = sum(r.hidden for r in results)
-        shares = []
-        for limit in moves:
-            shares.append(sum(r.found_after[:limit][-1] for r in results if r.found_after[:limit]) / hidden)
-        axes.plot(moves, shares, label=agent, linestyle="--" if agent == FULL_KNOWLEDGE else "-")
-    axes.set(xlabel="moves", ylabel="found, of the hidden objects", ylim=(0, 1.02), xlim=(0, max(LIMITS)), title=title)
-    axes.set_xticks(range(0, max(LIMITS) + 1, 2))
-    axes.grid(alpha=0.4)
-    figure.legend(loc="outside right upper")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def main(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = RESULTS / "episodes",
     workers: Annotated[int, typer.Option(min=1)] = 1,
@@ -161,7 +137,6 @@ def main(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="JSON to write; table2.json and table3.json if not given.")
     ] = None,
-    curves: Annotated[Path | None, typer.Option(metavar="FILE", help="PNG to write, of the last set.")] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
     if folder == RESULTS / "episodes" and fidelity != "settle":
@@ -196,8 +171,6 @@ def main(
             compared = {label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()}
             row["solvable"] = row_of(part, compared) if part else None
             rows.append(row)
-        if curves is not None:
-            draw_curves({agent: found[agent] for agent in chosen}, f"{name}, {number} scenes, {fidelity}", curves)
         held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
         add_rows(out or RESULTS / f"{table}.json", held, rows)
         shown += rows

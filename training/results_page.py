@@ -1,4 +1,4 @@
-"""Writes docs/results.md, every number of it from the files in training/results and benchmarks/results, and what they draw.
+"""Writes docs/results.md, every number of it from the files in training/results and benchmarks/results.
 
     python training/results_page.py
 
@@ -11,10 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import typer
 
 from drake_clutter.files import told_in_one_line, write_text
@@ -31,8 +27,6 @@ PAPER_GENERATORS = {
 }
 """Table I of the paper and its text: objects hidden and stability, by agent, object set, and nodes (SPEC section 5)."""
 
-OF_SEED = ", seed "
-"""Between a training's name and its seed, if that is not 0."""
 FEWEST_PAIRS = 10
 """Scenes that both of two explorers solve, at least, if their moves are compared."""
 PAPER_EXPLORERS: dict[str, dict[str, tuple[float, float | None]]] = {
@@ -317,68 +311,13 @@ PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, dete
 
 def page() -> str:
     """The whole page."""
-    told = "Written by `training/results_page.py` from `training/results/`; files or checkpoints name config, seed and commit."
+    told = "Written by `training/results_page.py`, and drawn by `training/results_pictures.py`, from `training/results/`; files or checkpoints name config, seed and commit."
     return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
 
 
-def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]]], labels: Mapping[str, str]) -> None:
-    """How trainings went, each a line, other seeds paler: a panel for every figure that has a label."""
-    plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
-    figure, panels = plt.subplots(1, len(labels), figsize=(18, 5.5), layout="constrained")
-    colours: dict[str, str] = {}
-    for training, history in histories.items():
-        whose = training.split(OF_SEED)[0]
-        first = whose not in colours
-        colour = colours.setdefault(whose, f"C{len(colours)}")
-        for panel, (name, label) in zip(panels, labels.items(), strict=True):
-            steps, values = [row["step"] / 1000 for row in history], [row[name] for row in history]
-            panel.plot(steps, values, color=colour, alpha=1 if first else 0.4, label=whose if first else None)
-            panel.set(xlabel="steps / 1000", ylabel=label)
-            panel.grid(alpha=0.4)
-    panels[0].legend()
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
-
-
-def draw_stacks(path: Path) -> None:
-    """How high the stacks of each agent are, and of what classes its scenes are, at 25 nodes."""
-    rows = [row for row in read("table1.json")["rows"] if row["nodes"] == 25 and row["objects"] == "ycb7"]
-    rows = [row for row in rows if row["temperature"] is None and "/" not in row["agent"]]
-    plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(18, 6.5), layout="constrained")
-    for k, row in enumerate(rows):
-        share = [count / sum(row["stack_heights_5cm"]) for count in row["stack_heights_5cm"]]
-        left.stairs(share, range(0, 5 * len(share) + 1, 5), label=row["agent"], linewidth=3)
-        places = [n + (k - (len(rows) - 1) / 2) * 0.8 / len(rows) for n in range(len(row["classes"]))]
-        shares = [count / sum(row["classes"].values()) for count in row["classes"].values()]
-        right.bar(places, shares, 0.8 / len(rows), label=row["agent"])
-    left.set(xlabel="height of a stack, cm", ylabel="share of the stacks")
-    left.legend()
-    names = [name.replace("_", "\n") for name in rows[0]["classes"]]
-    right.set_xticks(range(len(names)), names)
-    right.set_ylabel("share of the objects")
-    for panel in (left, right):
-        panel.grid(alpha=0.4, axis="y")
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
-
-
 def main(out: Annotated[Path, typer.Option(help="Page to write.")] = PAGE) -> None:
-    """Writes the page and its pictures."""
+    """Writes the page."""
     write_text(out, page())
-    if out == PAGE:
-        seeds = {f"seed {f.stem[-1]}": json.loads(f.read_text())["history"] for f in sorted(RESULTS.glob("sg_star_seed_*.json"))}
-        labels = {"score": "return of a scene", "hidden": "hidden objects", "stable": "stable, share"}
-        draw_curves(IMAGES / "learning_curves.png", seeds, labels)
-        explorers = {row["agent"]: row["history"] for row in read("explorer_trainings.json")["rows"]}
-        by_moves = {agent: history for agent, history in explorers.items() if history[-1]["step"] > 1000}  # clones count rounds
-        labels = {
-            "success": "everything found, share",
-            "moves_of_successes": "moves of successes",
-            "collapsed": "collapsed, share",
-        }
-        draw_curves(IMAGES / "explorer_curves.png", by_moves, labels)
-        draw_stacks(IMAGES / "stacks.png")
 
 
 if __name__ == "__main__":
