@@ -311,7 +311,8 @@ PARTS: tuple[Callable[[], str], ...] = (generators, explorers, closed_loop, dete
 
 def page() -> str:
     """The whole page."""
-    told = "Written by `training/results_page.py`, and drawn by `training/results_pictures.py`, from `training/results/`; files or checkpoints name config, seed and commit."
+    told = "Written by `training/results_page.py`, and drawn by `training/results_pictures.py`, from `training/results/`; files\n"
+    told += "or checkpoints name config, seed and commit."
     return f"# Results\n\n{told}\n\n" + "\n".join(part() for part in PARTS)
 
 
