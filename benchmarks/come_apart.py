@@ -23,7 +23,7 @@ from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.tasks.full_knowledge import Answer
+from drake_clutter.tasks.full_knowledge import Solvability
 
 OUT = Path(__file__).parent / "results" / "come_apart.json"
 
@@ -36,7 +36,7 @@ def counted(folder: Path) -> dict[str, Any]:
     for index, answer in enumerate(answers):
         file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
         if file.verdict is not None and file.verdict.stable:
-            counts[judge.comes_apart(file.settled_scene) is True, answer == Answer.SOLVABLE.value] += 1
+            counts[judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value] += 1
     told: dict[str, Any] = {"agent": job["agent"], "objects": job["objects"], "nodes": job["nodes"]}
     told |= {"seed": job["seed"], "scenes": len(answers)}
     for name, apart in (("comes_apart", True), ("does_not", False)):

@@ -42,7 +42,7 @@ from drake_clutter.scenes.scene import Scene, jittered, tilt_between
 from drake_clutter.scenes.seams import CannotJudge
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 
 CONFIG = ClutterConfig()
 NODES = 25
@@ -270,7 +270,7 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
             )
             rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
             rows[name]["median_moves_tried"] = float(np.median([solution.moves_tried for solution in solutions]))
-            rows[name] |= {answer.value: float(np.mean([s.answer is answer for s in solutions])) for answer in Answer}
+            rows[name] |= {answer.value: float(np.mean([s.answer is answer for s in solutions])) for answer in Solvability}
     return rows
 
 
@@ -297,7 +297,7 @@ def show(result: Row, console: Console) -> None:
             grown[name] = {str(row["objects"]): row[part][name]["mean_ms"] for row in result["growth"]}
     console.print(table("mean ms by objects", grown, {str(size.objects): str(size.objects) for size in SIZES}))
     columns = {"scenes": "count", "median s": "median_s", "most": "max_s", "moves": "median_moves_tried"}
-    console.print(table("search: hidden", result["search"], columns | {answer.value: answer.value for answer in Answer}))
+    console.print(table("search: hidden", result["search"], columns | {answer.value: answer.value for answer in Solvability}))
     targets = {name: {"aim": AIMS[name], "measured": value} for name, value in result["targets"].items()}
     console.print(table("target", targets, {"aim": "aim", "measured": "measured"}))
 

@@ -9,7 +9,7 @@ from conftest import CLASSES, resting, rng, scene_of
 
 from drake_clutter.agents.exploration import (
     BASELINES,
-    ExplorationAgent,
+    Explorer,
     LargestClear,
     LargestFirst,
     RandomExplorer,
@@ -177,7 +177,7 @@ def imagined(*detections: tuple[str, str, int]) -> Observation:
     return Observation(depth, tuple(found), camera, 0.70)
 
 
-def sweep(agent: ExplorationAgent, observation: Observation, count: int) -> list[str]:
+def sweep(agent: Explorer, observation: Observation, count: int) -> list[str]:
     """The objects that an agent picks one after the other; all go to the tray."""
     tried: list[Move] = []
     for _ in range(count):

@@ -15,7 +15,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
-from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch, Solution
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solution, Solvability
 
 CONFIG = ClutterConfig()
 JUDGE = FastJudge(CONFIG)
@@ -83,7 +83,7 @@ def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[
     scene = scene_of(*objects)
     assert JUDGE.stability(scene) is None
     solution = SEARCH.solve(scene)
-    assert solution.answer is Answer.SOLVABLE
+    assert solution.answer is Solvability.SOLVABLE
     assert (len(solution.plan), solution.at_least, solution.fewest, solution.never_found) == (moves, moves, True, ())
     assert {move.pick for move in solution.plan} == picked
     assert solution.moves_tried >= moves
@@ -106,7 +106,7 @@ def replayed(scene: Scene, solution: Solution, seed: int) -> set[str]:
 
 def test_no_plan_for_nothing_costs_nothing() -> None:
     solution = SEARCH.solve(scene_of(IN_VIEW), budget=0)
-    assert solution == Solution(Answer.SOLVABLE, (), 0, (), 0)
+    assert solution == Solution(Solvability.SOLVABLE, (), 0, (), 0)
 
 
 # --- Unsolvable ---
@@ -122,21 +122,21 @@ BELOW_IT = resting("gelatin_box", xy=(0.055, 0.0), name="below it")
 
 def test_what_lies_under_what_never_moves_is_never_found() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, IN_VIEW))
-    assert solution.answer is Answer.UNSOLVABLE
+    assert solution.answer is Solvability.UNSOLVABLE
     assert solution.never_found == ("foot", "held", "below it")
     assert (solution.plan, solution.fewest, solution.moves_tried) == ((), False, 0)
 
 
 def test_what_is_hidden_elsewhere_is_not_named() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, *covered(0.2, 0.25)))
-    assert solution.answer is Answer.UNSOLVABLE
+    assert solution.answer is Solvability.UNSOLVABLE
     assert solution.never_found == ("foot", "held", "below it")
 
 
 def test_no_room_for_any_move() -> None:
     """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
     solution = SEARCH.solve(scene_of(*covered(), tray_side=0.26))
-    assert (solution.answer, solution.plan, solution.never_found) == (Answer.UNSOLVABLE, (), ())
+    assert (solution.answer, solution.plan, solution.never_found) == (Solvability.UNSOLVABLE, (), ())
     assert not solution.fewest
     assert solution.moves_tried > 0
 
@@ -149,7 +149,7 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
     assert JUDGE.stability(scene) is None
     assert all(JUDGE.losing_support(scene, name) for name in scene.names)
     solution = SEARCH.solve(scene)
-    assert (solution.answer, solution.moves_tried) == (Answer.UNSOLVABLE, 0)
+    assert (solution.answer, solution.moves_tried) == (Solvability.UNSOLVABLE, 0)
 
 
 # --- The budget ---
@@ -158,7 +158,7 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
 @pytest.mark.parametrize("budget", [0, 1])
 def test_undecided_on_a_small_budget(budget: int) -> None:
     solution = SEARCH.solve(scene_of(*KNOWN["under two boxes"][0]), budget=budget)
-    assert solution == Solution(Answer.UNDECIDED, (), 2, (), budget)
+    assert solution == Solution(Solvability.UNDECIDED, (), 2, (), budget)
     assert not solution.fewest
 
 
@@ -170,10 +170,10 @@ def test_no_more_moves_than_the_budget_are_tried() -> None:
         assert solution.moves_tried <= budget
         assert solution.at_least <= 3
         answers.append(solution.answer)
-    decided = answers.index(Answer.SOLVABLE)
+    decided = answers.index(Solvability.SOLVABLE)
     assert decided >= 3
-    assert set(answers[:decided]) == {Answer.UNDECIDED}
-    assert set(answers[decided:]) == {Answer.SOLVABLE}
+    assert set(answers[:decided]) == {Solvability.UNDECIDED}
+    assert set(answers[decided:]) == {Solvability.SOLVABLE}
 
 
 def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
@@ -185,7 +185,7 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     if outcome.result is not MoveResult.PLACED or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3:
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
-    if (solution.answer, solution.moves_tried) != (Answer.UNDECIDED, 0):
+    if (solution.answer, solution.moves_tried) != (Solvability.UNDECIDED, 0):
         pytest.fail("the fast judge could tell", pytrace=False)
     assert solution.at_least <= 1
 
@@ -229,10 +229,10 @@ def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
     if fewest is None:
         assert seed == 45
         assert solution.at_least > 2
-        assert len(solution.plan) > 2 or solution.answer is not Answer.SOLVABLE
+        assert len(solution.plan) > 2 or solution.answer is not Solvability.SOLVABLE
         return
     assert fewest == (1 if seed == 2 else 2)
-    assert (solution.answer, solution.at_least, len(solution.plan)) == (Answer.SOLVABLE, fewest, fewest)
+    assert (solution.answer, solution.at_least, len(solution.plan)) == (Solvability.SOLVABLE, fewest, fewest)
     assert solution.fewest
     assert replayed(scene, solution, 2) == set(scene.names)
 
@@ -253,7 +253,7 @@ def test_the_same_seed_gives_the_same_solution() -> None:
 def test_the_plan_holds_for_its_seed(seed: int) -> None:
     for scene in (RANDOM[22], RANDOM[39]):
         solution = SEARCH.solve(scene, seed=seed)
-        assert solution.answer is Answer.SOLVABLE
+        assert solution.answer is Solvability.SOLVABLE
         assert replayed(scene, solution, seed) == set(scene.names)
 
 

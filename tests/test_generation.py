@@ -27,7 +27,7 @@ from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import scene_fields
 from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
-from drake_clutter.tasks.full_knowledge import Answer
+from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
 
@@ -90,7 +90,7 @@ def test_a_generated_scene_says_whether_it_is_solvable() -> None:
     for m in made:
         assert (m.solvable is None) == (not m.verdict.stable)
         if m.verdict.stable and not m.verdict.hidden:
-            assert m.solvable is Answer.SOLVABLE
+            assert m.solvable is Solvability.SOLVABLE
 
 
 def test_the_hill_climber_hides_more_than_chance() -> None:
@@ -171,7 +171,7 @@ def test_summary_of_a_batch_by_hand() -> None:
         Verdict(slid, {}, {}, ()),
         Verdict(None, {}, {}, ("c",)),
     ]
-    answers = [Answer.SOLVABLE, Answer.UNDECIDED, None, Answer.SOLVABLE]
+    answers = [Solvability.SOLVABLE, Solvability.UNDECIDED, None, Solvability.SOLVABLE]
     summary = summarise(job(), list(zip(scenes, verdicts, strict=True)), answers)
     assert summary.pop("solvable_ci95") == pytest.approx(wilson_interval(2, 3))
     assert summary.pop("largest_stack_share") == pytest.approx((0.5 + 0.5 + 1 + 1) / 4)

@@ -15,7 +15,7 @@ from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step, leg
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 
-class ExplorationAgent(Protocol):
+class Explorer(Protocol):
     """Chooses moves from what the camera has shown. One instance plays one episode at a time."""
 
     def choose(
@@ -37,7 +37,7 @@ class RandomExplorer:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`."""
+        """See `Explorer.choose`."""
         moves = legal_moves(observation)
         return Decision(moves[rng.integers(len(moves))] if moves else None)
 
@@ -61,7 +61,7 @@ class LargestFirst:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`."""
+        """See `Explorer.choose`."""
         return _least_picked_then_largest(observation.detections, tried, lambda d: d.object_class.volume)
 
 
@@ -74,7 +74,7 @@ class LargestClear:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`."""
+        """See `Explorer.choose`."""
         clear = [d for d in observation.detections if has_clear_top(observation, d)]
         return _least_picked_then_largest(clear or observation.detections, tried, lambda d: float(d.mask.sum()))
 
@@ -92,7 +92,7 @@ class FullKnowledge:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`. A plan that did not go as it was meant is followed by another.
+        """See `Explorer.choose`. A plan that did not go as it was meant is followed by another.
 
         Objects land where the plan puts them as long as nothing but the moves draws from `rng`.
         """
@@ -103,10 +103,10 @@ class FullKnowledge:
         return Decision(self._plan.pop(0) if self._plan else None)
 
 
-ExplorerMaker = Callable[[ExplorationTask], ExplorationAgent]
+ExplorerMaker = Callable[[ExplorationTask], Explorer]
 """Makes the agent of an episode; a privileged one may look at all of the task."""
 
-BASELINES: dict[str, Callable[[], ExplorationAgent]] = {
+BASELINES: dict[str, Callable[[], Explorer]] = {
     "random": RandomExplorer,
     "largest-first": LargestFirst,
     "largest-clear": LargestClear,
@@ -149,7 +149,7 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
 
 
 def play(
-    task: ExplorationTask, agent: ExplorationAgent, rng: np.random.Generator, report: Callable[[Step], None] = lambda _: None
+    task: ExplorationTask, agent: Explorer, rng: np.random.Generator, report: Callable[[Step], None] = lambda _: None
 ) -> None:
     """Lets an agent play a task to its end, or until it has no move left; `report` is called after each move."""
     while task.end is None:

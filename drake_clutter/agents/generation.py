@@ -20,7 +20,7 @@ from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.tasks.full_knowledge import Answer, FullKnowledgeSearch
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
 
 SEARCH_BUDGET = 400
@@ -146,7 +146,7 @@ class GeneratedScene:
     scene: Scene
     verdict: Verdict
     layout_failures: Counter[str]
-    solvable: Answer | None
+    solvable: Solvability | None
 
 
 class SceneGenerator:
@@ -202,7 +202,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(
-    job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]], solvable: Sequence[Answer | None] | None = None
+    job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]], solvable: Sequence[Solvability | None] | None = None
 ) -> dict[str, Any]:
     """The figures of a batch: stability over all scenes, hidden and solvable over the stable ones (SPEC section 6).
 
@@ -228,7 +228,7 @@ def summarise(
             reasons[verdict.instability.reason.value] += 1
     count = len(stacks)
     shares = np.array([*kinds.values()]) / kinds.total()
-    solved = sum(answer is Answer.SOLVABLE for answer in solvable or ())
+    solved = sum(answer is Solvability.SOLVABLE for answer in solvable or ())
     return {
         "nodes": job.nodes,
         "count": count,

@@ -57,7 +57,7 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
 
 
 class LearnedExplorer:
-    """Takes the likeliest pick and place for which there is room (an `ExplorationAgent`); one instance plays one episode."""
+    """Takes the likeliest pick and place for which there is room (an `Explorer`); one instance plays one episode."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class LearnedExplorer:
     def choose(
         self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
     ) -> Decision:
-        """See `ExplorationAgent.choose`.
+        """See `Explorer.choose`.
 
         Raises:
             InputError: an object of a class that the agent has not learned.

@@ -21,7 +21,7 @@ from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.scenes.seams import Verdict
-from drake_clutter.tasks.full_knowledge import Answer
+from drake_clutter.tasks.full_knowledge import Solvability
 
 JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
 SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"
@@ -106,7 +106,7 @@ def generate(
 
     files = [load_scene(path, catalogue) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
-    answers = [None if answer is None else Answer(answer) for answer in solvable[:count]]
+    answers = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
     summary = summarise(job, judged, answers)
     summary |= {"layout_failures": dict(failures), "seconds": round(seconds, 2), "workers": workers, "config": asdict(job.config)}
     write_json(out / SUMMARY_FILE, summary)

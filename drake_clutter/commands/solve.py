@@ -10,7 +10,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.full_knowledge import MOST_OBJECTS, Answer, FullKnowledgeSearch
+from drake_clutter.tasks.full_knowledge import MOST_OBJECTS, FullKnowledgeSearch, Solvability
 
 
 def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: ClutterConfig, report: Report) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: Cl
     solution = FullKnowledgeSearch(config).solve(scene, seed, budget)
     fields: dict[str, Any] = {
         "answer": solution.answer.value,
-        "moves": len(solution.plan) if solution.answer is Answer.SOLVABLE else None,
+        "moves": len(solution.plan) if solution.answer is Solvability.SOLVABLE else None,
         "at_least": solution.at_least,
         "fewest": solution.fewest,
         "plan": [str(move) for move in solution.plan],

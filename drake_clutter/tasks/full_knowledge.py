@@ -25,7 +25,7 @@ LONGEST = 30
 """Moves; longer plans are not looked for."""
 
 
-class Answer(Enum):
+class Solvability(Enum):
     """What a search found."""
 
     SOLVABLE = "solvable"
@@ -45,7 +45,7 @@ class Solution:
         moves_tried: what the search cost.
     """
 
-    answer: Answer
+    answer: Solvability
     plan: tuple[Move, ...]
     at_least: int
     never_found: tuple[str, ...]
@@ -54,7 +54,7 @@ class Solution:
     @property
     def fewest(self) -> bool:
         """Whether the plan is proved to have the fewest moves."""
-        return self.answer is Answer.SOLVABLE and len(self.plan) == self.at_least
+        return self.answer is Solvability.SOLVABLE and len(self.plan) == self.at_least
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class FullKnowledgeSearch:
         fixed = self._judge.never_movable(scene)
         never = self.never_found(scene, start.known, fixed if isinstance(fixed, frozenset) else ())
         if never:
-            return Solution(Answer.UNSOLVABLE, (), start.at_least, never, 0)
+            return Solution(Solvability.UNSOLVABLE, (), start.at_least, never, 0)
         plan, at_least, exhausted = None, start.at_least, False
         try:
             self._left = budget // 2
@@ -136,7 +136,7 @@ class FullKnowledgeSearch:
             pass
         self._left += budget - budget // 2
         if plan is not None and not fewest:
-            return Solution(Answer.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
+            return Solution(Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
         try:
             while not exhausted and at_least < (len(plan) if plan is not None else LONGEST + 1):
                 self._doubts = 0
@@ -151,8 +151,8 @@ class FullKnowledgeSearch:
         except _OutOfBudgetError:
             pass
         if plan is not None:
-            return Solution(Answer.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
-        return Solution(Answer.UNSOLVABLE if exhausted else Answer.UNDECIDED, (), at_least, (), budget - self._left)
+            return Solution(Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
+        return Solution(Solvability.UNSOLVABLE if exhausted else Solvability.UNDECIDED, (), at_least, (), budget - self._left)
 
     def _state(self, scene: Scene, known: frozenset[str], rng: Mapping[str, Any]) -> _State:
         observation, _ = self._rays.observe(scene)
