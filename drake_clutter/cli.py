@@ -140,12 +140,20 @@ def _print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
 
 @app.command()
 def evaluate(
+    place: Annotated[str | None, typer.Argument(metavar="SCENES", help="The same as --scenes.", show_default=False)] = None,
     scenes: Annotated[
-        str, typer.Option(help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged.")
-    ],
+        str | None, typer.Option(help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged.")
+    ] = None,
     agents: Annotated[
-        str, typer.Option(metavar="NAME,...", help="As for `explore`, or full-knowledge.")
-    ] = "random,largest-first,largest-clear",
+        list[str] | None,
+        typer.Option(
+            "--agents",
+            "--agent",
+            metavar="NAME,...",
+            help="As for `explore`, or full-knowledge; may be repeated.",
+            show_default="those without learning",
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON to write, with the rows and every episode.")] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
@@ -159,11 +167,18 @@ def evaluate(
 ) -> None:
     """Compare explorers on scenes that hide something."""
     from drake_clutter.agents.evaluation import in_words
+    from drake_clutter.agents.exploration import BASELINES
     from drake_clutter.commands import evaluate as command
     from drake_clutter.config import load_config
 
+    named = scenes or place
+    if named is None or None not in (scenes, place):
+        raise InputError(
+            "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
+        )
     world = load_config(config)
-    played, names = command.playable(scenes, catalogue)[:count], agents.split(",")
+    played = command.playable(named, catalogue)[:count]
+    names = [name for some in agents or BASELINES for name in some.split(",")]
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
@@ -174,7 +189,7 @@ def evaluate(
         print(json.dumps(rows, indent=2))
         return
     shown = [{"agent": row["agent"]} | in_words(row, command.limits(limit)) for row in rows]
-    table = Table(*shown[0], title=f"{scenes}, {limit} moves")
+    table = Table(*shown[0], title=f"{named}, {limit} moves")
     for cells in shown:
         table.add_row(*cells.values())
     out_console.print(table)

@@ -124,7 +124,8 @@ def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     alone, together = tmp_path / "alone.json", tmp_path / "together.json"
     given = ("evaluate", "--scenes", tmp_path / "scenes", "--agents", "random,largest-first", "--max-moves", "2")
     run(*given, "--out", alone)
-    run(*given, "--workers", "2", "--out", together)
+    agents = ("--agent", "random", "--agent", "largest-first")
+    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--workers", "2", "--out", together)
     assert alone.read_bytes() == together.read_bytes()
     written = json.loads(alone.read_text())
     files = [tmp_path / "scenes/one.yaml", tmp_path / "scenes/two.yaml"]
@@ -142,6 +143,7 @@ def test_evaluate_knows_the_frozen_sets_by_name() -> None:
     assert (row["agent"], row["episodes"]) == ("largest-clear", 2)
     assert row["hidden"] > 0
     assert "sg_star_25" in run("evaluate", "--scenes", "sg_star_9", code=2).stderr
+    assert "--scenes: give it once" in run("evaluate", code=2).stderr
 
 
 def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
