@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE
 from rich.table import Table
 
 from drake_clutter.cli_arm import feasibility, replay
@@ -188,8 +189,11 @@ def evaluate(
     if as_json:
         print(json.dumps(rows, indent=2))
         return
-    shown = [{"agent": row["agent"]} | in_words(row, command.limits(limit)) for row in rows]
-    table = Table(*shown[0], title=f"{named}, {limit} moves")
+    shown = [{"agent": row["agent"]} | cells for row in rows for cells in in_words(row, command.limits(limit))]
+    title = f"{named}: {rows[0]['episodes']} scenes, {rows[0]['hidden']:.1f} objects hidden"
+    table = Table(
+        *shown[0], title=title, box=SIMPLE, padding=(0, 1, 0, 0), caption="in: so many moves; moves: of those who found all"
+    )
     for cells in shown:
         table.add_row(*cells.values())
     out_console.print(table)

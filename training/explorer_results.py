@@ -117,9 +117,10 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """For the screen."""
     told = []
     for row in rows:
+        begin = {"set": row["set"], "agent": row["agent"], "episodes": str(row["episodes"]), "hidden": f"{row['hidden']:.1f}"}
         ratios = {f"to {name}": row.get(f"moves_to_{name}") for name in COMPARED}
-        cells = {"set": row["set"], "agent": row["agent"]} | in_words(row, LIMITS)
-        told.append(cells | {name: "" if ratio is None else f"{ratio:.2f}" for name, ratio in ratios.items()})
+        end = {name: "" if ratio is None else f"{ratio:.2f}" for name, ratio in ratios.items()}
+        told += [begin | cells | end for cells in in_words(row, LIMITS)]
     table = Table(*told[0])
     for cells in told:
         table.add_row(*cells.values())
@@ -174,7 +175,7 @@ def main(
         held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
         add_rows(out or RESULTS / f"{table}.json", held, rows)
         shown += rows
-    Console(width=180).print(table_of(shown))
+    Console(width=150).print(table_of(shown))
 
 
 if __name__ == "__main__":

@@ -140,15 +140,15 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
     return row
 
 
-def in_words(row: dict[str, Any], limits: Sequence[int]) -> dict[str, str]:
-    """A row of `summarise_episodes` for people: cells of a table by its columns."""
-    cells = {"episodes": str(row["episodes"]), "hidden": f"{row['hidden']:.2f}"}
+def in_words(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]:
+    """A row of `summarise_episodes` for people: lines of a table, one for each limit of moves, as cells by column."""
+    lines = []
     for limit in limits:
         part = row[f"within_{limit}"]
         low, high = part["success_ci95"]
-        cells[f"success in {limit}"] = f"{part['success']:.2f} ({low:.2f} to {high:.2f})"
-        cells[f"found in {limit}"] = f"{part['found']:.2f}"
-        cells[f"of hidden in {limit}"] = f"{part['found_of_hidden']:.2f}"
-    cells["collapsed"] = f"{row[f'within_{limits[-1]}']['collapsed']:.2f}"
-    cells["moves"] = "" if row["moves_of_successes"] is None else f"{row['moves_of_successes']:.1f}"
-    return cells
+        cells = {"in": str(limit), "success (95 %)": f"{part['success']:.2f} ({low:.2f}-{high:.2f})"}
+        cells |= {"found": f"{part['found']:.2f}", "of hidden": f"{part['found_of_hidden']:.2f}"}
+        lines.append(cells | {"collapsed": f"{part['collapsed']:.2f}", "moves": ""})
+    if row["moves_of_successes"] is not None:
+        lines[-1]["moves"] = f"{row['moves_of_successes']:.1f}"
+    return lines
