@@ -40,7 +40,8 @@ AGENTS = {
     "random": ("RE", "C5"),
 }
 """Whose finds are drawn, what they are called, and in which colour."""
-MOVES = 20
+MOVES, FEWEST = 20, 100
+"""Moves that are drawn, and scenes that an agent must have played to be drawn."""
 
 
 def read(name: str) -> dict[str, Any]:
@@ -111,7 +112,7 @@ def draw_found(path: Path) -> None:
 
 def draw_set(panel: Axes, name: str) -> None:
     """A panel of `draw_found`."""
-    played = {agent: episodes for agent in AGENTS if (episodes := episodes_of(name, agent))}
+    played = {agent: episodes for agent in AGENTS if len(episodes := episodes_of(name, agent)) >= FEWEST}
     count = min(len(episodes) for episodes in played.values())
     for agent, episodes in played.items():
         hidden, found = sum(e["hidden"] for e in episodes[:count]), np.zeros(MOVES + 1)
