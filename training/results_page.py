@@ -248,8 +248,8 @@ From `fast` to `settle`: the same scenes, chances and explorers, judged fast (`t
 Drake.
 
 {table(["set", "agent", "scenes", "success in 10", "in 20", "of hidden", "collapsed", "moves"], gaps)}
-SE* trained with other seeds, teacher and clone included, and by plain cloning (`student_bc`); the first 100 scenes, settled by
-Drake. `training/results/explorers_seeds.json`
+SE* trained with other seeds, teacher and clone included; the first 100 scenes, settled by Drake.
+`training/results/explorers_seeds.json`
 {spreads}
 {table(head, [explorer_row(row) for row in seeds])}
 The trainings, and 200 episodes as they ended, at fidelity `equilibrium` and within 20 moves. All had other work beside them. A
