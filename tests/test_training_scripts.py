@@ -1,6 +1,7 @@
 """The scripts that make sets of scenes and the explorers' tables."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,13 @@ import pytest
 from conftest import CATALOGUE, training_script
 
 from drake_clutter.agents.evaluation import EpisodeResult
+from drake_clutter.agents.generation import GenerationJob
+from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.records import recorded
 from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
+from drake_clutter.simulation.judge import DrakeJudge
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
 
@@ -87,21 +93,53 @@ def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
         add_rows(path, {"seed": 2}, [])
 
 
-@pytest.mark.parametrize("drake", [False, True])
-def test_a_set_of_scenes(drake: bool, tmp_path: Path) -> None:
-    script, work = training_script("make_scenes"), tmp_path / "work" if drake else None
-    options = {"agent": "random", "nodes": 10, "work": work}
-    script.main(tmp_path / "first.json", count=2, seed=1, **options)
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
+    script = training_script("make_scenes")
+    options = {"agent": "random", "nodes": 10, "seed": 1, "work": tmp_path / "work", "frozen": frozen}
+    script.main(tmp_path / "first.json", count=2, **options)
     first = load_scene_set(tmp_path / "first.json", CATALOGUE)
-    assert first.about["judge"] == ("drake" if drake else "fast")
+    assert first.about["judge"] == "drake"
     assert len({scene.form for scene in first.scenes}) == 2
-    assert all(scene.hidden > 0 and (scene.settled is not None) == drake for scene in first.scenes)
+    assert all(scene.hidden > 0 and (scene.settled is not None) == frozen for scene in first.scenes)
     again = tmp_path / "again.json"
-    script.main(again, count=1, seed=1, not_in=[tmp_path / "first.json"], **options)
+    script.main(again, count=1, not_in=[tmp_path / "first.json"], **options)
     (other,) = load_scene_set(again, CATALOGUE).scenes
     assert other.form not in {scene.form for scene in first.scenes}
 
 
+def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fast judge calls this one stable; Drake has the last word."""
+    script = training_script("make_scenes")
+    judge = script.GraphJudge(GenerationJob("random", "ycb7", None, 10, 1, ClutterConfig()))
+    index = next(k for k in range(20) if judge(k).get("hidden"))
+    fall = Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.1, 1.0)
+    monkeypatch.setattr(DrakeJudge, "judge", lambda self, scene, rng: Verdict(fall, scene.poses, {}, ()))
+    record = judge(index)
+    assert record == {"fast": True, "fell": "toppled"}
+    assert script.graph_of(record) is None
+
+
 def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--count 1: only 0 of 20 scenes are stable"):
-        training_script("make_scenes").main(tmp_path / "set.json", agent="random", nodes=3, count=1)
+        training_script("make_scenes").main(tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1)
+
+
+def test_records_are_made_once(tmp_path: Path) -> None:
+    """Also after a run was killed while it wrote one; and none is taken for what it is not."""
+    path, made = tmp_path / "folder" / "records.jsonl", list[int]()
+
+    def make(done: int) -> Iterator[int]:
+        for k in range(done, 3):
+            made.append(k)
+            yield k
+
+    first = recorded(path, {"seed": 1}, make)
+    assert [next(first), next(first)] == [0, 1]
+    first.close()
+    path.write_text(path.read_text()[:-1])
+    assert list(recorded(path, {"seed": 1}, make)) == [0, 1, 2]
+    assert list(recorded(path, {"seed": 1}, make)) == [0, 1, 2]
+    assert made == [0, 1, 1, 2]
+    with pytest.raises(InputError, match=r"records\.jsonl: holds records of something else \(seed\)"):
+        next(recorded(path, {"seed": 2}, make))

@@ -1,16 +1,18 @@
-"""Makes a set of stable scenes for explorers, drawn by a generation agent, in one small file.
+"""Makes a set of stable scenes for explorers, drawn by a generation agent and judged by Drake, in one small file.
 
-    python training/make_scenes.py --agent sg-star --seed 100 --out training/scenes/train_sg_star.json
-    python training/make_scenes.py --count 300 --seed 9000 --work runs/sg_star_25 --out training/scenes/sg_star_25.json
+    python training/make_scenes.py --agent sg-star --seed 100 --work runs/train_sg_star --out training/scenes/train_sg_star.json
+    python training/make_scenes.py --frozen --count 300 --seed 9000 --work runs/sg_star_25 --out training/scenes/sg_star_25.json
 
-With --work, Drake judges the scenes, they stay in that folder (so that a run that was stopped goes on), and the set is a frozen
-one: it holds where the objects came to rest. Without, the fast judge decides, with the margin that generators learn with, and the
-set holds graphs, to be laid out anew. No graph is taken twice, nor one of the sets given as --not-in, up to symmetry.
+A set to learn from holds graphs, to be laid out anew. The fast judge chooses among the scenes, with the margin that generators
+learn with, and Drake has the last word. A frozen set, of all scenes that Drake calls stable, also holds where the objects came to
+rest. What has been judged stays in the --work folder, so that a run that was stopped goes on. No graph is taken twice, nor one of
+the sets given as --not-in, up to symmetry.
 """
 
 import itertools
 import json
 from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,17 +28,21 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.grammar import canonical_form
+from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set
 from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.generation import GenerationTask
 
 MOST_DRAWS = 20
 """Scenes that are drawn at most, for each that is to be collected."""
 MORE = 1.1
 """Times as many scenes are drawn as are still missing."""
+JUDGED = "judged.jsonl"
+"""In the --work folder: what was said of each scene."""
 
 
 def judged_by_drake(folder: Path) -> Iterator[SetScene]:
@@ -53,22 +59,33 @@ def judged_by_drake(folder: Path) -> Iterator[SetScene]:
             yield SetScene(file.scene.derivation, form, len(file.verdict.hidden), answer, settled)
 
 
-class FastMaker:
+class GraphJudge:
     """Draws scene after scene of a job; a worker for the runner."""
 
     def __init__(self, job: GenerationJob) -> None:
         self._job, self._generator = job, SceneGenerator(job)
-        self._judge, self._classes = FastJudge(job.config, margin=GenerationTask().margin), load_catalogue().classes
+        self._fast, self._drake = FastJudge(job.config, margin=GenerationTask().margin), DrakeJudge(job.config)
+        self._classes = load_catalogue().classes
 
-    def __call__(self, index: int) -> SetScene | None:
-        """The scene of an index, if it stands, comes apart and hides something."""
+    def __call__(self, index: int) -> dict[str, Any]:
+        """What is said of the scene of an index: `fast`, whether it stands, comes apart and hides something as the fast judge
+        sees it; if so `fell`, how it fell in Drake; and if it stayed, its rules, form and how many it hides."""
         rng = item_rng(self._job.seed, index)
         scene, _ = self._generator.lay_out(rng)
-        verdict = self._judge.judge(scene, rng)
-        if isinstance(verdict, CannotJudge) or not verdict.hidden or self._judge.comes_apart(scene) is not True:
-            return None
+        verdict = self._fast.judge(scene, rng)
+        if isinstance(verdict, CannotJudge) or not verdict.hidden or self._fast.comes_apart(scene) is not True:
+            return {"fast": False}
+        drake = self._drake.judge(scene, rng)
+        if drake.instability is not None:
+            return {"fast": True, "fell": drake.instability.reason.value}
         assert scene.graph is not None
-        return SetScene(scene.derivation, canonical_form(scene.graph, self._classes), len(verdict.hidden))
+        form = canonical_form(scene.graph, self._classes)
+        return {"fast": True, "fell": None, "rules": scene.derivation, "form": form, "hidden": len(drake.hidden)}
+
+
+def graph_of(record: dict[str, Any]) -> SetScene | None:
+    """The graph of what `GraphJudge` said; None if it is stable for neither or hides nothing."""
+    return SetScene(tuple(record["rules"]), record["form"], record["hidden"]) if record.get("hidden") else None
 
 
 def without_repeats(scenes: Iterable[SetScene | None], taken: set[str]) -> Iterator[SetScene]:
@@ -82,13 +99,14 @@ def without_repeats(scenes: Iterable[SetScene | None], taken: set[str]) -> Itera
 
 def main(
     out: Annotated[Path, typer.Option(metavar="FILE", help="JSON to write.")],
+    work: Annotated[Path, typer.Option(metavar="DIR", help="Where what has been judged is kept.")],
     agent: Annotated[str, typer.Option(help="As for `drake-clutter generate`.")] = "sg-star",
     nodes: Annotated[int, typer.Option(min=3)] = 25,
     objects: str = "ycb7",
     count: Annotated[int, typer.Option(min=1, help="Stable scenes to collect.")] = 3000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     temperature: Annotated[float | None, typer.Option(help="Of a trained agent.")] = None,
-    work: Annotated[Path | None, typer.Option(metavar="DIR", help="Have Drake judge, and keep the scenes here.")] = None,
+    frozen: Annotated[bool, typer.Option("--frozen", help="Hold where the objects came to rest.")] = False,
     not_in: Annotated[list[Path] | None, typer.Option(metavar="FILE", help="A set to leave out; may be repeated.")] = None,
     workers: Annotated[int, typer.Option(min=1)] = 1,
 ) -> None:
@@ -97,18 +115,18 @@ def main(
     taken = {scene.form for path in not_in or [] for scene in load_scene_set(path, load_catalogue()).scenes}
     job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
     about: dict[str, Any] = {"objects": objects, "agent": agent, "nodes": nodes, "seed": seed, "temperature": temperature}
-    about |= {
-        "judge": "fast" if work is None else "drake",
-        "without": [path.name for path in not_in or []],
-        "commit": git_commit(),
-    }
+    about |= {"judge": "drake", "without": [path.name for path in not_in or []], "commit": git_commit()}
     found, drawn = list[SetScene](), 0
-    if work is None:
-        made = map_ordered(partial(FastMaker, job), range(MOST_DRAWS * count), workers=workers)
-        fitting = itertools.islice(without_repeats(made, taken), count)
+    if not frozen:
+        judged = recorded(
+            work / JUDGED,
+            asdict(job),
+            lambda done: map_ordered(partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers),
+        )
+        fitting = itertools.islice(without_repeats(map(graph_of, judged), taken), count)
         found = list(track(fitting, out.stem, total=count, console=console))
-        made.close()
-    while work is not None and len(found) < count and drawn < MOST_DRAWS * count:
+        judged.close()
+    while frozen and len(found) < count and drawn < MOST_DRAWS * count:
         drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
         generate(job, drawn, work, workers, lambda scenes, done, total: track(scenes, out.stem, total, done, console=console))
         found = list(without_repeats(judged_by_drake(work), taken))

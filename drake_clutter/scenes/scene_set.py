@@ -80,7 +80,7 @@ class SceneSet:
         poses = self.scenes[index].settled
         if poses is None:
             raise InputError(
-                f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py writes with --work"
+                f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
             )
         scene = lay_anew(self.derivation(index, grammar), grammar, layout, np.random.default_rng(index))
         return scene.at(dict(zip(scene.names, poses, strict=True)))
