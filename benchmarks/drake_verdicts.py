@@ -5,10 +5,10 @@ Every group of objects that may touch is settled, also after one of them has fal
 python benchmarks/drake_verdicts.py FOLDER --workers 2
 """
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,8 @@ from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, config_yaml
-from drake_clutter.files import InputError, write_text
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.resources import git_commit
+from drake_clutter.records import recorded
 from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene
@@ -128,19 +127,12 @@ class _Factory:
 def _records(
     path: Path, head: dict[str, Any], make_worker: Callable[[], Callable[[Any], Any]], items: Sequence[Any], pool: Pool
 ) -> Iterator[dict[str, Any]]:
-    """The head with the commit at which it was begun, then a record per item; what the file lacks is made and added."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not path.exists():
-        write_text(path, json.dumps(head | {"commit": git_commit()}) + "\n")
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    if {key: lines[0].get(key) for key in head} != head:
-        raise InputError(f"{path}: holds the results of another config; give another folder")
-    yield from lines[: 1 + len(items)]
-    with path.open("a") as file:
-        for record in map_ordered(make_worker, items[len(lines) - 1 :], workers=pool.workers, ray_address=pool.ray):
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            yield record
+    """The head, then a record per item."""
+
+    def make(done: int) -> Iterator[Any]:
+        return map_ordered(make_worker, items[done:], workers=pool.workers, ray_address=pool.ray)
+
+    return islice(recorded(path, head, make), 1 + len(items))
 
 
 def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:

@@ -10,10 +10,10 @@ from drake_clutter.resources import git_commit
 
 
 def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterable[Any]]) -> Generator[Any, None, None]:
-    """The records of a file, and then those that it lacks, each added to it as soon as it is made.
+    """The head of a file, its records, and then those that it lacks, each added to it as soon as it is made.
 
-    The first line says what was asked, and at which commit the file was begun. A line that was cut off when a run was killed is
-    made again.
+    The head, the first line, says what was asked and at which `commit` the file was begun. A line that was cut off
+    when a run was killed is made again.
 
     Args:
         path: the file; made, with its folders, if it is not there.
@@ -35,6 +35,7 @@ def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterabl
     if lines and not lines[-1].endswith("\n"):
         write_text(path, head + "".join(lines[:-1]))
         lines.pop()
+    yield there
     yield from map(json.loads, lines)
     with path.open("a", encoding="utf-8") as file:
         for record in make(len(lines)):

@@ -100,7 +100,7 @@ def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     row = script.ROWS[0]
     assert [e["number"] for e in script.episodes_of(row, 2, 1, path)] == [row.first, row.first + 1]
     assert [e["number"] for e in script.episodes_of(row, 3, 1, path)] == made == [row.first + k for k in range(3)]
-    with pytest.raises(InputError, match=r"row\.jsonl: holds episodes of other networks, scenes or settings"):
+    with pytest.raises(InputError, match=r"row\.jsonl: holds records of something else \(row, scenario, weights\)"):
         script.episodes_of(replace(row, agent="student-dagger"), 3, 1, path)
 
 

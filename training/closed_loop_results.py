@@ -13,7 +13,7 @@ arm finds.
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -28,8 +28,9 @@ from rich.table import Table
 from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json, write_text
+from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
 from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene import Scene, SceneObject
@@ -142,18 +143,17 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
         networks.append(checkpoint_path(row.perception, DETECTORS))
     scenario = asdict(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
     scenario.pop("seed")  # each episode's own: the scene's number
-    asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": json.loads(json.dumps(scenario))}
+    asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": scenario}
     asked |= {"weights": [sha256_of(file) for file in networks]}
-    lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
-    if json.loads(lines[0]) != asked:
-        raise InputError(f"{path}: holds episodes of other networks, scenes or settings; give another folder as DIR")
-    missing = [Asked(row, row.first + k) for k in range(len(lines) - 1, count)]
-    commit, done = git_commit(), len(lines) - 1
-    made = map_ordered(Player, missing, workers=workers, fresh_after=EPISODES_OF_A_PROCESS)
-    for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
-        lines.append(json.dumps(told | {"commit": commit}))
-        write_text(path, "\n".join(lines) + "\n")
-    return [json.loads(line) for line in lines[1 : 1 + count]]
+    commit = git_commit()
+
+    def play(done: int) -> Iterator[dict[str, Any]]:
+        missing = [Asked(row, row.first + k) for k in range(done, count)]
+        made = map_ordered(Player, missing, workers=workers, fresh_after=EPISODES_OF_A_PROCESS)
+        for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
+            yield told | {"commit": commit}
+
+    return list(recorded(path, asked, play))[1 : 1 + count]
 
 
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:

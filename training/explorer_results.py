@@ -6,7 +6,7 @@ Every episode is a line of a file in training/results/episodes, a file for each 
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,8 @@ from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResul
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json, write_text
+from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
+from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
@@ -44,25 +45,21 @@ def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, w
     config = ClutterConfig()
     asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
     asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
-    lines = path.read_text().splitlines() if path.exists() else [json.dumps(asked)]
-    there = json.loads(lines[0])
-    differing = ", ".join(key for key, value in asked.items() if there.get(key) != value)
-    if differing:
-        raise InputError(f"{path}: holds other episodes ({differing}); give the same options or another folder")
     make_explorers(agent, config)  # says what is wrong before anything is played
-    missing = [Episode(SCENES / scenes.name, k, agent, k) for k in range(len(lines) - 1, count)]
-    results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), missing, workers=workers)
     commit = git_commit()
-    for result in track(results, path.stem, total=len(missing), console=Console(stderr=True)):
-        lines.append(json.dumps(asdict(result) | {"commit": commit}))
-        write_text(path, "\n".join(lines) + "\n")
-    return [episode_of(line) for line in lines[1 : 1 + count]]
+
+    def play(done: int) -> Iterator[dict[str, Any]]:
+        missing = [Episode(SCENES / scenes.name, k, agent, k) for k in range(done, count)]
+        results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), missing, workers=workers)
+        for result in track(results, path.stem, count, done, console=Console(stderr=True)):
+            yield asdict(result) | {"commit": commit}
+
+    return [episode_of(record) for record in list(recorded(path, asked, play))[1 : 1 + count]]
 
 
-def episode_of(line: str) -> EpisodeResult:
-    """From a line of a file of episodes."""
-    fields = json.loads(line)
-    fields.pop("commit")
+def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
+    """From a record of a file of episodes."""
+    fields = {key: value for key, value in record.items() if key != "commit"}
     return EpisodeResult(**fields | {"found_after": tuple(fields["found_after"])})
 
 

@@ -123,6 +123,7 @@ def main(
             asdict(job),
             lambda done: map_ordered(partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers),
         )
+        next(judged)  # the head
         fitting = itertools.islice(without_repeats(map(graph_of, judged), taken), count)
         found = list(track(fitting, out.stem, total=count, console=console))
         judged.close()
