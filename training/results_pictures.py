@@ -15,11 +15,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 from matplotlib.axes import Axes
+from results_page import IMAGES, RESULTS, read
 
 from drake_clutter.files import told_in_one_line
 
-ROOT = Path(__file__).parents[1]
-RESULTS, IMAGES = ROOT / "training/results", ROOT / "docs/images"
 OF_SEED = ", seed "
 """Between a training's name and its seed, if that is not 0."""
 SETS = {
@@ -42,12 +41,6 @@ AGENTS = {
 """Whose finds are drawn, what they are called, and in which colour."""
 MOVES, FEWEST = 20, 100
 """Moves that are drawn, and scenes that an agent must have played to be drawn."""
-
-
-def read(name: str) -> dict[str, Any]:
-    """A file of results."""
-    found: dict[str, Any] = json.loads((RESULTS / name).read_text())
-    return found
 
 
 def episodes_of(name: str, agent: str) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.agents.exploration_episodes import Played, acting, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
-from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
+from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 
@@ -109,14 +109,13 @@ class ActorCritic:
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        save_tensors(path, tensors | optimizer_tensors(self._optimizer), {"step": self.step, "round": self._round})
+        state = {"step": self.step, "round": self._round}
+        save_tensors(path, learner_tensors(self.network, self._optimizer), state)
 
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config and seed."""
         tensors, state = load_tensors(path)
-        self.network.load_state_dict({n.removeprefix("network."): v for n, v in tensors.items() if n.startswith("network.")})
-        optimizer_from(self._optimizer, tensors)
+        restore_learner(self.network, self._optimizer, tensors)
         self.step, self._round = state["step"], state["round"]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.agents.exploration_episodes import Played, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
-from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
+from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation
@@ -113,8 +113,7 @@ class Cloning:
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= optimizer_tensors(self._optimizer)
+        tensors = learner_tensors(self.network, self._optimizer)
         arrays = {**self._states, "moves": self._moves}
         tensors |= {f"states.{name}": torch.from_numpy(array) for name, array in arrays.items()}
         save_tensors(path, tensors, {"step": self.step})
@@ -122,8 +121,7 @@ class Cloning:
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config, seed and teacher."""
         tensors, state = load_tensors(path)
-        self.network.load_state_dict({n.removeprefix("network."): v for n, v in tensors.items() if n.startswith("network.")})
-        optimizer_from(self._optimizer, tensors)
-        self._states = {n.removeprefix("states."): v.numpy() for n, v in tensors.items() if n.startswith("states.")}
+        restore_learner(self.network, self._optimizer, tensors)
+        self._states = {name: value.numpy() for name, value in part_of(tensors, "states").items()}
         self._moves = self._states.pop("moves")
         self.step = state["step"]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
+from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
 from drake_clutter.runner import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 
@@ -333,9 +333,8 @@ class SoftQLearner:
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        tensors = learner_tensors(self.network, self._optimizer)
         tensors |= {f"target.{name}": value for name, value in self._target.state_dict().items()}
-        tensors |= optimizer_tensors(self._optimizer)
         tensors |= {
             f"replay.{name}": torch.from_numpy(array[: self._replay.times]) for name, array in self._replay.arrays.items()
         }
@@ -353,14 +352,9 @@ class SoftQLearner:
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config and seed."""
         tensors, state = load_tensors(path)
-        parts: dict[str, dict[str, Tensor]] = {"network": {}, "target": {}, "optimizer": {}, "replay": {}}
-        for name, value in tensors.items():
-            part, _, rest = name.partition(".")
-            parts[part][rest] = value
-        self.network.load_state_dict(parts["network"])
-        self._target.load_state_dict(parts["target"])
-        optimizer_from(self._optimizer, tensors)
-        for name, value in parts["replay"].items():
+        restore_learner(self.network, self._optimizer, tensors)
+        self._target.load_state_dict(part_of(tensors, "target"))
+        for name, value in part_of(tensors, "replay").items():
             self._replay.arrays[name][: len(value)] = value.numpy()
         self._replay.times, self.step = state["remembered"], state["step"]
         self._rng.bit_generator.state = state["rng"]

@@ -64,18 +64,23 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
         return {name: file.get_tensor(name) for name in names}, json.loads(file.metadata()["state"])
 
 
-def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
-    """What an optimiser remembers, as `optimizer.NUMBER.NAME`."""
+def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """Those that are called `PART.NAME`, by NAME."""
+    return {name.removeprefix(f"{part}."): value for name, value in tensors.items() if name.startswith(f"{part}.")}
+
+
+def learner_tensors(network: nn.Module, optimizer: Optimizer) -> dict[str, Tensor]:
+    """A network's weights, as `network.NAME`, and what its optimiser remembers, as `optimizer.NUMBER.NAME`."""
+    weights = {f"network.{name}": value for name, value in network.state_dict().items()}
     moments = optimizer.state_dict()["state"].items()
-    return {f"optimizer.{number}.{name}": value for number, of_one in moments for name, value in of_one.items()}
+    return weights | {f"optimizer.{number}.{name}": value for number, of_one in moments for name, value in of_one.items()}
 
 
-def optimizer_from(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Gives back to an optimiser what `optimizer_tensors` took; other names are left alone."""
+def restore_learner(network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Gives back what `learner_tensors` took; other names are left alone."""
+    network.load_state_dict(part_of(tensors, "network"))
     moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        part, _, rest = name.partition(".")
-        if part == "optimizer":
-            number, _, moment = rest.partition(".")
-            moments.setdefault(int(number), {})[moment] = value
+    for name, value in part_of(tensors, "optimizer").items():
+        number, _, moment = name.partition(".")
+        moments.setdefault(int(number), {})[moment] = value
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.learning.checkpoint import load_tensors, optimizer_from, optimizer_tensors, save_tensors
+from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import LabelledImage
 from drake_clutter.perception.segmentation import (
@@ -159,13 +159,10 @@ class SegmentationLearner:
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        save_tensors(path, tensors | optimizer_tensors(self._optimizer), {"step": self.step})
+        save_tensors(path, learner_tensors(self.network, self._optimizer), {"step": self.step})
 
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config and seed."""
         tensors, state = load_tensors(path)
-        weights = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
-        self.network.load_state_dict(weights)
-        optimizer_from(self._optimizer, tensors)
+        restore_learner(self.network, self._optimizer, tensors)
         self.step = state["step"]
