@@ -1,11 +1,12 @@
 """Files of JSON lines that a long run adds to: what is there is not made again."""
 
+import fcntl
 import json
 from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.files import InputError, write_text
+from drake_clutter.files import InputError
 from drake_clutter.resources import git_commit
 
 
@@ -21,24 +22,31 @@ def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterabl
         make: told how many records are there, makes those that follow.
 
     Raises:
-        InputError: the file holds records of something else.
+        InputError: the file holds records of something else, or another run is adding to it.
     """
     asked = json.loads(json.dumps(asked))
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps({**asked, "commit": git_commit()}) + "\n")
-    head, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    there = json.loads(head)
-    differing = ", ".join(key for key, value in asked.items() if there.get(key) != value)
-    if differing:
-        raise InputError(f"{path}: holds records of something else ({differing}); give the same options or another folder")
-    if lines and not lines[-1].endswith("\n"):
-        write_text(path, head + "".join(lines[:-1]))
-        lines.pop()
-    yield there
-    yield from map(json.loads, lines)
-    with path.open("a", encoding="utf-8") as file:
-        for record in make(len(lines)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{path}: another run is adding to it; wait for it, or give another folder") from error
+        file.seek(0)
+        lines = file.readlines()
+        if lines and not lines[-1].endswith("\n"):
+            lines.pop()
+            file.truncate(len("".join(lines).encode()))
+        if not lines:
+            lines = [json.dumps({**asked, "commit": git_commit()}) + "\n"]
+            file.write(lines[0])
+            file.flush()
+        head, *records = map(json.loads, lines)
+        differing = ", ".join(key for key, value in asked.items() if head.get(key) != value)
+        if differing:
+            raise InputError(f"{path}: holds records of something else ({differing}); give the same options or another folder")
+        yield head
+        yield from records
+        for record in make(len(records)):
             file.write(json.dumps(record) + "\n")
             file.flush()
             yield record

@@ -137,6 +137,8 @@ def test_records_are_made_once(tmp_path: Path) -> None:
     first = recorded(path, {"seed": 1}, make)
     assert next(first)["seed"] == 1
     assert [next(first), next(first)] == [0, 1]
+    with pytest.raises(InputError, match="another run is adding to it"):
+        next(recorded(path, {"seed": 1}, make))
     first.close()
     path.write_text(path.read_text()[:-1])
     assert list(recorded(path, {"seed": 1}, make))[1:] == [0, 1, 2]
