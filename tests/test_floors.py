@@ -10,7 +10,7 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "config", "files", "learning", "resources", "runner", "runner_ray"},
+    0: {"assets", "catalogue", "config", "files", "learning", "records", "resources", "runner", "runner_ray"},
     1: {"grammar"},
     2: {"fast", "scenes"},
     3: {"export", "simulation"},
