@@ -11,6 +11,7 @@ the sets given as --not-in, up to symmetry.
 
 import itertools
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
@@ -83,16 +84,20 @@ class GraphJudge:
         return {"fast": True, "fell": None, "rules": scene.derivation, "form": form, "hidden": len(drake.hidden)}
 
 
-def graph_of(record: dict[str, Any]) -> SetScene | None:
-    """The graph of what `GraphJudge` said; None if it is stable for neither or hides nothing."""
-    return SetScene(tuple(record["rules"]), record["form"], record["hidden"]) if record.get("hidden") else None
+def graphs_of(records: Iterable[dict[str, Any]], fell: Counter[str]) -> Iterator[SetScene]:
+    """The graphs of what `GraphJudge` said that are stable and hide something; counts in `fell` how others fell in Drake."""
+    for record in records:
+        if record.get("fell"):
+            fell[record["fell"]] += 1
+        if record.get("hidden"):
+            yield SetScene(tuple(record["rules"]), record["form"], record["hidden"])
 
 
-def without_repeats(scenes: Iterable[SetScene | None], taken: set[str]) -> Iterator[SetScene]:
+def without_repeats(scenes: Iterable[SetScene], taken: set[str]) -> Iterator[SetScene]:
     """Those whose form is not taken, each form once."""
     taken = set(taken)
     for scene in scenes:
-        if scene is not None and scene.form not in taken:
+        if scene.form not in taken:
             taken.add(scene.form)
             yield scene
 
@@ -123,9 +128,11 @@ def main(
             asdict(job),
             lambda done: map_ordered(partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers),
         )
-        next(judged)  # the head
-        fitting = itertools.islice(without_repeats(map(graph_of, judged), taken), count)
+        about["commit"] = next(judged)["commit"]  # at which they were judged
+        fell = Counter[str]()
+        fitting = itertools.islice(without_repeats(graphs_of(judged, fell), taken), count)
         found = list(track(fitting, out.stem, total=count, console=console))
+        about["fell_in_drake"] = dict(fell)
         judged.close()
     while frozen and len(found) < count and drawn < MOST_DRAWS * count:
         drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
