@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -13,11 +15,11 @@ import torch
 from conftest import CATALOGUE, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
-from drake_clutter.agents.actor_critic import advantage
+from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
 from drake_clutter.agents.cloning import Cloning, CloningConfig
 from drake_clutter.agents.exploration import make_explorers, play
 from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
-from drake_clutter.agents.explorer_network import ExplorerNetwork
+from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -60,6 +62,20 @@ def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -
 def test_it_is_a_gymnasium_environment(file: Path) -> None:
     environment = gymnasium.make("drake_clutter.tasks:ClutterExploration-v0", scenes=file, max_moves=4)
     check_env(environment.unwrapped, skip_render_check=True)
+
+
+def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) -> None:
+    """One object is put on the tray again and again."""
+    environment = gymnasium.make("drake_clutter.tasks:ClutterExploration-v0", scenes=str(file), max_moves=40).unwrapped
+    assert isinstance(environment, ClutterExploration)
+    observation, _ = environment.reset(options={"scene": 1})
+    picked = 0
+    while environment.task.end is None and (moves := np.flatnonzero(observation["allowed"][:, 0])).size:
+        least = observation["feature"][:, FEATURES.index("z")][moves].argmin()
+        observation, *_ = environment.step((moves[least], 0))
+        picked += 1
+        assert environment.observation_space.contains(observation)
+    assert observation["feature"][:, FEATURES.index("times_picked")].max() == 10, picked
 
 
 @pytest.mark.parametrize("privileged", [False, True])
@@ -125,11 +141,12 @@ def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
 
 
 def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -> None:
-    environment = ClutterExploration(scenes)
+    environment = ClutterExploration(replace(scenes, scenes=(scenes.scenes[1],)))
     starts: list[dict[str, Pose]] = []
-    for options in (None, None, {"scene": 1}, {"scene": 1}):
+    for options in (None, None, {"scene": 0}, {"scene": 0}):
         environment.reset(seed=len(starts), options=options)
         starts.append(environment.task.start.poses)
+    assert starts[0].keys() == starts[1].keys()
     assert starts[0] != starts[1]
     assert starts[2] == starts[3]
     assert [p.p for p in starts[2].values()] == [pytest.approx(p.p, abs=1e-6) for p in random_scene(10, 16, 20).poses.values()]
@@ -145,6 +162,48 @@ def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
 
 
 # --- Learning ---
+
+
+def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneSet) -> None:
+    """Of four episodes, all moves of two are called good, and all of the others bad."""
+    environment = ClutterExploration(scenes, privileged=True, max_moves=4)
+    learner = ActorCritic(environment, ActorCriticConfig(width=8, learning_rate=0.01), 0, torch.device("cpu"))
+    rng = np.random.default_rng(0)
+    played = play_episodes(environment, 4, (0,), acting(learner.network, rng))
+    for number, episode in enumerate(played):
+        episode.rewards = [1.0 if number < 2 else -1.0] * len(episode.moves)
+        episode.notes = [(chance, 0.0) for chance, _ in episode.notes]
+
+    def lead() -> float:
+        good, bad = likelihood(learner.network, played[:2]), likelihood(learner.network, played[2:])
+        return good - bad
+
+    before = lead()
+    learner.learn(played, rng)
+    assert lead() > before + 0.05
+
+
+@pytest.mark.parametrize("dagger", [False, True])
+def test_a_clone_does_more_and_more_what_its_teacher_would(dagger: bool, scenes: SceneSet) -> None:
+    environment = ClutterExploration(scenes, max_moves=5)
+    torch.manual_seed(3)
+    teacher = ExplorerNetwork(len(environment.numbers), 8)
+    config = CloningConfig(width=8, rounds=3, episodes=4, updates=60, batch=16, learning_rate=0.01, dagger=dagger)
+    learner, fresh = (Cloning(environment, teacher, config, 0, torch.device("cpu")) for _ in range(2))
+    first, second = learner.advance(), learner.advance()
+    for played, student_plays in ((first, False), (second, dagger)):
+        differs = [(move != note).any() for episode in played for move, note in zip(episode.moves, episode.notes, strict=True)]
+        assert any(differs) == student_plays
+        wanted = [replace(episode, moves=episode.notes) for episode in played]
+        assert likelihood(learner.network, wanted) > likelihood(fresh.network, wanted) + 0.5
+
+
+def likelihood(network: ExplorerNetwork, played: Sequence[Played]) -> float:
+    """The mean log-probability of the moves."""
+    with torch.no_grad():
+        found = network(stacked_graphs([observation for episode in played for observation in episode.observations]))
+        moves = torch.from_numpy(np.array([move for episode in played for move in episode.moves]))
+        return float(log_probability(found, network.places(found, moves[:, 0]), moves).mean())
 
 
 def test_episodes_are_the_same_for_the_same_seed(scenes: SceneSet) -> None:

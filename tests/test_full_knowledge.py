@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.runner import item_rng
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
@@ -188,6 +189,25 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     if (solution.answer, solution.moves_tried) != (Solvability.UNDECIDED, 0):
         pytest.fail("the fast judge could tell", pytrace=False)
     assert solution.at_least <= 1
+
+
+# --- What the search does not take, or is not to try ---
+
+
+def test_no_plan_begins_with_what_has_failed() -> None:
+    scene = scene_of(*covered(), IN_VIEW)
+    (first,) = SEARCH.solve(scene).plan
+    (other,) = SEARCH.solve(scene, failed=[first]).plan
+    assert (first.pick, other.pick) == ("cover", "cover")
+    assert other.place != first.place
+    nothing_left = [Move(name, place) for name in scene.names for place in (TRAY, *scene.names)]
+    assert SEARCH.solve(scene, failed=nothing_left).plan == ()
+
+
+def test_more_objects_than_the_search_takes() -> None:
+    markers = [resting("large_marker", xy=(0.01 * (k % 8), 0.1 * (k // 8)), name=f"m{k}") for k in range(65)]
+    with pytest.raises(InputError, match="objects: 65; allowed are 64 at most"):
+        SEARCH.solve(scene_of(*markers))
 
 
 # --- Against trying everything ---

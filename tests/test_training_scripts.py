@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import pytest
@@ -27,7 +28,7 @@ def result(ended: str, hidden: int, found_after: tuple[int, ...], not_carried_ou
 
 
 def test_a_row_of_the_table() -> None:
-    """By hand: one within 10 moves, one within 20, a collapse after two, and one that finds a part."""
+    """By hand: one within 10 moves, one within 20, a collapse after two, and one that finds nothing."""
     results = [
         result(ALL, 2, (1, 2)),
         result(ALL, 3, (0,) * 10 + (1, 3), not_carried_out=3),
@@ -48,6 +49,14 @@ def test_a_row_of_the_table() -> None:
     assert (row["moves_to_ceiling"], row["both_with_ceiling"]) == (14 / 4, 2)
 
 
+@pytest.mark.parametrize(("moves", "in_10", "in_20"), [(10, 0.5, 0.5), (11, 0, 0.5), (20, 0, 0.5)])
+def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
+    results = [result(ended, 1, (0,) * (moves - 1) + (1,)) for ended in (ALL, COLLAPSED)]
+    row = training_script("explorer_results").row_of(results, {})
+    told = {limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")] for limit in (10, 20)}
+    assert told == {10: [in_10, in_10, 2 * in_10], 20: [in_20, in_20, 2 * in_20]}
+
+
 def test_episodes_are_played_once(tmp_path: Path) -> None:
     """And those that are there are not taken for others."""
     script = training_script("explorer_results")
@@ -63,21 +72,39 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
         script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
     with pytest.raises(InputError, match="--out: is missing"):
         script.main(tmp_path, only="sg_star_25", agents=["random"])
+    with pytest.raises(InputError, match="--out: is missing"):
+        script.main(only="sg_star_10", count=1)
     with pytest.raises(InputError, match="--only none"):
         script.main(tmp_path, only="none", out=tmp_path / "table.json")
+
+
+def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
+    script, out = training_script("explorer_results"), tmp_path / "table.json"
+    for agents, told in (
+        (["random", "missing.safetensors"], r"missing\.safetensors: cannot be read"),
+        (["random", "student"], "was not trained with cereal_box_large"),
+    ):
+        with pytest.raises(InputError, match=told):
+            script.main(tmp_path / "episodes", only="sg_14", count=1, agents=agents, out=out)
+    out.write_text('{"rows": []}')
+    with pytest.raises(InputError, match=r"--out .*table\.json: is no file of results \('seed'\)"):
+        script.main(tmp_path / "episodes", only="sg_14", count=1, agents=["random"], out=out)
+    assert list((tmp_path / "episodes").iterdir()) == []
 
 
 def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -> None:
     script, out = training_script("explorer_results"), tmp_path / "table.json"
     options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "equilibrium", "out": out}
-    for agent, count in (("largest-clear", 1), ("student", 2)):
-        script.main(tmp_path, agents=[agent], count=count, **options)
+    script.main(tmp_path, agents=["largest-clear"], count=1, **options)
+    yardstick = tmp_path / "sg_star_10_largest-clear.jsonl"
+    whole = yardstick.read_text()
+    yardstick.write_text(whole + '{"scene": ')  # it was killed while it wrote the second
+    script.main(tmp_path, agents=["student"], count=2, **options)
     clear, student = json.loads(out.read_text())["rows"]
     assert (clear["moves_to_largest_clear"], clear["both_with_largest_clear"], clear["episodes"]) == (1, 1, 1)
     assert (student["both_with_largest_clear"], student["episodes"]) == (1, 2)
     assert "moves_to_ceiling" not in student, "nobody has played that"
-    lines = (tmp_path / "sg_star_10_largest-clear.jsonl").read_text().splitlines()
-    assert len(lines) == 2, "and nothing is played for it"
+    assert yardstick.read_text() == whole, "and nothing is played for it"
 
 
 def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
@@ -121,6 +148,24 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(monkeypatch: pyt
     fell = Counter[str]()
     assert list(script.graphs_of([record], fell)) == []
     assert fell == {"toppled": 1}
+
+
+@pytest.mark.parametrize(("frozen", "told"), [(False, r"something else \(weights\)"), (True, "scenes of other options")])
+def test_a_set_goes_on_with_the_weights_that_it_began_with(frozen: bool, told: str, tmp_path: Path) -> None:
+    script, agent = training_script("make_scenes"), tmp_path / "agent.safetensors"
+    options = {"agent": str(agent), "nodes": 10, "work": tmp_path / "work", "count": 1, "frozen": frozen}
+
+    checkpoints = Path(script.__file__).parent / "checkpoints"
+
+    def take(shipped: str) -> None:
+        for suffix in (".safetensors", ".json"):
+            copyfile(checkpoints / f"{shipped}{suffix}", agent.with_suffix(suffix))
+
+    take("sg")
+    script.main(tmp_path / "set.json", **options)
+    take("sg_star")
+    with pytest.raises(InputError, match=told):
+        script.main(tmp_path / "set.json", **options)
 
 
 def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:

@@ -21,9 +21,10 @@ from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResul
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
+from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import recorded
-from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.resources import git_commit
 from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
@@ -43,9 +44,8 @@ TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", 
 def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
     """The episodes of an agent on a set's first scenes; those that the file has not got are played, and written as they end."""
     config = ClutterConfig()
-    asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
+    asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent, TRAINED)}
     asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
-    make_explorers(agent, config)  # says what is wrong before anything is played
     commit = git_commit()
 
     def play(done: int) -> Iterator[dict[str, Any]]:
@@ -63,16 +63,9 @@ def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
     return EpisodeResult(**fields | {"found_after": tuple(fields["found_after"])})
 
 
-def weights_of(agent: str) -> str:
-    """The hash of a trained agent's weights; "" for the others."""
-    if agent not in TRAINED and not agent.endswith(".safetensors"):
-        return ""
-    return sha256_of(shipped_path(TRAINED[agent]) if agent in TRAINED else Path(agent))
-
-
 def file_of(folder: Path, name: str, agent: str) -> Path:
     """Of an agent's episodes on a set."""
-    told = f"{Path(agent).stem}_{weights_of(agent)[:8]}" if agent.endswith(".safetensors") else agent
+    told = f"{Path(agent).stem}_{weights_of(agent, TRAINED)[:8]}" if agent.endswith(".safetensors") else agent
     return folder / f"{name}_{told}.jsonl"
 
 
@@ -93,21 +86,31 @@ def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[Episo
     return row
 
 
-def add_rows(path: Path, held: dict[str, Any], rows: Sequence[dict[str, Any]]) -> None:
-    """Writes the rows into a file of results, in the place of those of the same sets and agents.
+def rows_there(path: Path, held: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a file of results; none if there is no such file.
 
     Raises:
-        InputError: the file's were measured otherwise.
+        InputError: they were measured otherwise, or it is another file.
     """
-    kept = []
-    if path.exists():
+    try:
         there = json.loads(path.read_text())
-        if any(there[key] != value for key, value in held.items()):
-            raise InputError(f"{path}: holds rows of other chances, fidelity or config; give another file as --out")
-        new = {(row["set"], row["agent"]) for row in rows}
-        kept = [row for row in there["rows"] if (row["set"], row["agent"]) not in new]
+        rows: list[dict[str, Any]] = there["rows"]
+        same = all(there[key] == value for key, value in held.items())
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"--out {path}: is no file of results ({error}); allowed is one, or a new file") from error
+    if not same:
+        raise InputError(f"--out {path}: holds rows of other chances, fidelity or config; give another file")
+    return rows
+
+
+def add_rows(path: Path, held: Mapping[str, Any], rows: Sequence[dict[str, Any]]) -> None:
+    """Writes the rows into a file of results, in the place of those of the same sets and agents."""
+    new = {(row["set"], row["agent"]) for row in rows}
+    kept = [row for row in rows_there(path, held) if (row["set"], row["agent"]) not in new]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, held | {"rows": sorted([*kept, *rows], key=lambda row: row["set"])})
+    write_json(path, {**held, "rows": sorted([*kept, *rows], key=lambda row: row["set"])})
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
@@ -139,8 +142,10 @@ def main(
     """Measures what is missing and prints the table."""
     if folder == RESULTS / "episodes" and fidelity != "settle":
         raise InputError(f"DIR: {folder}: is for episodes under settle; give another folder")
-    if out is None and (agents or fidelity != "settle"):
-        raise InputError("--out: is missing; the published tables are all agents', under settle: give a file for others")
+    if out is None and (agents or count or fidelity != "settle"):
+        raise InputError(
+            "--out: is missing; the published tables are all agents' on all scenes under settle: give a file for others"
+        )
     if fidelity not in EXECUTORS:
         raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(EXECUTORS)}")
     folder.mkdir(parents=True, exist_ok=True)
@@ -148,9 +153,14 @@ def main(
     names = [name for name in TABLES if only is None or only in name]
     if not names:
         raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
-    for name in names:
+    held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
+    sets = {name: load_scene_set(SCENES / f"{name}.json", catalogue) for name in names}
+    for name, scenes in sets.items():  # says what is wrong before anything is played
+        rows_there(out or RESULTS / f"{TABLES[name][0]}.json", held)
+        for agent in agents or TABLES[name][1]:
+            make_explorers(agent, ClutterConfig(), [c.name for c in scenes.classes])
+    for name, scenes in sets.items():
         table, agents_of_table = TABLES[name]
-        scenes = load_scene_set(SCENES / f"{name}.json", catalogue)
         number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or agents_of_table
         found = {agent: played(scenes, agent, number, fidelity, seed, workers, file_of(folder, name, agent)) for agent in chosen}
@@ -158,18 +168,17 @@ def main(
         for label, agent in COMPARED.items():
             path = file_of(folder, name, agent)
             if path.exists():  # what the yardstick has played; nothing is played for it
-                there = min(number, len(path.read_text().splitlines()) - 1)
+                there = min(number, path.read_text().count("\n") - 1)
                 others[label] = played(scenes, agent, there, fidelity, seed, workers, path)
         solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
         rows = []
         for agent in chosen:
-            row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent)}
+            row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent, TRAINED)}
             row |= row_of(found[agent], others) | {"commits": commits_of(file_of(folder, name, agent), number)}
             part = [found[agent][k] for k in solvable]
             compared = {label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()}
             row["solvable"] = row_of(part, compared) if part else None
             rows.append(row)
-        held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
         add_rows(out or RESULTS / f"{table}.json", held, rows)
         shown += rows
     Console(width=150).print(table_of(shown))

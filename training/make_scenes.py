@@ -13,7 +13,6 @@ import itertools
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -125,7 +124,7 @@ def main(
     if not frozen:
         judged = recorded(
             work / JUDGED,
-            asdict(job),
+            job.fields,
             lambda done: map_ordered(partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers),
         )
         about["commit"] = next(judged)["commit"]  # at which they were judged

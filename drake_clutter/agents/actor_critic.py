@@ -4,6 +4,7 @@ Every round plays fresh episodes to their ends with the present policy, whose se
 between two rounds is the network, its optimiser and the number of rounds.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,12 +70,13 @@ class ActorCritic:
         """One round; returns its episodes."""
         rng = item_rng(self._seed, 1, self._round)
         played = play_episodes(self._environment, self.config.episodes, (self._seed, 2, self._round), acting(self.network, rng))
-        self._learn(played, rng)
+        self.learn(played, rng)
         self.step += sum(len(episode.moves) for episode in played)
         self._round += 1
         return played
 
-    def _learn(self, played: list[Played], rng: np.random.Generator) -> None:
+    def learn(self, played: Sequence[Played], rng: np.random.Generator) -> None:
+        """Takes its passes over the moves of episodes that the network has played, noted as by `acting`; `rng` orders them."""
         config = self.config
         moves = torch.from_numpy(np.array([move for episode in played for move in episode.moves]))
         before = torch.tensor([chance for episode in played for chance, _ in episode.notes])

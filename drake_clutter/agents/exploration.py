@@ -98,7 +98,9 @@ class FullKnowledge:
         """
         in_view = {TRAY, *(d.name for d in observation.detections)}
         if not self._plan or failed or not {self._plan[0].pick, self._plan[0].place} <= in_view:
-            found = self._search.solve(self._task.scene, budget=self.BUDGET, known=self._task.known, rng=rng)
+            found = self._search.solve(
+                self._task.scene, budget=self.BUDGET, known=self._task.known, rng=rng, failed=self._task.failed
+            )
             self._plan = list(found.plan)
         return Decision(self._plan.pop(0) if self._plan else None)
 
@@ -124,15 +126,16 @@ TRAINED = {
 FULL_KNOWLEDGE = "full-knowledge"
 
 
-def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
+def make_explorers(name: str, config: ClutterConfig, classes: Collection[str] = ()) -> ExplorerMaker:
     """What makes an explorer for each episode.
 
     Args:
         name: one of `BASELINES`, of `TRAINED`, `FULL_KNOWLEDGE`, or the file of a checkpoint.
         config: the world.
+        classes: names of the object classes that it will meet, as far as that is known.
 
     Raises:
-        InputError: no such explorer, or a file that is no checkpoint of one.
+        InputError: no such explorer, a file that is no checkpoint of one, or one that has not learned one of the classes.
     """
     if name in BASELINES:
         return lambda _: BASELINES[name]()
@@ -145,7 +148,7 @@ def make_explorers(name: str, config: ClutterConfig) -> ExplorerMaker:
     path = checkpoint_path(name, TRAINED)
     from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
-    return LearnedExplorers(path, config.exploration)
+    return LearnedExplorers(path, config.exploration, classes)
 
 
 def play(

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
-from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.learning.shipped import checkpoint_path, weights_of
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
@@ -130,6 +130,13 @@ class GenerationJob:
     seed: int
     config: ClutterConfig
     temperature: float | None = None
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The same for JSON, with the hash of a trained agent's weights: all that decides what the scenes are."""
+        folder = str(self.catalogue_folder.resolve()) if self.catalogue_folder else None
+        weights = {"weights": found} if (found := weights_of(self.agent, TRAINED)) else {}
+        return {**asdict(self), **weights, "catalogue_folder": folder}
 
 
 @dataclass(frozen=True)

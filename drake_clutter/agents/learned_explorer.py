@@ -56,6 +56,12 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
     return made.eval(), numbers
 
 
+def _refuse_unknown(classes: Collection[str], numbers: Collection[str], path: Path) -> None:
+    unknown = sorted(set(classes) - set(numbers))
+    if unknown:
+        raise InputError(f"--agent {path}: was not trained with {', '.join(unknown)}; train one with your objects")
+
+
 class LearnedExplorer:
     """Takes the likeliest pick and place for which there is room (an `Explorer`); one instance plays one episode."""
 
@@ -93,9 +99,7 @@ class LearnedExplorer:
         self, shown: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], failed: Collection[Move]
     ) -> Decision:
         """The same for given objects: what is remembered is the caller's business."""
-        unknown = sorted({o.object_class.name for o in shown} - set(self._numbers))
-        if unknown:
-            raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
+        _refuse_unknown({o.object_class.name for o in shown}, self._numbers, self._path)
         graph = exploration_graph(shown, observation, tried, self._numbers, failed)
         allowed, names = graph["allowed"], tuple(o.name for o in shown)
         some = np.random.default_rng(0)  # it decides where, not whether
@@ -120,19 +124,21 @@ class LearnedExplorers:
         privileged: whether it knows everything.
     """
 
-    def __init__(self, path: Path, config: ExplorationConfig) -> None:
+    def __init__(self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()) -> None:
         """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
 
         Args:
             path: of the checkpoint.
             config: how objects are put down.
+            classes: names of those that it will meet, as far as that is known.
 
         Raises:
-            InputError: it cannot be read, or is none of an explorer.
+            InputError: it cannot be read, is none of an explorer, or has not learned one of the classes.
         """
         self._path, self._config = path, config
         checkpoint = load_checkpoint(path)
         self._network, self._numbers = load_explorer(checkpoint, path)
+        _refuse_unknown(classes, self._numbers, path)
         self.privileged = checkpoint.about["kind"] == TEACHER
 
     def __call__(self, task: ExplorationTask) -> LearnedExplorer:

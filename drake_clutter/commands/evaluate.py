@@ -1,7 +1,7 @@
 """`drake-clutter evaluate`: explorers on scenes at rest that hide something."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,22 @@ def limits(max_moves: int) -> list[int]:
     return sorted({min(_READ_AT, max_moves), max_moves})
 
 
-def playable(named: str, catalogue_folder: Path | None) -> list[tuple[Path, int | None]]:
+@dataclass(frozen=True)
+class PlayableScene:
+    """A scene at rest that hides something.
+
+    Attributes:
+        file: a scene file, or a set.
+        number: in the set; None for a scene file.
+        classes: names of those that its objects may have.
+    """
+
+    file: Path
+    number: int | None
+    classes: frozenset[str]
+
+
+def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
     """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set with each number.
 
     Args:
@@ -42,20 +57,26 @@ def playable(named: str, catalogue_folder: Path | None) -> list[tuple[Path, int 
             raise InputError(f"--scenes {named}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}")
         scenes = sets[named]
     if scenes.is_file():
-        return [(scenes, number) for number in range(len(load_scene_set(scenes, catalogue).scenes))]
+        held = load_scene_set(scenes, catalogue)
+        classes = frozenset(c.name for c in held.classes)
+        return [PlayableScene(scenes, number, classes) for number in range(len(held.scenes))]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
             f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote, or a set of scenes"
         )
-    found = [path for path in paths if (verdict := load_scene(path, catalogue).verdict) is not None and verdict.hidden]
+    found = []
+    for path in paths:
+        file = load_scene(path, catalogue)
+        if file.verdict is not None and file.verdict.hidden:
+            found.append(PlayableScene(path, None, frozenset(o.object_class.name for o in file.scene.objects)))
     if not found:
         raise InputError(f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes")
-    return [(path, None) for path in found]
+    return found
 
 
 def evaluate(
-    scenes: Sequence[tuple[Path, int | None]],
+    scenes: Sequence[PlayableScene],
     agents: Sequence[str],
     max_moves: int,
     fidelity: str,
@@ -67,22 +88,31 @@ def evaluate(
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
     ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Plays every agent on every scene; `out`: JSON with the rows, every episode, and commit and hashes of the scenes."""
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}; give a file in one that exists")
+    """Plays every agent on every scene; `out`: JSON with the rows, every episode, and commit and hashes of the scenes.
+
+    Rows are of the scenes that hide something as the config's camera sees them.
+
+    Raises:
+        InputError: an agent that there is not or that does not know the objects, no place for `out`, or nothing is hidden.
+    """
+    if out is not None and (out.is_dir() or not out.parent.is_dir()):
+        raise InputError(f"--out {out}: is a folder, or in none; allowed is a file in a folder that exists")
+    agents, classes = list(dict.fromkeys(agents)), frozenset[str]().union(*(scene.classes for scene in scenes))
     for agent in agents:
-        make_explorers(agent, config)  # says what is wrong before anything is played
-    episodes = [Episode(*scene, agent, index) for agent in agents for index, scene in enumerate(scenes)]
+        make_explorers(agent, config, classes)  # says what is wrong before anything is played
+    episodes = [Episode(scene.file, scene.number, agent, index) for agent in agents for index, scene in enumerate(scenes)]
     make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
-    results = list(progress(played, len(episodes)))
+    results = [result for result in progress(played, len(episodes)) if result.hidden]
+    if not results:
+        raise InputError(f"--scenes: none of {len(scenes)} hides anything from the camera of --config; give scenes that do")
     rows = [
         {"agent": agent} | summarise_episodes([result for result in results if result.agent == agent], limits(max_moves))
         for agent in agents
     ]
     if out is None:
         return rows
-    files = sorted({path for path, _ in scenes})
+    files = sorted({scene.file for scene in scenes})
     fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
     fields |= {"commit": git_commit(), "scenes": {str(file): sha256_of(file) for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})

@@ -37,11 +37,6 @@ class _Factory:
         return SceneGenerator(self.job)
 
 
-def _job_fields(job: GenerationJob) -> dict[str, Any]:
-    folder = str(job.catalogue_folder.resolve()) if job.catalogue_folder else None
-    return {**asdict(job), "catalogue_folder": folder}
-
-
 def generate(
     job: GenerationJob,
     count: int,
@@ -78,13 +73,13 @@ def generate(
     output_directory(out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES}))
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
-        if earlier != json.loads(json.dumps(_job_fields(job))):
+        if earlier != json.loads(json.dumps(job.fields)):
             raise InputError(
                 f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
             )
     else:
         output_directory(out)
-        write_json(out / JOB_FILE, _job_fields(job))
+        write_json(out / JOB_FILE, job.fields)
     (out / SCENES).mkdir(exist_ok=True)
     paths = [out / SCENES / f"{index:04d}.yaml" for index in range(count)]
     # Scenes are written in order, so what is there is a beginning.

@@ -7,10 +7,10 @@ import yaml
 
 from drake_clutter.commands.explore import Report, carry_out, write_episode
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, write_json, write_text
+from drake_clutter.files import write_json, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.full_knowledge import MOST_OBJECTS, FullKnowledgeSearch, Solvability
+from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 
 
 def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: ClutterConfig, report: Report) -> dict[str, Any]:
@@ -31,8 +31,6 @@ def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: Cl
     Raises:
         InputError: the scene has more objects than the search takes.
     """
-    if len(scene.objects) > MOST_OBJECTS:
-        raise InputError(f"{name}: objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most")
     solution = FullKnowledgeSearch(config).solve(scene, seed, budget)
     fields: dict[str, Any] = {
         "answer": solution.answer.value,

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, sha256_of
 from drake_clutter.resources import shipped_path
 
 
@@ -25,3 +25,18 @@ def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
         return shipped_path(shipped[name]) if name in shipped else Path(name)
     except FileNotFoundError as error:
         raise InputError(f"--agent {name}: {error}; train it with the scripts of training/, and give its file") from error
+
+
+def weights_of(name: str, shipped: Mapping[str, str]) -> str:
+    """The hash of a trained agent's weights; "" for an agent that has none. Arguments as for `checkpoint_path`.
+
+    Raises:
+        InputError: they cannot be read.
+    """
+    if name not in shipped and not name.endswith(".safetensors"):
+        return ""
+    path = checkpoint_path(name, shipped)
+    try:
+        return sha256_of(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed is a checkpoint") from error

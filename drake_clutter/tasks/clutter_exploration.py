@@ -15,7 +15,7 @@ from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
 from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, exploration_graph, seen
+from drake_clutter.tasks.exploration_graph import BOUND, EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, exploration_graph, seen
 
 TRAINING_SET = "training/scenes/train_sg_star.json"
 _TRIES = 100
@@ -33,14 +33,15 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         counts as one of `max_moves`.
     Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`, or when
         no move is left that has not failed.
-    The `info` of a step has the `step` (a `tasks.exploration.Step`) and, when the episode is over, the `end`.
+    The `info` of a step has the `step` (a `tasks.exploration.Step`), if the move was allowed, and, when the episode is over, the
+    `end`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
 
     def __init__(
         self,
-        scenes: SceneSet | Path | None = None,
+        scenes: SceneSet | Path | str | None = None,
         *,
         privileged: bool = False,
         fidelity: str = "fast",
@@ -59,7 +60,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             config: the world.
         """
         if not isinstance(scenes, SceneSet):
-            scenes = load_scene_set(shipped_path(TRAINING_SET) if scenes is None else scenes, load_catalogue())
+            scenes = load_scene_set(shipped_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue())
         self._config, self._privileged, self.scenes = config or ClutterConfig(), privileged, scenes
         self._max_moves = max_moves or self._config.exploration.max_moves
         self._nodes = most_objects + 1
@@ -73,10 +74,10 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.numbers), (n,), np.int8),
-            "feature": box(-10, 10, (n, len(FEATURES)), np.float32),
+            "feature": box(-BOUND, BOUND, (n, len(FEATURES)), np.float32),
             "edge": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
-            "glob": box(0, 10, (len(GLOBALS),), np.float32),
+            "glob": box(0, BOUND, (len(GLOBALS),), np.float32),
             "allowed": box(0, 1, (n, n), np.int8),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]

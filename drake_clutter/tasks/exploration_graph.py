@@ -30,6 +30,8 @@ it without touching it, is beside it, or is further away."""
 GLOBALS = ("moves_made",)
 """Of the graph, in `_MANY_MOVES`."""
 
+BOUND = 10.0
+"""That no number of the graph exceeds."""
 _LENGTH, _MANY_PICKS, _MANY_MOVES = 0.35, 3.0, 20.0
 _OVERLAP = 0.003
 """m, by which two outlines overlap at least, seen from above, for one object to be above the other."""
@@ -106,7 +108,7 @@ def exploration_graph(
                 share,
                 above[k].any(),
                 max(0.0, low[k] - floor[k] - _TOUCHING) / _LENGTH,
-                picks / _MANY_PICKS,
+                min(BOUND, picks / _MANY_PICKS),
             )
         # From the lower to the upper; of equally low ones, in an order that does not depend on theirs.
         order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], low))
@@ -125,7 +127,7 @@ def exploration_graph(
         node = {TRAY: 0} | {o.name: k for k, o in enumerate(objects, start=1)}
         for move in failed:
             allowed[node[move.pick], node[move.place]] = 0
-    glob = np.array([len(tried) / _MANY_MOVES], np.float32)
+    glob = np.array([min(BOUND, len(tried) / _MANY_MOVES)], np.float32)
     return {
         "node_kind": kind,
         "feature": feature,

@@ -15,6 +15,7 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.fast.judge import FastJudge
+from drake_clutter.files import InputError
 from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult, Observation
@@ -111,6 +112,7 @@ class FullKnowledgeSearch:
         fewest: bool = True,
         known: Collection[str] = (),
         rng: np.random.Generator | None = None,
+        failed: Collection[Move] = (),
     ) -> Solution:
         """The fewest moves for a scene at rest.
 
@@ -121,7 +123,14 @@ class FullKnowledgeSearch:
             fewest: whether to look for a shorter plan when there is one.
             known: what has been in view before.
             rng: in place of the seed: as it will be when the plan is carried out. It is left as it is.
+            failed: moves that turned out impossible in this scene; no plan begins with one of them.
+
+        Raises:
+            InputError: the scene has more objects than the search takes.
         """
+        if len(scene.objects) > MOST_OBJECTS:
+            raise InputError(f"objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most, for a full-knowledge search")
+        self._failed = failed
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
         fixed = self._judge.never_movable(scene)
@@ -234,6 +243,8 @@ class FullKnowledgeSearch:
         for moves in self._moves(state, only_blockers or tight):
             children = []
             for move in moves:
+                if depth == 0 and move in self._failed:
+                    continue
                 child = self._after(state, move)
                 if child is not None and depth + 1 + child.at_least <= limit:
                     children.append((move, child))
