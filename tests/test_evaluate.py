@@ -32,7 +32,7 @@ def test_an_agent_that_is_named_twice_plays_once() -> None:
 
 
 def test_a_set_that_there_is_not() -> None:
-    with pytest.raises(InputError, match="--scenes sg_star_9: is not there; allowed are .*sg_star_25"):
+    with pytest.raises(InputError, match=r"--scenes sg_star_9: is not there; allowed are .*sg_star_25"):
         playable("sg_star_9", None)
 
 
