@@ -155,7 +155,7 @@ def test_a_set_goes_on_with_the_weights_that_it_began_with(frozen: bool, told: s
     script, agent = training_script("make_scenes"), tmp_path / "agent.safetensors"
     options = {"agent": str(agent), "nodes": 10, "work": tmp_path / "work", "count": 1, "frozen": frozen}
 
-    checkpoints = Path(script.__file__).parent / "checkpoints"
+    checkpoints = Path(__file__).parents[1] / "training" / "checkpoints"
 
     def take(shipped: str) -> None:
         for suffix in (".safetensors", ".json"):
