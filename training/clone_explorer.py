@@ -12,44 +12,28 @@ from typing import Annotated
 import typer
 
 from drake_clutter.agents.cloning import Cloning, CloningConfig
-from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
+from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.config import load_typed
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.scenes.scene_set import load_scene_set
-from drake_clutter.tasks.clutter_exploration import ClutterExploration
-
-CHECKPOINT = "explorer.safetensors"
 
 
 @dataclass
-class CloneExplorer:
-    """A training.
+class CloneExplorer(ExplorerTraining):
+    """A training, see `ExplorerTraining`.
 
     Attributes:
         teacher: its checkpoint.
-        scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
-        seed: same seed, same weights (on the same kind of machine).
-        fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
-        evaluate_every: rounds; evaluation_episodes: that are then played with the likeliest moves.
-        learning, world: see there.
+        evaluate_every: rounds.
+        learning: see there.
     """
 
     teacher: str = "training/checkpoints/teacher.safetensors"
-    scenes: str = "training/scenes/train_sg_star.json"
-    catalogue: str = ""
-    seed: int = 0
-    fidelity: str = "equilibrium"
-    max_moves: int = 20
-    most_objects: int = 24
     evaluate_every: int = 5
-    evaluation_episodes: int = 200
     learning: CloningConfig = field(default_factory=CloningConfig)
-    world: ClutterConfig = field(default_factory=ClutterConfig)
 
 
 def main(
@@ -62,10 +46,7 @@ def main(
     given = load_typed(CloneExplorer(), config, settings or [])
     one_thread_per_operation()
     chosen = device_of(device)
-    scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    environment = ClutterExploration(
-        scenes, fidelity=given.fidelity, config=given.world, max_moves=given.max_moves, most_objects=given.most_objects
-    )
+    environment = given.environment()
     teacher, numbers = load_explorer(load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER)
     if numbers != environment.numbers:
         raise InputError(f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}")
@@ -74,8 +55,7 @@ def main(
     while learner.step < given.learning.rounds:
         learner.advance()
         if learner.step == given.learning.rounds or learner.step % given.evaluate_every == 0:
-            episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
-            run.report(figures(episodes), learner.losses)
+            run.report(given.evaluation(environment, learner.network), learner.losses)
             run.save()
     about = {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width)}
     run.finish(CHECKPOINT, learner.network, about)

@@ -13,46 +13,30 @@ from typing import Annotated
 import typer
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
-from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
+from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.config import load_typed
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.scenes.scene_set import load_scene_set
-from drake_clutter.tasks.clutter_exploration import ClutterExploration
-
-CHECKPOINT = "explorer.safetensors"
 
 
 @dataclass
-class TrainExplorer:
-    """A training.
+class TrainExplorer(ExplorerTraining):
+    """A training, see `ExplorerTraining`.
 
     Attributes:
         privileged: whether it sees everything, a teacher; or K_t, a student.
         warm_start: a checkpoint of the same kind to begin with, or "".
-        scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
-        seed: same seed, same weights (on the same kind of machine).
-        fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
-        evaluate_every: moves; evaluation_episodes: that are then played with the likeliest moves.
-        learning, world: see there.
+        evaluate_every: moves.
+        learning: see there.
     """
 
     privileged: bool = True
     warm_start: str = ""
-    scenes: str = "training/scenes/train_sg_star.json"
-    catalogue: str = ""
-    seed: int = 0
-    fidelity: str = "equilibrium"
-    max_moves: int = 20
-    most_objects: int = 24
     evaluate_every: int = 15_000
-    evaluation_episodes: int = 200
     learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
-    world: ClutterConfig = field(default_factory=ClutterConfig)
 
 
 def main(
@@ -64,15 +48,7 @@ def main(
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
     given = load_typed(TrainExplorer(), config, settings or [])
     one_thread_per_operation()
-    scenes = load_scene_set(Path(given.scenes), load_catalogue(Path(given.catalogue) if given.catalogue else None))
-    environment = ClutterExploration(
-        scenes,
-        privileged=given.privileged,
-        fidelity=given.fidelity,
-        config=given.world,
-        max_moves=given.max_moves,
-        most_objects=given.most_objects,
-    )
+    environment = given.environment(privileged=given.privileged)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
     kind = TEACHER if given.privileged else STUDENT
     if given.warm_start:
@@ -87,8 +63,7 @@ def main(
         learner.advance()
         over = learner.step >= given.learning.steps
         if over or learner.step // given.evaluate_every > before // given.evaluate_every:
-            episodes = play_episodes(environment, given.evaluation_episodes, (given.seed, 3), acting(learner.network, None))
-            run.report(figures(episodes), learner.losses)
+            run.report(given.evaluation(environment, learner.network), learner.losses)
             run.save()
     about = {"kind": kind, "network": about_explorer(environment.numbers, given.learning.width)}
     run.finish(CHECKPOINT, learner.network, about)

@@ -1,0 +1,50 @@
+"""What all trainings of explorers have in common: the scenes, the world, and how they are watched."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
+from drake_clutter.agents.explorer_network import ExplorerNetwork
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.tasks.clutter_exploration import ClutterExploration
+
+CHECKPOINT = "explorer.safetensors"
+
+
+@dataclass
+class ExplorerTraining:
+    """A training.
+
+    Attributes:
+        scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
+        seed: same seed, same weights (on the same kind of machine).
+        fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
+        evaluation_episodes: that are played with the likeliest moves, to see how it goes.
+        world: see there.
+    """
+
+    scenes: str = "training/scenes/train_sg_star.json"
+    catalogue: str = ""
+    seed: int = 0
+    fidelity: str = "equilibrium"
+    max_moves: int = 20
+    most_objects: int = 24
+    evaluation_episodes: int = 200
+    world: ClutterConfig = field(default_factory=ClutterConfig)
+
+    def environment(self, *, privileged: bool = False) -> ClutterExploration:
+        """Where it learns; `privileged`: it sees everything, or K_t."""
+        return ClutterExploration(
+            load_scene_set(Path(self.scenes), load_catalogue(Path(self.catalogue) if self.catalogue else None)),
+            privileged=privileged,
+            fidelity=self.fidelity,
+            config=self.world,
+            max_moves=self.max_moves,
+            most_objects=self.most_objects,
+        )
+
+    def evaluation(self, environment: ClutterExploration, network: ExplorerNetwork) -> dict[str, float]:
+        """How a network does, on the same episodes every time."""
+        return figures(play_episodes(environment, self.evaluation_episodes, (self.seed, 3), acting(network, None)))
