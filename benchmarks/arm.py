@@ -20,21 +20,22 @@ from rich.console import Console
 from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
-from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
-from drake_clutter.arm.attempts import NEAR, REPORTED, PlannerConfig
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.paths import Payload, sampled, smooth, timed
-from drake_clutter.arm.plan import NoPlan, Plan
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.attempts import NEAR, REPORTED, PlannerConfig
+from drake_clutter.planning.paths import Payload, sampled, smooth, timed
+from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
 from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.workers.mapping import map_ordered
 
 Result = TypeVar("Result")
 

@@ -19,10 +19,10 @@ from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.full_knowledge import Solvability
 
 OUT = Path(__file__).parent / "results" / "come_apart.json"

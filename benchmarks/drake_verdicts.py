@@ -21,13 +21,14 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, config_yaml
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.records import recorded
-from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.seams import Move, Observation
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.workers.mapping import map_ordered
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},

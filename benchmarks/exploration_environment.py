@@ -15,10 +15,10 @@ from generator_training import timed
 from rich.console import Console
 from rich.table import Table
 
-from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.tasks import clutter_exploration
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 

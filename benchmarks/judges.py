@@ -33,14 +33,14 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import wilson_interval
-from drake_clutter.fast.executor import FastExecutor
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
 from drake_clutter.resources import git_commit
+from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Move, MoveResult
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Move, MoveResult
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.stability.judge import FastJudge
 
 MARGINS = (0.0005, 0.001, 0.0015, 0.00205, 0.0025, 0.003, 0.004)
 FRICTIONS = (0.0, 0.3, 0.5)

@@ -19,10 +19,10 @@ from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import item_rng
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import SceneObject, jittered
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import settle
 

@@ -33,15 +33,15 @@ from rich.table import Table
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, config_yaml
 from drake_clutter.export import ExportFormat, export_scene
-from drake_clutter.fast.judge import FastJudge
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import write_json
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene import Scene, jittered, tilt_between
-from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 
 CONFIG = ClutterConfig()

@@ -218,7 +218,7 @@ def move(
     """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
     from drake_clutter.commands import explore as command
     from drake_clutter.config import load_config
-    from drake_clutter.scenes.seams import Move
+    from drake_clutter.scenes.interfaces import Move
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
         raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
@@ -295,7 +295,7 @@ def view(
     catalogue: CatalogueOption = None,
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
-    from drake_clutter.scenes.seams import Frame
+    from drake_clutter.scenes.interfaces import Frame
 
     file = load(scene, catalogue)
     shown = file.scene if laid_out else file.settled_scene

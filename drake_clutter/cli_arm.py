@@ -27,9 +27,9 @@ def replay(
     catalogue: CatalogueOption = None,
 ) -> None:
     """Show the arm's recorded motions in the browser (Meshcat), or write them to one HTML file."""
-    from drake_clutter.arm.trajectory_file import read_trajectories
     from drake_clutter.catalogue import load_catalogue
     from drake_clutter.reports.recording import joined
+    from drake_clutter.station.trajectory_file import read_trajectories
 
     scene, moves = read_trajectories(file, load_catalogue(catalogue))
     if not moves:

@@ -17,9 +17,9 @@ from rich.table import Table
 from drake_clutter.files import InputError
 
 if TYPE_CHECKING:
+    from drake_clutter.scenes.interfaces import Frame
     from drake_clutter.scenes.scene import Scene
     from drake_clutter.scenes.scene_file import SceneFile
-    from drake_clutter.scenes.seams import Frame
 
 out_console, err_console = Console(), Console(stderr=True)
 

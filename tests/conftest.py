@@ -13,13 +13,13 @@ from hypothesis import settings
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, LayoutConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import NodeBudget, Orientation, SceneGrammar, resting_rotation, uniform_choice
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")

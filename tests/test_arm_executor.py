@@ -11,21 +11,21 @@ import pytest
 from conftest import resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
-from drake_clutter.arm.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.clutter_station import ClutterStation
-from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, scheduled
-from drake_clutter.arm.plan import Plan
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.suction import SuctionConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.recording import write_recording
+from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
+from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.pick_place import DWELL, PickPlaceExecutor, scheduled
 
 SCENE = scene_of(
     resting("sugar_box", Orientation.UPRIGHT_0),

@@ -12,18 +12,18 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.agents.exploration import LargestClear
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, load_typed
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.files import InputError
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import Move, MoveResult, Observation
+from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase, Request

@@ -24,10 +24,10 @@ from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explor
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
-from drake_clutter.scenes.seams import Move, MoveResult
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, legal_moves
 from drake_clutter.tasks.exploration_graph import FEATURES

@@ -10,8 +10,8 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import deepest_penetration
+from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.scenes.seams import Move, MoveResult, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 

@@ -16,8 +16,8 @@ from drake_clutter.agents.exploration import (
 )
 from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.interfaces import Detection, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.scenes.seams import Detection, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
 

@@ -9,10 +9,10 @@ from conftest import CLASSES, random_scene, resting, rng, scene_of
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.scenes.seams import Move
+from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GraphObservation, exploration_graph, seen
 
 NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}

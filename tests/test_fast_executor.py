@@ -9,13 +9,9 @@ from scipy.spatial.transform import Rotation
 from test_executor import STACKS
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import (
+from drake_clutter.scenes.interfaces import (
     CannotJudge,
     CannotJudgeReason,
     Instability,
@@ -26,8 +22,12 @@ from drake_clutter.scenes.seams import (
     Observation,
     Outcome,
 )
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.fallback import FastOrDrakeExecutor
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.stability.judge import FastJudge
 
 CONFIG = ClutterConfig()
 JUDGE = FastJudge(CONFIG)

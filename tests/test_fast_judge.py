@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 
 UPRIGHT = Orientation.UPRIGHT_0
 MARGIN = 0.00205

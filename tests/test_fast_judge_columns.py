@@ -16,11 +16,11 @@ from test_fast_judge import FAST, MARGIN, STEP, UPRIGHT, reason_of, stands
 from test_settle import BELOW
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, InstabilityReason, Verdict
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 
 # --- Columns, for which there is a formula ---
 

@@ -12,22 +12,22 @@ import pytest
 from conftest import resting, rng, scene_of
 from typer.testing import CliRunner
 
-from drake_clutter.arm.attempts import PlannerConfig, downwards
-from drake_clutter.arm.kinematics import jacobian, manipulability
-from drake_clutter.arm.plan import NoPlan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.reachability import Reachability, base_scores
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.cell.kinematics import jacobian, manipulability
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.suction import SuctionConfig
 from drake_clutter.cli import app
 from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.attempts import PlannerConfig, downwards
+from drake_clutter.planning.plan import NoPlan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.reports import feasibility_report
+from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.scenes.seams import Verdict
 from drake_clutter.tasks import feasibility as tasks_feasibility
 from drake_clutter.tasks.feasibility import MOVE_COLUMNS, PLANNED, FeasibilityStudy, below, rest_of
 

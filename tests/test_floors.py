@@ -10,15 +10,16 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "config", "files", "learning", "records", "resources", "runner", "runner_ray"},
-    1: {"grammar"},
-    2: {"fast", "scenes"},
+    0: {"assets", "catalogue", "config", "files", "learning", "records", "resources", "seeding", "workers"},
+    1: {"cell", "grammar"},
+    2: {"scenes", "stability"},
     3: {"export", "simulation"},
-    4: {"arm", "perception"},
-    5: {"tasks"},
-    6: {"agents"},
-    7: {"systems"},
-    8: {"cli", "cli_arm", "cli_options", "commands", "doctor", "reports"},
+    4: {"perception", "planning"},
+    5: {"station"},
+    6: {"tasks"},
+    7: {"agents"},
+    8: {"systems"},
+    9: {"cli", "cli_arm", "cli_options", "commands", "doctor", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts)

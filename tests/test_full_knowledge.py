@@ -6,15 +6,15 @@ from conftest import CLASSES, random_scene, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solution, Solvability
 

@@ -22,13 +22,13 @@ from drake_clutter.agents.generation import (
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget
-from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import scene_fields
-from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+from drake_clutter.workers.mapping import map_ordered
 
 
 def job(nodes: int = 10, seed: int = 5) -> GenerationJob:

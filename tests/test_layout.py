@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from drake_clutter.config import LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
 from drake_clutter.grammar.graph import DUMMY
-from drake_clutter.runner import item_rng
 from drake_clutter.scenes.geometry import deepest_penetration
 from drake_clutter.scenes.layout import LayoutFailure, LayoutFailureReason, lay_out
 from drake_clutter.scenes.scene import Scene, SceneObject
+from drake_clutter.seeding import item_rng
 
 RANDOM_SCENES = 2000
 """`benchmarks/check_layout.py` checks 10,000 alike; here they would take minutes."""

@@ -13,12 +13,12 @@ from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.agents.learned_generator import LearnedGenerator, about_values, load_values
 from drake_clutter.agents.soft_q import SoftQConfig, stacked
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
+from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
-from drake_clutter.scenes.seams import Verdict
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphVocabulary
 
 WIDTH = 8

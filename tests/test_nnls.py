@@ -6,7 +6,7 @@ from conftest import rng
 from numpy.typing import NDArray
 from scipy.optimize import nnls as scipy_nnls
 
-from drake_clutter.fast.nnls import nnls
+from drake_clutter.stability.nnls import nnls
 
 
 def optimal(A: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float64]) -> bool:

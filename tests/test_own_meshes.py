@@ -15,13 +15,13 @@ from test_settle import BELOW
 from drake_clutter.assets import build_assets
 from drake_clutter.catalogue import ObjectClass, load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
-from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Verdict
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.visibility import RayCaster
 
 
 def hull(corners: NDArray[np.float64]) -> trimesh.Trimesh:

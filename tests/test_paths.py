@@ -8,8 +8,9 @@ from conftest import rng
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.paths import (
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.planning.paths import (
     ACCELERATION_LIMIT,
     MARGIN,
     TORQUE_LIMIT,
@@ -24,7 +25,6 @@ from drake_clutter.arm.paths import (
     timed,
     torques,
 )
-from drake_clutter.arm.station import ArmConfig
 
 ARM = ArmConfig()
 HOME = np.array(ARM.home)

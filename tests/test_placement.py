@@ -12,9 +12,9 @@ from drake_clutter.config import ExplorationConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import CELL, choose_placement, has_clear_top, top_height
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.tasks.exploration import legal_moves
 
 CONFIG = ExplorationConfig()

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from conftest import CLASSES, random_scene, resting, rng
 
-from drake_clutter.arm.attempts import PlannerConfig, inverse, matrix
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.suction import SuctionConfig
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.suction import SuctionConfig
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.attempts import PlannerConfig, inverse, matrix
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 

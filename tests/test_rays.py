@@ -13,12 +13,12 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.fast.shapes import Shapes
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.stability.shapes import Shapes
+from drake_clutter.stability.visibility import RayCaster
 
 CAMERA = CameraConfig()
 RAYS = RayCaster(CAMERA)

@@ -20,8 +20,8 @@ from drake_clutter.reports.diagram_picture import connections, draw_diagram
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
+from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step
 

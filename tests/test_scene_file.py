@@ -11,9 +11,9 @@ import yaml
 from conftest import CATALOGUE, CLASSES, random_scene, resting, rng, scene_of
 
 from drake_clutter.files import InputError
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import SceneFile, load_scene, save_scene, scene_fields
-from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 
 Path_ = tuple[str | int, ...]
 GONE = object()

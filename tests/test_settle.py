@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject, jittered, tilt_between
-from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.simulation.settle import Settled, settle
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from conftest import CLASSES
 
-from drake_clutter.arm.epick import epick_sdf
-from drake_clutter.arm.suction import GRAVITY, SuctionConfig, carried_load, greatest_acceleration, load_share, unevenness
 from drake_clutter.catalogue import Rest, Shape, load_catalogue
+from drake_clutter.cell.epick import epick_sdf
+from drake_clutter.cell.suction import GRAVITY, SuctionConfig, carried_load, greatest_acceleration, load_share, unevenness
 from drake_clutter.resources import shipped_path
 
 CUP = SuctionConfig()

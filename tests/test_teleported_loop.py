@@ -10,12 +10,12 @@ import pytest
 from conftest import resting, scene_of, training_script
 
 from drake_clutter.agents.exploration import LargestClear
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import MoveResult, Observation
 from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.arm_ceiling import ArmCeiling

@@ -9,8 +9,8 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.seams import Detection, Observation
 from drake_clutter.systems.tracking import recognised, tracked
 
 CLASSES, CAMERA = load_catalogue().classes, CameraConfig()

@@ -15,8 +15,8 @@ from drake_clutter.agents.generation import GenerationJob
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.records import recorded
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene_set import load_scene_set
-from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 from drake_clutter.simulation.judge import DrakeJudge
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"

@@ -9,17 +9,17 @@ import pytest
 from conftest import resting, rng, scene_of
 from typer.testing import CliRunner
 
-from drake_clutter.arm.arm_executor import ArmExecutor
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.trajectory_file import read_trajectories, write_trajectories
-from drake_clutter.arm.ur10 import LINKS
 from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.ur10 import LINKS
 from drake_clutter.cli import app
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.scenes.seams import Move, MoveResult, Outcome
+from drake_clutter.station.arm_executor import ArmExecutor
+from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 
 SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", floor=0.035), resting("large_marker", xy=(0.2, 0.2)))
 MOVES = (Move("gelatin_box"), Move("large_marker"))

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from conftest import resting, scene_of
 
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.seams import Observation
 from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
 
 CAMERA = CameraConfig()

@@ -10,9 +10,9 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_clutter.arm.kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
-from drake_clutter.arm.rods import Rod
-from drake_clutter.arm.ur10 import BASE_OUTLINE, LINKS, ur10_sdf
+from drake_clutter.cell.kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
+from drake_clutter.cell.rods import Rod
+from drake_clutter.cell.ur10 import BASE_OUTLINE, LINKS, ur10_sdf
 from drake_clutter.resources import shipped_path
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"

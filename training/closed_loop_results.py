@@ -32,16 +32,16 @@ from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_j
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.scenes.seams import MoveResult
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
 from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.workers.mapping import map_ordered
 
 HERE = Path(__file__).parent
 EPISODES_OF_A_PROCESS = 10

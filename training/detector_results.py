@@ -29,8 +29,8 @@ from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 
 SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)

@@ -25,9 +25,9 @@ from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
+from drake_clutter.workers.mapping import map_ordered
 
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"

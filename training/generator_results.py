@@ -26,11 +26,11 @@ from drake_clutter.agents.generation import TRAINED, GenerationJob
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.stability.judge import FastJudge
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -39,10 +39,11 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, output_directory, told_in_one_line, write_json
 from drake_clutter.perception.image_set import LabelledImage, write_images
-from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
+from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE = "job.json"
 HEAP_IMAGES, GENERATED_IMAGES = 20, 16

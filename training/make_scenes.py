@@ -25,17 +25,18 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.grammar import canonical_form
 from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set
-from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.generation import GenerationTask
+from drake_clutter.workers.mapping import map_ordered
 
 MOST_DRAWS = 20
 """Scenes that are drawn at most, for each that is to be collected."""

@@ -21,7 +21,7 @@ from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
 from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
-from drake_clutter.runner import item_rng
+from drake_clutter.seeding import item_rng
 
 CHECKPOINT = "detector.safetensors"
 

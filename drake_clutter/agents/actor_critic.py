@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drake_clutter.agents.exploration_episodes import Played, acting, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
 from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
-from drake_clutter.runner import item_rng
+from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 
 

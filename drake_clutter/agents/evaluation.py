@@ -12,10 +12,10 @@ from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.runner import item_rng
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
 
 

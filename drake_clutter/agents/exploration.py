@@ -8,9 +8,9 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
-from drake_clutter.scenes.seams import Detection, Move, Observation
 from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step, legal_moves
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 

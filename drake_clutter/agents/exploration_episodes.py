@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
-from drake_clutter.runner import item_rng
+from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.exploration_graph import GraphObservation

@@ -11,15 +11,15 @@ from scipy.stats import norm
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
 from drake_clutter.learning.shipped import checkpoint_path, weights_of
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import Verdict
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
 

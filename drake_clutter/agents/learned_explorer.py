@@ -14,9 +14,9 @@ from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stack
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, SceneObject
-from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.tasks.exploration import Decision, ExplorationTask
 from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph, seen
 

@@ -9,10 +9,10 @@ import torch
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.agents.soft_q import softmax_choice, stacked
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
-from drake_clutter.runner import item_rng
+from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 
 PARTS = 2

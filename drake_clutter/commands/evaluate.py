@@ -12,9 +12,9 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, sha256_of, write_json
 from drake_clutter.resources import git_commit, shipped_path
-from drake_clutter.runner import map_ordered
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.workers.mapping import map_ordered
 
 _READ_AT = 10
 """Moves at which a longer search is read, too (SPEC section 6)."""

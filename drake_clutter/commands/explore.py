@@ -7,19 +7,19 @@ from typing import Any
 import yaml
 
 from drake_clutter.agents.exploration import make_explorers, play
-from drake_clutter.arm.arm_executor import ArmExecutor
-from drake_clutter.arm.plan import plan_fields
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.trajectory_file import write_trajectories
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.plan import plan_fields
 from drake_clutter.reports.episode_page import write_episode_page
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.scenes.seams import Move
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.station.arm_executor import ArmExecutor
+from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
 
 Report = Callable[[Step], None]
@@ -183,7 +183,7 @@ def write_episode(
 ) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
 
-    At fidelity `arm` also `trajectory.h5`, see `arm/trajectory_file.py`. `more` is put over what is known of the episode.
+    At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `more` is put over what is known of the episode.
     """
     fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
     save_scene(out / "after.yaml", task.scene)

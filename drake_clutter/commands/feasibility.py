@@ -15,18 +15,19 @@ import numpy as np
 import yaml
 
 from drake_clutter.agents.generation import wilson_interval
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.reachability import Reachability, base_scores
-from drake_clutter.arm.station import ArmConfig
 from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig, load_typed
 from drake_clutter.files import InputError, output_directory, write_json, write_text
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.reports.feasibility_report import write_report
-from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
+from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
 HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05

@@ -17,11 +17,11 @@ from drake_clutter.files import InputError, output_directory, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
 from drake_clutter.reports.pictures import PictureCamera
-from drake_clutter.runner import map_ordered
+from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
-from drake_clutter.scenes.seams import Verdict
 from drake_clutter.tasks.full_knowledge import Solvability
+from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
 SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"

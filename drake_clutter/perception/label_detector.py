@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from drake_clutter.config import CameraConfig
+from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import Detection, Observation
 from drake_clutter.simulation.camera import OverheadCamera
 
 

@@ -28,8 +28,8 @@ from drake_clutter.perception.segmentation import (
     without_holes,
 )
 from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.seams import Detection, Observation
 
 LEAST_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""

@@ -1,9 +1,9 @@
 """The perfect detector without rendering: it casts the camera's rays at the true objects, which is what training needs."""
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.fast.visibility import RayCaster
 from drake_clutter.perception.label_detector import Look
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.stability.visibility import RayCaster
 
 
 class RayDetector:

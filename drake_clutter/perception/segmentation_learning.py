@@ -25,7 +25,7 @@ from drake_clutter.perception.segmentation import (
     network_input,
     points,
 )
-from drake_clutter.runner import item_rng
+from drake_clutter.seeding import item_rng
 
 RISING = 0.1
 """Share of the steps in which the learning rate rises."""

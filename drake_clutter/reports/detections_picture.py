@@ -7,7 +7,7 @@ from PIL import Image
 
 from drake_clutter.reports.drawing import Canvas, Label, middle
 from drake_clutter.reports.pictures import humanised
-from drake_clutter.scenes.seams import Observation
+from drake_clutter.scenes.interfaces import Observation
 
 SIDE = 720
 _OVERSAMPLING = 2

@@ -17,8 +17,8 @@ from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.detections_picture import detections_picture
 from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
 from drake_clutter.reports.recording import episode_frames, write_recording
+from drake_clutter.scenes.interfaces import Instability, Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.scenes.seams import Instability, Move, MoveResult
 from drake_clutter.tasks.exploration import Decision, Step
 
 _TEMPLATE = Path(__file__).with_name("episode_page.html")

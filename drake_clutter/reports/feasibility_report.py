@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from drake_clutter.agents.generation import wilson_interval
-from drake_clutter.arm.attempts import PlannerConfig, inverse
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.plan import Plan
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
+from drake_clutter.planning.attempts import PlannerConfig, inverse
+from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.reports.arm_pictures import strip
 from drake_clutter.reports.pictures import Marks, PictureCamera
+from drake_clutter.scenes.interfaces import ArmState, Frame
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.seams import ArmState, Frame
 from drake_clutter.tasks.feasibility import PLANNED
 
 Rows = Sequence[Mapping[str, Any]]

@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import ExplorationConfig
+from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.scene import TRAY, Pose
-from drake_clutter.scenes.seams import Detection, Move, Observation
 
 CELL = 0.005
 """m, of the grid of places on the tray that are considered."""

@@ -14,8 +14,8 @@ from drake_clutter.files import InputError, write_text
 from drake_clutter.grammar import ClutterGraph, Orientation
 from drake_clutter.grammar.graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
 from drake_clutter.scenes.geometry import PENETRATION_ALLOWED, deepest_penetration
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import Instability, InstabilityReason, Verdict
 
 VERSION = 1
 _QUATERNION_TOLERANCE = 1e-3  # a hand-written 0.7071 is close enough, and is normalised

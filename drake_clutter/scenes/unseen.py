@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label, minimum_filter
 from trimesh.bounds import oriented_bounds_2D
 
+from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.seams import Observation
 
 _FLAT = 0.012
 """m; nothing lies hidden under less, and what is no higher above the tray is noise."""

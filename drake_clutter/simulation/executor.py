@@ -7,9 +7,9 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
-from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import Settled, settle
 

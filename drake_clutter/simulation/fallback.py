@@ -3,12 +3,12 @@
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
-from drake_clutter.fast.judge import FastJudge
+from drake_clutter.scenes.interfaces import CannotJudge, Move, MoveResult, Observation, Outcome, Verdict
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult, Observation, Outcome, Verdict
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.stability.judge import FastJudge
 
 
 class FastOrDrakeJudge:

@@ -7,12 +7,12 @@ import numpy as np
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
-from drake_clutter.scenes.seams import Verdict
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.settle import Settled, settle
+from drake_clutter.stability.judge import FastJudge
 
 TOUCHING_MARGIN = 0.003
 """m; objects further apart than this, random offsets included, settle without each other."""

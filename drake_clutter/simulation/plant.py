@@ -1,10 +1,7 @@
 """A scene as a MultibodyPlant diagram: the tray welded to the world, every object a free body."""
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -16,6 +13,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_clutter.assets.tray import tray_sdf
 from drake_clutter.catalogue import ObjectClass, Rest, Shape
+from drake_clutter.cell.sdf import sdf_text
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_STOPS_WITHIN = 0.05
@@ -31,22 +29,6 @@ def rigid_transform(pose: Pose) -> RigidTransform:
 def pose_of(X_AB: RigidTransform) -> Pose:
     """Drake's type as a pose."""
     return Pose.of(X_AB.rotation().matrix(), X_AB.translation())
-
-
-@lru_cache(maxsize=256)
-def sdf_text(path: Path, *, visuals: bool) -> str:
-    """The SDF model at `path` with or without its visuals, URIs made absolute.
-
-    Drake parses the text in a millisecond or two, the file it came from in sixty.
-    """
-    ElementTree.register_namespace("drake", "drake.mit.edu")  # else the prefix is renamed, and Drake no longer knows it
-    root = ElementTree.parse(path).getroot()
-    for link in () if visuals else root.iter("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-    for uri in root.iter("uri"):
-        uri.text = (path.parent / (uri.text or "")).as_uri()
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 @dataclass(frozen=True)

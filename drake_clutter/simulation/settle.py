@@ -10,8 +10,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalogue import Shape
 from drake_clutter.config import SettleConfig
+from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
-from drake_clutter.scenes.seams import Frame, Instability, InstabilityReason
 from drake_clutter.simulation.plant import add_scene_plant
 
 SAMPLE_PERIOD = 0.05

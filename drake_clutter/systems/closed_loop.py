@@ -12,21 +12,21 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
 
-from drake_clutter.arm.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
-from drake_clutter.arm.pick_place import PickPlaceExecutor
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried
+from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.seams import Frame, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
+from drake_clutter.station.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
+from drake_clutter.station.clutter_station import ClutterStation, Freedom, Vacuum
+from drake_clutter.station.pick_place import PickPlaceExecutor
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request, hopeless
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception, for_who_sees

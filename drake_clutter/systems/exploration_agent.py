@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
-from drake_clutter.arm.arm_executor import nearest
-from drake_clutter.arm.plan import NoPlan, Plan
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.runner import item_rng
+from drake_clutter.planning.plan import NoPlan, Plan
+from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
-from drake_clutter.scenes.seams import Move, Observation
 from drake_clutter.scenes.unseen import under_nameless
+from drake_clutter.seeding import item_rng
+from drake_clutter.station.arm_executor import nearest
 from drake_clutter.systems.move_planner import Answer
 from drake_clutter.systems.tracking import Tracked
 from drake_clutter.tasks.exploration import Decision, legal_moves

@@ -8,8 +8,8 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, State
 
-from drake_clutter.arm.plan import NoPlan, Plan
-from drake_clutter.runner import item_rng
+from drake_clutter.planning.plan import NoPlan, Plan
+from drake_clutter.seeding import item_rng
 
 PERIOD = 0.05
 """s, between two looks at what is asked for."""

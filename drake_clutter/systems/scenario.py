@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drake_clutter.agents.exploration import BASELINES, make_explorers
-from drake_clutter.arm.station import ArmConfig
 from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path

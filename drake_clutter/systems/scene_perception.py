@@ -11,14 +11,14 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from drake_clutter.arm.clutter_station import ClutterStation
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import Observation
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.plant import pose_of
+from drake_clutter.station.clutter_station import ClutterStation
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation]
 """From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned

@@ -4,16 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from drake_clutter.arm.arm_executor import nearest
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.runner import item_rng
 from drake_clutter.scenes.geometry import carried, rests_on
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.seams import Move, MoveResult, Observation, Outcome
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.station.arm_executor import nearest
 from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, hopeless
 from drake_clutter.systems.scene_perception import Perceive, for_who_sees
 from drake_clutter.systems.tracking import tracked

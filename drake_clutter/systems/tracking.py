@@ -10,8 +10,8 @@ from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.perception.explaining import explanation
 from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.seams import Detection, Observation
 
 NEAR = 0.04
 """m; an object that is seen so near to where one of its class is known to be is that one."""

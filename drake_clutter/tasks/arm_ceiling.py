@@ -1,12 +1,12 @@
 """What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
 
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.scenes.seams import CannotJudge
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
-from drake_clutter.scenes.seams import Move, MoveResult
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
 from drake_clutter.tasks.exploration_graph import BOUND, EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, exploration_graph, seen
 

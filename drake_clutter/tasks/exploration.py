@@ -8,15 +8,15 @@ from typing import Protocol
 
 import numpy as np
 
-from drake_clutter.arm.arm_executor import ArmExecutor
 from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
-from drake_clutter.fast.executor import FastExecutor
 from drake_clutter.perception.label_detector import LabelDetector, Look
 from drake_clutter.perception.ray_detector import RayDetector
+from drake_clutter.scenes.interfaces import Move, MoveExecutor, MoveResult, Observation, Outcome
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.scenes.seams import Move, MoveExecutor, MoveResult, Observation, Outcome
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.fallback import FastOrDrakeExecutor
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.station.arm_executor import ArmExecutor
 
 
 class ExecutorMaker(Protocol):

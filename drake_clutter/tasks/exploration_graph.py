@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
-from drake_clutter.scenes.seams import Move, Observation
 
 GraphObservation = dict[str, NDArray[Any]]
 

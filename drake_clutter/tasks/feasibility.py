@@ -10,20 +10,20 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.arm.attempts import PlannerConfig, inverse, matrix
-from drake_clutter.arm.kinematics import forward_kinematics, manipulability
-from drake_clutter.arm.paths import sampled
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.suction import unevenness
 from drake_clutter.catalogue import Shape
+from drake_clutter.cell.kinematics import forward_kinematics, manipulability
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.suction import unevenness
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.runner import item_rng
+from drake_clutter.planning.attempts import PlannerConfig, inverse, matrix
+from drake_clutter.planning.paths import sampled
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.seams import Move
+from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.exploration import legal_moves
 
 PLANNED = "planned"

@@ -13,12 +13,12 @@ import networkx as nx
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.executor import FastExecutor
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.files import InputError
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import CannotJudge, Move, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.scenes.seams import CannotJudge, Move, MoveResult, Observation
+from drake_clutter.seeding import item_rng
+from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.stability.judge import FastJudge
 
 MOST_OBJECTS = 64
 """Objects in a scene, see `RayCaster.cover`."""

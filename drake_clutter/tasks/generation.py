@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, SceneGrammar
 from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, OBJECT_SLOT, OPEN_SLOT, PRIMITIVE, TRAY
+from drake_clutter.scenes.interfaces import CannotJudge, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.seams import CannotJudge, Verdict
+from drake_clutter.stability.judge import FastJudge
 
 MOST_IN_A_STACK = 0.6
 """Of a balanced scene's objects."""

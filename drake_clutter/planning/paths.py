@@ -13,13 +13,13 @@ from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.arm.epick import epick_sdf
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.time_optimal import squared_speeds
-from drake_clutter.arm.ur10 import JOINT_RANGE, LINKS
+from drake_clutter.cell.epick import epick_sdf
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.sdf import sdf_text
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.ur10 import JOINT_RANGE, LINKS
+from drake_clutter.planning.time_optimal import squared_speeds
 from drake_clutter.resources import shipped_path
-from drake_clutter.simulation.plant import sdf_text
 
 Floats = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.arm.attempts import Attempts, Grasp, PlannerConfig, downwards, inverse, matrix
-from drake_clutter.arm.clearance import ClearanceScene
-from drake_clutter.arm.kinematics import branches
-from drake_clutter.arm.paths import Payload
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.station import ArmConfig
-from drake_clutter.arm.suction import EPICK_MASS, greatest_acceleration, unevenness
+from drake_clutter.cell.kinematics import branches
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.suction import EPICK_MASS, greatest_acceleration, unevenness
+from drake_clutter.planning.attempts import Attempts, Grasp, PlannerConfig, downwards, inverse, matrix
+from drake_clutter.planning.clearance import ClearanceScene
+from drake_clutter.planning.paths import Payload
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock

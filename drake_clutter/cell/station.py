@@ -15,12 +15,12 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_clutter.arm.epick import epick_sdf
-from drake_clutter.arm.kinematics import JOINTS
-from drake_clutter.arm.suction import SuctionConfig
 from drake_clutter.assets.tray import RIM_THICKNESS
+from drake_clutter.cell.epick import epick_sdf
+from drake_clutter.cell.kinematics import JOINTS
+from drake_clutter.cell.sdf import sdf_text
+from drake_clutter.cell.suction import SuctionConfig
 from drake_clutter.resources import shipped_path
-from drake_clutter.simulation.plant import sdf_text
 
 Floats = NDArray[np.float64]
 

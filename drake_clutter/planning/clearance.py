@@ -11,8 +11,8 @@ from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.station import Arm, ArmConfig, add_arm, joint_numbers
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform

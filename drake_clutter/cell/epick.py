@@ -7,8 +7,8 @@ and cup are ours.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.arm.rods import Rod, sdf_link, sdf_pose
-from drake_clutter.arm.suction import EPICK_LENGTH, EPICK_MASS, EPICK_RADIUS, SuctionConfig
+from drake_clutter.cell.rods import Rod, sdf_link, sdf_pose
+from drake_clutter.cell.suction import EPICK_LENGTH, EPICK_MASS, EPICK_RADIUS, SuctionConfig
 
 TUBE_RADIUS, TUBE_MASS, CUP_MASS = 0.010, 0.05, 0.02
 """m, kg, kg."""
@@ -41,7 +41,7 @@ def epick_sdf(config: SuctionConfig, *, compliant: bool = True) -> str:
         <dynamics><damping>{damping:.6g}</damping><spring_stiffness>{config.stiffness:g}</spring_stiffness></dynamics>
       </axis>"""
     return f"""<?xml version="1.0"?>
-<!-- Written by drake_clutter.arm.epick, which names the sources. -->
+<!-- Written by drake_clutter.cell.epick, which names the sources. -->
 <sdf version="1.10">
   <model name="epick">{sdf_link("body", "", mass, p_FCm, rods, rods, "cylinder")}{
         sdf_link("cup", cup_pose, CUP_MASS, np.array([0.0, 0.0, -config.cup_length / 2]), (bellows,), (bellows,), "cylinder")

@@ -20,7 +20,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 from scipy import sparse
 
-from drake_clutter.arm.paths import ACCELERATION_LIMIT, MARGIN, VELOCITY_LIMIT
+from drake_clutter.planning.paths import ACCELERATION_LIMIT, MARGIN, VELOCITY_LIMIT
 
 Floats = NDArray[np.float64]
 

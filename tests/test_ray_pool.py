@@ -22,13 +22,14 @@ import ray
 from numpy.typing import NDArray
 from ray.cluster_utils import Cluster
 from test_cli import ABOVE, BELOW, broken, run, scenes_of
-from test_runner import broken_factory, failing_worker
+from test_workers import broken_factory, failing_worker
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.runner import item_rng, map_ordered
 from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.seeding import item_rng
+from drake_clutter.workers.mapping import map_ordered
 
 Drawn = tuple[int, NDArray[np.float64]]
 Found = TypeVar("Found")
@@ -224,7 +225,7 @@ def test_closing_midway_ends_the_workers(cluster: Cluster) -> None:
 def test_ctrl_c_ends_the_workers(cluster: Cluster) -> None:
     code = f"""
 import signal
-from test_runner_ray import make_sleeper, map_ordered
+from test_ray_pool import make_sleeper, map_ordered
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
 for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_address="{cluster.address}"):
     print(result, flush=True)

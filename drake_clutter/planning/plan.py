@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from drake_clutter.arm.clearance import Clearance
+from drake_clutter.planning.clearance import Clearance
 from drake_clutter.scenes.scene import Pose
 
 Floats = NDArray[np.float64]

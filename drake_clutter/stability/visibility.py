@@ -13,9 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.config import CameraConfig
-from drake_clutter.fast.shapes import Floats, Ints, Shapes
+from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.seams import Detection, Observation
+from drake_clutter.stability.shapes import Floats, Ints, Shapes
 
 _MOST_COVERED = 64
 

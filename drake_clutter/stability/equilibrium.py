@@ -8,8 +8,8 @@ corner. With friction there are six rows, and four columns a corner.
 import numpy as np
 from numba import njit
 
-from drake_clutter.fast.contacts import GROUND, contact_polygon
-from drake_clutter.fast.nnls import nnls
+from drake_clutter.stability.contacts import GROUND, contact_polygon
+from drake_clutter.stability.nnls import nnls
 
 _LENGTH = 0.05
 """m, by which moments are divided, so that they count about as much as forces."""

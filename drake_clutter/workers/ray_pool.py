@@ -1,4 +1,4 @@
-"""Maps over the machines of a Ray cluster: the part of `drake_clutter.runner` that needs the extra `scale`."""
+"""Maps over the machines of a Ray cluster: the part that needs the extra `scale`."""
 
 import logging
 import os
@@ -12,7 +12,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from drake_clutter.files import InputError
-from drake_clutter.runner import IN_FLIGHT_PER_WORKER, ONE_THREAD_EACH, environment
+from drake_clutter.workers.environment import IN_FLIGHT_PER_WORKER, ONE_THREAD_EACH, environment
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -60,7 +60,7 @@ class _Job:
 def map_on_ray(
     make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int, address: str
 ) -> Generator[Result, None, None]:
-    """See `drake_clutter.runner.map_ordered`."""
+    """See `drake_clutter.workers.mapping.map_ordered`."""
     with _connection(address) as ray:
         options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": -1, "runtime_env": {"env_vars": ONE_THREAD_EACH}}
         actor_class = ray.remote(**options)(_Actor)

@@ -11,19 +11,19 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
-from drake_clutter.arm.attempts import PlannerConfig
-from drake_clutter.arm.clutter_station import ClutterStation, Freedom, Vacuum
-from drake_clutter.arm.pick_place import DWELL, PickPlaceExecutor, Running, Schedule
-from drake_clutter.arm.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig, SettleConfig
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried, touching_groups
+from drake_clutter.scenes.interfaces import Frame, Instability, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
-from drake_clutter.scenes.seams import Frame, Instability, Move, MoveResult, Observation, Outcome
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import fallen, settle
+from drake_clutter.station.clutter_station import ClutterStation, Freedom, Vacuum
+from drake_clutter.station.pick_place import DWELL, PickPlaceExecutor, Running, Schedule
 
 Floats = NDArray[np.float64]
 

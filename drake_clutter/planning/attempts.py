@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from drake_clutter.arm.clearance import Clearance, ClearanceScene
-from drake_clutter.arm.kinematics import forward_kinematics
-from drake_clutter.arm.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
-from drake_clutter.arm.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
-from drake_clutter.arm.shorten import Wall, Way, shortened
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.planning.clearance import Clearance, ClearanceScene
+from drake_clutter.planning.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
+from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
+from drake_clutter.planning.shorten import Wall, Way, shortened
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]
@@ -37,7 +37,7 @@ class PlannerConfig:
         time_limit: s; so long that it decides nothing: the same question has the same answer on any machine.
         descent: m, at most, that an object is lowered from its place until it touches something; 0: it is let go there.
         above: m, over its place, that this descent begins; where there is no room to go down, it is let go at its place.
-        optimise: whether the sure way is made quicker by trajectory optimisation, see `arm/shorten.py`.
+        optimise: whether the sure way is made quicker by trajectory optimisation, see `planning/shorten.py`.
     """
 
     clearance: float = 0.005

@@ -3,10 +3,7 @@
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
-from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import TRAY, Scene, random_offsets
-from drake_clutter.scenes.seams import (
+from drake_clutter.scenes.interfaces import (
     CannotJudge,
     CannotJudgeReason,
     Instability,
@@ -16,6 +13,9 @@ from drake_clutter.scenes.seams import (
     Observation,
     Outcome,
 )
+from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.scene import TRAY, Scene, random_offsets
+from drake_clutter.stability.judge import FastJudge
 
 
 class FastExecutor:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from drake_clutter.runner import item_rng, map_ordered
+from drake_clutter.seeding import item_rng
+from drake_clutter.workers.mapping import map_ordered
 
 
 class Noisy:
@@ -124,7 +125,7 @@ def test_closing_midway_does_not_wait() -> None:
 def test_ending_the_first_process_ends_the_others(signal_number: signal.Signals) -> None:
     code = """
 import signal
-from test_runner import make_sleeper, map_ordered
+from test_workers import make_sleeper, map_ordered
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
 for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
     print(result, flush=True)

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast import contacts, equilibrium
-from drake_clutter.fast.shapes import Floats, Ints, Shapes
-from drake_clutter.fast.visibility import RayCaster
+from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, random_offsets
-from drake_clutter.scenes.seams import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
+from drake_clutter.stability import contacts, equilibrium
+from drake_clutter.stability.shapes import Floats, Ints, Shapes
+from drake_clutter.stability.visibility import RayCaster
 
 FRICTION = 0.3
 """Coefficient of the friction that is relied on, of the 0.5 that there is: bodies at rest do not find every force that could

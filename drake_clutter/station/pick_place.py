@@ -9,9 +9,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.arm.paths import Payload, dynamics_plant, motion, torques
-from drake_clutter.arm.plan import DESCENT_SPEED, Plan
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.planning.paths import Payload, dynamics_plant, motion, torques
+from drake_clutter.planning.plan import DESCENT_SPEED, Plan
 
 Floats = NDArray[np.float64]
 

@@ -18,14 +18,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_clutter.arm.hold import HexapodHold, Hold, JointHold
-from drake_clutter.arm.kinematics import JOINTS
-from drake_clutter.arm.station import Arm, ArmConfig, add_arm, joint_numbers
-from drake_clutter.arm.suction import load_share, surface_under_lip, unevenness
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.kinematics import JOINTS
+from drake_clutter.cell.station import Arm, ArmConfig, add_arm, joint_numbers
+from drake_clutter.cell.suction import load_share, surface_under_lip, unevenness
+from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.seams import ArmState
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
+from drake_clutter.station.hold import HexapodHold, Hold, JointHold
 
 Floats = NDArray[np.float64]
 

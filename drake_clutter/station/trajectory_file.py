@@ -19,13 +19,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.arm.station import ArmConfig
 from drake_clutter.catalogue import Catalogue
+from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import config_yaml
 from drake_clutter.files import InputError, replacing
+from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import scene_from_text, scene_text
-from drake_clutter.scenes.seams import ArmState, Frame, Move, Outcome
 
 VERSION = 1
 _ARM = ("q", "v", "torque")

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.arm.attempts import PlannerConfig, downwards
-from drake_clutter.arm.kinematics import manipulability
-from drake_clutter.arm.paths import nearest_turns
-from drake_clutter.arm.planner import PickPlacePlanner
-from drake_clutter.arm.station import ArmConfig
+from drake_clutter.cell.kinematics import manipulability
+from drake_clutter.cell.station import ArmConfig
+from drake_clutter.planning.attempts import PlannerConfig, downwards
+from drake_clutter.planning.paths import nearest_turns
+from drake_clutter.planning.planner import PickPlacePlanner
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from pydrake.multibody.plant import DistanceConstraintParams, MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_clutter.arm.epick import CUP_MASS
-from drake_clutter.arm.station import Arm
-from drake_clutter.arm.suction import GRAVITY
+from drake_clutter.cell.epick import CUP_MASS
+from drake_clutter.cell.station import Arm
+from drake_clutter.cell.suction import GRAVITY
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.arm.kinematics import JOINTS, UR10, after_joint
-from drake_clutter.arm.rods import Point, Rod, sdf_link, sdf_pose
+from drake_clutter.cell.kinematics import JOINTS, UR10, after_joint
+from drake_clutter.cell.rods import Point, Rod, sdf_link, sdf_pose
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def ur10_sdf() -> str:
     </joint>""")
         parent, X_PL = link.name, X_LDh
     return f"""<?xml version="1.0"?>
-<!-- Written by drake_clutter.arm.ur10, which names the sources. -->
+<!-- Written by drake_clutter.cell.ur10, which names the sources. -->
 <sdf version="1.10">
   <model name="ur10">{"".join(parts)}
     <frame name="flange" attached_to="{parent}">
