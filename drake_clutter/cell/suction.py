@@ -8,14 +8,16 @@ PickNik's `epick_description` (BSD). A lip that is loaded evenly by the vacuum o
 """
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.validation import Between, Model
 
 Floats = NDArray[np.float64]
 
@@ -29,40 +31,52 @@ _STANDOFF = 0.05
 """m above the lip, from which is looked."""
 
 
-@dataclass
-class SuctionConfig:
+class SuctionGripper(Model):
     """The EPick with a cup of one and a half bellows on an extension tube.
 
     Attributes:
-        cup_diameter: m, of the lip.
-        cup_length: m, without load.
-        extension: m, length of the tube between body and cup.
-        stroke: m, by which the cup can be pressed together or drawn out; stiffness: N/m along its axis.
-        vacuum: share of the atmosphere's pressure that is taken away.
-        friction: of the lip on cardboard, tin and plastic.
-        unevenness: m, out of a plane, that the lip still follows.
-        safety: by how much the cup must be able to hold more than it is planned to.
+        kind: Names this gripper in a cell's file.
+        cup_diameter: Of the lip [m].
+        cup_length: Of the cup without load [m].
+        extension: Length of the tube between body and cup [m].
+        stroke: By which the cup can be pressed together or drawn out [m].
+        stiffness: Along its axis [N/m].
+        vacuum: Share of the atmosphere's pressure that is taken away.
+        friction: Of the lip on cardboard, tin and plastic.
+        unevenness: Out of a plane, that the lip still follows [m].
+        safety: By how much the cup must be able to hold more than it is planned to.
     """
 
-    cup_diameter: float = 0.025
-    cup_length: float = 0.020
-    extension: float = 0.100
-    stroke: float = 0.006
-    stiffness: float = 2_000.0
-    vacuum: float = 0.8
-    friction: float = 0.5
-    unevenness: float = 0.001
-    safety: float = 1.5
+    kind: Literal["suction"] = "suction"
+    cup_diameter: Annotated[float, Between(0.005, 0.1)] = 0.025
+    cup_length: Annotated[float, Between(0.005, 0.1)] = 0.020
+    extension: Annotated[float, Between(0.01, 0.5)] = 0.100
+    stroke: Annotated[float, Between(0.001, 0.05)] = 0.006
+    stiffness: Annotated[float, Between(100.0, 1e5)] = 2_000.0
+    vacuum: Annotated[float, Between(0.01, 1.0)] = 0.8
+    friction: Annotated[float, Between(0.01, 10.0)] = 0.5
+    unevenness: Annotated[float, Between(0.0, 0.01)] = 0.001
+    safety: Annotated[float, Between(1.0, 100.0)] = 1.5
 
     @property
     def pull(self) -> float:
-        """N, with which the atmosphere presses the lip on."""
+        """Force with which the atmosphere presses the lip on [N]."""
         return self.vacuum * ATMOSPHERE * math.pi * self.cup_diameter**2 / 4
 
     @property
     def length(self) -> float:
-        """m, from the flange to the lip."""
+        """From the flange to the lip [m]."""
         return EPICK_LENGTH + self.extension + self.cup_length
+
+    @property
+    def mass(self) -> float:
+        """Of the body, which counts towards the robot's payload [kg]."""
+        return EPICK_MASS
+
+    @property
+    def X_FG(self) -> RigidTransform:
+        """The cup at rest, in the flange's frame."""
+        return RigidTransform([0.0, 0.0, self.length])
 
 
 EPICK_LENGTH, EPICK_RADIUS, EPICK_MASS = 0.1023, 0.044, 0.71
@@ -108,7 +122,7 @@ def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> floa
     return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
 
 
-def load_share(force: Floats, moment: Floats, config: SuctionConfig) -> Floats:
+def load_share(force: Floats, moment: Floats, config: SuctionGripper) -> Floats:
     """How much of what the cup can bear a load takes up; above 1 it comes off.
 
     Args:
@@ -147,7 +161,7 @@ def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floa
     return force, np.cross(np.broadcast_to(p_GCm, force.shape), force)
 
 
-def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionConfig) -> float:
+def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionGripper) -> float:
     """m/s^2, with which a cup that points down may move a body in any direction, safety included; negative if it cannot hold it.
 
     Args:

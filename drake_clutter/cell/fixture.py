@@ -1,0 +1,26 @@
+"""What stands in the cell beside robot and support, and counts as an obstacle."""
+
+from typing import Annotated
+
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.validation import Between, Model
+
+Extent = Annotated[float, Between(0.001, 10.0)]
+
+
+class Fixture(Model):
+    """A box, or a model of a file, that does not move.
+
+    Attributes:
+        name: As it is called in reasons and pictures; unique in the cell.
+        pose: X_TF, of the box's center, or of the model's frame.
+        box: Extents of a box [m]; or None.
+        model: File of an SDF or URDF model; "" for a box.
+        color: Red, green, blue and opacity, 0 to 1; None: it is not drawn.
+    """
+
+    name: str
+    pose: PoseSpec = PoseSpec()
+    box: tuple[Extent, Extent, Extent] | None = None
+    model: str = ""
+    color: tuple[float, float, float, float] | None = None

@@ -1,0 +1,57 @@
+"""The robot of a cell as data. Frames: T the support; B the robot's base; F its tool flange, z out of the arm."""
+
+from typing import Annotated, Literal
+
+from pydrake.math import RigidTransform
+
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.validation import Between, Finite, Model, Positive
+
+
+class JointLimits(Model):
+    """Limits of each joint, in the order of the joints; None: as the model file has them.
+
+    Attributes:
+        position: Least and greatest [rad].
+        velocity: [rad/s].
+        acceleration: [rad/s^2].
+        jerk: [rad/s^3].
+        torque: [N m].
+    """
+
+    position: tuple[tuple[Finite, Finite], ...] | None = None
+    velocity: tuple[Positive, ...] | None = None
+    acceleration: tuple[Positive, ...]
+    jerk: tuple[Positive, ...] | None = None
+    torque: tuple[Positive, ...] | None = None
+
+
+class RobotSpec(Model):
+    """Which robot, and where.
+
+    Attributes:
+        model: SDF or URDF file: a path relative to the cell's file, or package://drake_clutter_models/...
+        base_link: The link that is fixed to the base pose.
+        tool_frame: The frame or link F on which the gripper is mounted.
+        base: X_TB.
+        home: Where moves begin and end; the cameras see the support then [rad].
+        limits: Of the joints.
+        ik: Inverse kinematics: closed form of the UR family, or numerical for any arm.
+        payload: Largest mass of gripper and object together [kg].
+        pedestal_side: Of the pedestal's square section, from the table to the base [m]; 0 for none.
+    """
+
+    model: str
+    base_link: str
+    tool_frame: str
+    base: PoseSpec
+    home: tuple[Finite, ...]
+    limits: JointLimits
+    ik: Literal["ur", "numerical"] = "numerical"
+    payload: Positive
+    pedestal_side: Annotated[float, Between(0.0, 1.0)] = 0.0
+
+    @property
+    def X_TB(self) -> RigidTransform:
+        """Pose of the base."""
+        return self.base.transform

@@ -1,0 +1,43 @@
+"""What the objects stand on: a rectangular floor with walls on some of its sides.
+
+Frame T: origin at the center of the floor's upper surface, z up. It is the world frame of every plant.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.validation import Between, Model
+
+Side = Annotated[float, Between(0.1, 2.0)]
+
+
+class Support(Model):
+    """A tray, or a shelf board.
+
+    Attributes:
+        size: Inner extents along x and y [m].
+        wall_height: Of the walls above the floor [m].
+        wall_thickness: Of the walls [m].
+        walls: The sides that have a wall.
+        floor_thickness: Of the floor [m].
+        floor_height: Of the floor's lower surface above the table [m].
+    """
+
+    size: tuple[Side, Side]
+    wall_height: Annotated[float, Between(0.0, 1.0)] = 0.025
+    wall_thickness: Annotated[float, Between(0.001, 0.1)] = 0.008
+    walls: tuple[Literal["+x", "-x", "+y", "-y"], ...] = ("+x", "-x", "+y", "-y")
+    floor_thickness: Annotated[float, Between(0.001, 0.1)] = 0.010
+    floor_height: Annotated[float, Between(0.0, 2.0)] = 0.0
+
+    @property
+    def half_size(self) -> NDArray[np.float64]:
+        """Half the inner extents along x and y [m]. Shape (2,)."""
+        return np.array(self.size) / 2
+
+    @property
+    def area(self) -> float:
+        """Of the floor [m^2]."""
+        return self.size[0] * self.size[1]

@@ -1,0 +1,92 @@
+"""The work cell as data: robot, gripper, support, cameras and fixtures, in one file."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import field_validator
+
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.fixture import Fixture
+from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.suction import SuctionGripper
+from drake_clutter.cell.support import Support
+from drake_clutter.resources import shipped_path
+from drake_clutter.validation import Model, allowed, load_typed, read_yaml, validate
+
+DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
+
+
+class WorkCell(Model):
+    """Everything that stands in the cell but the objects.
+
+    Attributes:
+        robot: Which arm, and where.
+        gripper: Its tool.
+        support: What the objects stand on.
+        cameras: By name; the explorer sees through the first.
+        fixtures: Obstacles.
+    """
+
+    robot: RobotSpec
+    gripper: SuctionGripper
+    support: Support
+    cameras: dict[str, Camera]
+    fixtures: tuple[Fixture, ...] = ()
+
+    @field_validator("cameras")
+    @classmethod
+    def _at_least_one(cls, cameras: dict[str, Camera]) -> dict[str, Camera]:
+        if not cameras:
+            raise allowed("at least one camera")
+        return cameras
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the explorer sees through."""
+        return next(iter(self.cameras.values()))
+
+    def __hash__(self) -> int:
+        """Hash of the whole content, so that what is derived from a cell can be kept."""
+        return hash(self.model_dump_json())
+
+
+@lru_cache(maxsize=1)
+def default_cell() -> WorkCell:
+    """Return the cell of `models/cells/ur10_epick_tray.yaml`."""
+    return load_cell(shipped_path(DEFAULT_CELL))
+
+
+def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
+    """Read a cell.
+
+    Args:
+        path: YAML with the fields of `WorkCell`.
+        settings: Single fields over those of the file, such as "robot.base.z=0.4".
+
+    Raises:
+        InputError: The file, the field and what is allowed.
+    """
+    given = read_yaml(path, "a mapping with robot, gripper, support and cameras")
+    cell = validate(WorkCell, _with_paths(given, path.parent), str(path))
+    return load_typed(cell, settings=settings)
+
+
+def _with_paths(given: Any, folder: Path) -> Any:
+    """Return the document with its models' paths made absolute, as they are relative to the cell's file."""
+    if not isinstance(given, dict):
+        return given
+    made = dict(given)
+    if isinstance(robot := given.get("robot"), dict):
+        made["robot"] = _with_path(robot, folder)
+    if isinstance(fixtures := given.get("fixtures"), list):
+        made["fixtures"] = [_with_path(f, folder) if isinstance(f, dict) else f for f in fixtures]
+    return made
+
+
+def _with_path(part: dict[str, Any], folder: Path) -> dict[str, Any]:
+    model = part.get("model")
+    if isinstance(model, str) and model and not model.startswith("package://"):
+        return {**part, "model": str((folder / model).resolve())}
+    return part
