@@ -21,7 +21,7 @@ from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -35,6 +35,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
 from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 Result = TypeVar("Result")
@@ -122,7 +123,7 @@ class Mover:
 
     def __init__(self, nodes: int, seed: int) -> None:
         self._scenes, self._seed = Scenes(nodes, seed), seed
-        self._detector, self._executor = LabelDetector(WORLD.camera), ArmExecutor(WORLD)
+        self._detector, self._executor = LabelDetector(WORLD.cell.camera), ArmExecutor(WORLD)
         self._sure = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False))
 
     def __call__(self, number: int) -> list[Trial]:
@@ -131,7 +132,7 @@ class Mover:
         observation = self._detector.look(scene).observation
         moves = legal_moves(observation)
         for executor in (self._executor, self._sure):
-            executor.planner(scene.tray_side).clearance_scene(scene.objects)  # as when moves follow each other
+            executor.planner(scene.support).clearance_scene(scene.objects)  # as when moves follow each other
         return [self._tried(scene, moves[k], rng, observation) for k in rng.permutation(len(moves))[:MOVES_PER_SCENE]]
 
     def _tried(self, scene: Scene, move: Any, rng: np.random.Generator, observation: Any) -> Trial:
@@ -139,13 +140,13 @@ class Mover:
         X_TO = choose_placement(observation, move, WORLD.exploration, rng)
         if X_TO is None:
             return Trial("no free spot", False, name, 0.0)
-        planner = self._executor.planner(scene.tray_side)
-        sure = self._sure.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
+        planner = self._executor.planner(scene.support)
+        sure = self._sure.planner(scene.support).plan(scene.objects, move.pick, X_TO)
         plan = planner.plan(scene.objects, move.pick, X_TO)
         if isinstance(plan, NoPlan):
             return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, sure.seconds)
         begun = time.perf_counter()
-        carried = ArmSimulation(ArmConfig(), scene, plan, camera_altitude=WORLD.camera.altitude).run()
+        carried = ArmSimulation(default_cell(), scene, plan).run()
         wall, result = time.perf_counter() - begun, judged(carried)
         return Trial(
             result=result,
@@ -195,7 +196,7 @@ def moves(
     fields = {
         "command": f"benchmarks/arm.py moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}",
         "commit": git_commit(),
-        "arm": asdict(ArmConfig()),
+        "cell": to_plain(default_cell()),
         "planner": asdict(PlannerConfig()),
         "results": Counter(t.result for t in trials),
         "not_planned_by_class": Counter(f"{t.object_class}: {t.result}" for t in trials if math.isnan(t.motion)),
@@ -226,7 +227,7 @@ def parts(
     seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
 ) -> None:
     """Times the parts of planning and simulating a move, one by one, on one core."""
-    detector, spent = LabelDetector(WORLD.camera), dict[str, list[float]]()
+    detector, spent = LabelDetector(WORLD.cell.camera), dict[str, list[float]]()
     sure, executor, scenes = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False)), ArmExecutor(WORLD), Scenes(25, seed)
 
     def timed_as(name: str, call: Callable[[], Result], of: int = 1) -> Result:
@@ -243,7 +244,7 @@ def parts(
         X_TO = choose_placement(observation, move, WORLD.exploration, rng)
         if X_TO is None:
             return False
-        planner, quick = executor.planner(scene.tray_side), sure.planner(scene.tray_side)
+        planner, quick = executor.planner(scene.support), sure.planner(scene.support)
         timed_as("scene of distances", lambda: planner.clearance_scene(scene.objects))
         quick.clearance_scene(scene.objects)
         timed_as("sure plan", lambda: quick.plan(scene.objects, move.pick, X_TO))
@@ -253,13 +254,14 @@ def parts(
             return False
         around = planner.clearance_scene(scene.objects)
         q = sampled(plan.phases[1].trajectory)
-        poses = ArmConfig().X_TB @ forward_kinematics(q) @ ArmConfig().X_FG
+        cell = default_cell()
+        poses = cell.robot.X_TB.GetAsMatrix4() @ forward_kinematics(q) @ cell.gripper.X_FG.GetAsMatrix4()
         timed_as("forward kinematics of a pose", lambda: forward_kinematics(q), len(q))
         timed_as("inverse kinematics of a pose, eight branches", lambda: planner.reach(poses), len(q))
         timed_as("distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q))
         timed_as("distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q))
-        timed_as("timing of a path without load", lambda: timed(smooth(q), ArmConfig(), Payload()))
-        simulation = timed_as("simulation, built", lambda: ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6))
+        timed_as("timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload()))
+        simulation = timed_as("simulation, built", lambda: ArmSimulation(default_cell(), scene, plan))
         timed_as("simulation, run", simulation.run)
         return True
 
@@ -282,7 +284,7 @@ def holds(
     seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
 ) -> None:
     """Carries the same moves out with both ways to hold, of an object alone and in scenes of 25 nodes."""
-    detector, executor, rows = LabelDetector(WORLD.camera), ArmExecutor(WORLD), list[dict[str, Any]]()
+    detector, executor, rows = LabelDetector(WORLD.cell.camera), ArmExecutor(WORLD), list[dict[str, Any]]()
     for kind, nodes in (("one object", 4), ("25 nodes", 25)):
         scenes, plans, number = Scenes(nodes, seed), list[tuple[Scene, Plan]](), 0
         while len(plans) < count:
@@ -297,7 +299,7 @@ def holds(
             results, walls = list[Carried](), list[float]()
             for scene, plan in track(plans, f"{kind}, {hold}", console=console):
                 begun = time.perf_counter()
-                results.append(ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6, jointed=jointed).run())
+                results.append(ArmSimulation(default_cell(), scene, plan, jointed=jointed).run())
                 walls.append(time.perf_counter() - begun)
             rows.append(
                 {

@@ -14,9 +14,10 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, summarise
-from drake_clutter.config import config_yaml, load_config
+from drake_clutter.config import load_config
 from drake_clutter.files import InputError, write_json
 from drake_clutter.resources import git_commit
+from drake_clutter.validation import config_yaml
 from drake_clutter.workers.mapping import map_ordered
 
 PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}

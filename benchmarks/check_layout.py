@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import LayoutConfig
+from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import NodeBudget, SceneGrammar, uniform_choice
 from drake_clutter.scenes.geometry import deepest_penetration
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
@@ -33,7 +33,7 @@ class _Layouts:
         rng = item_rng(2022, index)
         grammar = self._grammars[index % 2]
         derivation = grammar.derive(NodeBudget(int(rng.integers(3, 31))), uniform_choice(rng))
-        scene = lay_out(derivation, grammar.classes, LayoutConfig(), rng)
+        scene = lay_out(derivation, grammar.classes, ClutterConfig(), rng)
         if isinstance(scene, LayoutFailure):
             return scene.reason.value, -np.inf
         return "laid out", deepest_penetration(scene.objects)[0]

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.config import ClutterConfig, config_yaml
+from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.records import recorded
 from drake_clutter.scenes.interfaces import Move, Observation
@@ -28,6 +28,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.validation import config_yaml
 from drake_clutter.workers.mapping import map_ordered
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -165,7 +166,7 @@ class DrakeMoves:
 
     def __init__(self) -> None:
         config = ClutterConfig()
-        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.camera)
+        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.cell.camera)
 
     def __call__(self, item: RandomMove) -> dict[str, Any]:
         """The record of a move."""
@@ -209,9 +210,9 @@ def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
     return scene.at({name: Pose(tuple(v[1:4]), tuple(v[4:])) for name, v in record["settled"].items()})
 
 
-def hidden(record: dict[str, Any], hidden_below: float) -> tuple[str, ...]:
+def hidden(record: dict[str, Any], visibility_threshold: float) -> tuple[str, ...]:
     """What a stable scene hides."""
-    return tuple(name for name, v in record["settled"].items() if v[0] < hidden_below)
+    return tuple(name for name, v in record["settled"].items() if v[0] < visibility_threshold)
 
 
 def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:

@@ -108,7 +108,7 @@ def compare_scenes(
         scenes.pairs[said(found), drake] += 1
         if not isinstance(verdict, CannotJudge) and verdict.stable and drake == "stable":
             both_stable += 1
-            same_hidden += verdict.hidden == hidden(record, config.camera.hidden_below)
+            same_hidden += verdict.hidden == hidden(record, config.cell.camera.visibility_threshold)
         for group in record["groups"]:
             part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
             fall = group["fall"]
@@ -150,7 +150,7 @@ def compare_variants(batch: Batch, default: Sequence[dict[str, Any]], other: Seq
     pairs = list(zip(default, other, strict=False))
     equal = [("settled" in a) == ("settled" in b) for a, b in pairs]
     falls = [(fall(a), fall(b)) for a, b in pairs]
-    below = config_of(batch).camera.hidden_below
+    below = config_of(batch).cell.camera.visibility_threshold
     lists = [hidden(a, below) == hidden(b, below) for a, b in pairs if "settled" in a and "settled" in b]
     return {
         "count": len(pairs),

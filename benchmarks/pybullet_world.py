@@ -6,13 +6,13 @@ from typing import Any
 
 import pybullet
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.scenes.scene import Pose, Scene
 
 
 def label_image() -> Any:
     """The body that the overhead camera sees in each pixel of PyBullet's world."""
-    camera = CameraConfig()
+    camera = default_cell().camera
     view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
     projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
     engine = pybullet.ER_TINY_RENDERER

@@ -45,7 +45,7 @@ def stacks(count: int, nodes: int, seed: int, config: ClutterConfig) -> list[tup
     while len(found) < count:
         rng = item_rng(seed, index)
         index += 1
-        scene = lay_out(RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config.layout, rng)
+        scene = lay_out(RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config, rng)
         if isinstance(scene, LayoutFailure):
             continue
         for group in touching_groups(scene.objects, TOUCHING_MARGIN):
@@ -84,7 +84,7 @@ def main(
         settle_config: SettleConfig = replace(config.settle, **changes)
         chosen = [second if name.startswith("other") else first for first, second in groups]
         stable[name] = [
-            settle(group, config.layout.tray_side, settle_config).instability is None
+            settle(group, config.cell.support, settle_config).instability is None
             for group in track(chosen, name, console=Console(stderr=True))
         ]
     table = Table("setting", "agrees with the default", "stable")

@@ -31,7 +31,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.config import ClutterConfig, config_yaml
+from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.files import write_json
 from drake_clutter.resources import git_commit
@@ -43,6 +43,7 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
+from drake_clutter.validation import config_yaml
 
 CONFIG = ClutterConfig()
 NODES = 25
@@ -119,7 +120,8 @@ class Case:
 
 def generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
     """RG on a tray."""
-    config = replace(CONFIG, layout=replace(CONFIG.layout, tray_side=tray_side))
+    support = CONFIG.cell.support.model_copy(update={"size": (tray_side, tray_side)})
+    config = replace(CONFIG, cell=CONFIG.cell.with_support(support))
     return SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
 
 
@@ -179,7 +181,7 @@ def in_bullet(case: Case) -> tuple[float, float, float, Found]:
         late = poses(scene)
         more_steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(120)])
         stayed = all(
-            max(abs(X.p[:2])) <= scene.tray_side / 2
+            scene.support.contains(*X.p[:2])
             and X.p[2] >= 0
             and np.linalg.norm(X.p - X_first.p) < limits.max_displacement
             and np.linalg.norm(X.p - X_late.p) <= limits.rest_drift
@@ -237,7 +239,7 @@ def measure(what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, Fa
     rows = {name: judge_row(*pair, truth) for name, pair in found.items()}
     rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
 
-    rays, camera = RayCaster(CONFIG.camera), OverheadCamera(CONFIG.camera)
+    rays, camera = RayCaster(CONFIG.cell.camera), OverheadCamera(CONFIG.cell.camera)
     eyes: dict[str, tuple[Callable[[Scene, np.random.Generator], Any], int]] = {
         RAYS: (lambda scene, _: ray_labels(rays, scene), REPEATS),
         VTK: (lambda scene, _: camera.label(scene), 1),
@@ -258,7 +260,7 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
     for case in cases:
         if judge.stability(case.scene) is None:
             shares = judge.rays.visible_shares(case.scene.objects).values()
-            hidden = sum(share < CONFIG.camera.hidden_below for share in shares)
+            hidden = sum(share < CONFIG.cell.camera.visibility_threshold for share in shares)
             parts[HIDDEN[min(hidden, len(HIDDEN) - 1)]].append(case)
     del parts["0"]
     rows: dict[str, Row] = {name: {"count": len(part)} for name, part in parts.items()}
@@ -355,7 +357,7 @@ def main(
 
     fast, drake = FastJudge(CONFIG), DrakeJudge(CONFIG)
     accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, calm_samples=NEVER)))
-    rg, cases = generator(NODES, CONFIG.layout.tray_side, seed), []
+    rg, cases = generator(NODES, CONFIG.cell.support.size[0], seed), []
     for index in range(count):
         rng = item_rng(seed, index)
         cases.append(Case(rg.lay_out(rng)[0], rng))

@@ -127,7 +127,7 @@ def explore(
     limit = max_moves or world.exploration.max_moves
     task = command.explore(command.at_rest(file.scene, world, seed), agent, fidelity.value, limit, seed, world, _report)
     title = f"{agent} explores {scene.name}"
-    fields = command.write_episode(out, task, title, agent, fidelity.value, seed)
+    fields = command.write_episode(out, task, title, agent, fidelity.value, seed, world)
     _print_episode(fields, as_json, out)
 
 
@@ -232,7 +232,7 @@ def move(
         show({"plans": plans} if as_json else command.plans_in_words(plans), as_json, f"{out}")
         return
     task = command.carry_out(command.at_rest(file.scene, world, seed), chosen, seed, world, _report, fidelity.value)
-    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed)
+    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world)
     _print_episode(fields, as_json, out)
 
 
@@ -265,10 +265,11 @@ def run(
 ) -> None:
     """Play the closed loop: camera images in, arm motion out, until nothing is hidden; writes episode.json and a page."""
     from drake_clutter.commands import run as command
-    from drake_clutter.config import load_typed
+    from drake_clutter.config import upgrade
     from drake_clutter.systems.scenario import Scenario
+    from drake_clutter.validation import load_typed
 
-    given = load_typed(Scenario(), scenario, settings or [])
+    given = load_typed(Scenario(), scenario, settings or [], upgrade)
     output_directory(out)
     _print_episode(command.run(given, out, _report), as_json, out)
 
@@ -295,11 +296,12 @@ def view(
     catalogue: CatalogueOption = None,
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
+    from drake_clutter.cell.work_cell import default_cell
     from drake_clutter.scenes.interfaces import Frame
 
     file = load(scene, catalogue)
     shown = file.scene if laid_out else file.settled_scene
-    watch(scene, shown, [Frame(0.0, shown.poses)], html)
+    watch(scene, shown, [Frame(0.0, shown.poses)], default_cell(), html)
 
 
 @app.command()

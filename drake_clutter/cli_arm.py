@@ -31,12 +31,12 @@ def replay(
     from drake_clutter.reports.recording import joined
     from drake_clutter.station.trajectory_file import read_trajectories
 
-    scene, moves = read_trajectories(file, load_catalogue(catalogue))
+    scene, cell, moves = read_trajectories(file, load_catalogue(catalogue))
     if not moves:
         raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
     for number, (move, motion) in enumerate(moves, start=1):
         out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
-    watch(file, scene, joined([motion for _, motion in moves]), html)
+    watch(file, scene, joined([motion for _, motion in moves]), cell, html)
 
 
 PLACE = "X,Y,Z,YAW"
@@ -75,14 +75,18 @@ def feasibility(
     from drake_clutter.commands import feasibility as command
     from drake_clutter.config import load_config
 
+    world = load_config(config)
     job = command.FeasibilityJob(
         command.scene_files(scenes),
         command.setups(
-            [_numbers("--base", text) for text in base or []], [_numbers("--tray", text) for text in tray or []], arm or []
+            [_numbers("--base", text) for text in base or []],
+            [_numbers("--tray", text) for text in tray or []],
+            arm or [],
+            world.cell,
         ),
         command.read_targets(targets) if targets else (),
         seed,
-        load_config(config),
+        world,
         catalogue,
     )
 

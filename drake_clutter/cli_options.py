@@ -17,6 +17,7 @@ from rich.table import Table
 from drake_clutter.files import InputError
 
 if TYPE_CHECKING:
+    from drake_clutter.cell.work_cell import WorkCell
     from drake_clutter.scenes.interfaces import Frame
     from drake_clutter.scenes.scene import Scene
     from drake_clutter.scenes.scene_file import SceneFile
@@ -112,18 +113,18 @@ def tracked(what: str, items: Iterable[Any], done: int, total: int) -> Iterator[
         yield from bar.track(items, total=total, completed=done)
 
 
-def watch(name: Path, scene: "Scene", frames: Sequence["Frame"], html: Path | None) -> None:
+def watch(name: Path, scene: "Scene", frames: Sequence["Frame"], cell: "WorkCell", html: Path | None) -> None:
     """Shows frames in the browser until it is interrupted, or writes them to one HTML file."""
     from drake_clutter.reports.recording import serve, write_recording
 
     if html is not None:
         try:
-            write_recording(html, scene, frames)
+            write_recording(html, scene, frames, cell)
         except OSError as error:
             raise InputError(f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write") from error
         out_console.print(f"wrote {html}")
         return
-    meshcat = serve(scene, frames)
+    meshcat = serve(scene, frames, cell)
     out_console.print(f"{name} is at {meshcat.web_url()}; Ctrl-C ends it")
     while True:
         time.sleep(1)

@@ -1,276 +1,166 @@
 """Every number that the simulated world leaves open, in one place; `docs/calibration.md` argues the defaults."""
 
-import dataclasses
-import json
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any
 
-import numpy as np
-import yaml
-from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
-
-from drake_clutter.files import InputError
+from drake_clutter.cell.work_cell import WorkCell, default_cell
+from drake_clutter.validation import Between, NonNegative, config_class, load_typed, override, to_plain
 
 
-@dataclass
+@config_class
 class LayoutConfig:
-    """How a graph becomes poses on the tray.
+    """How a graph becomes poses on the support.
 
     Attributes:
-        tray_side: m, inner side of the square tray.
-        stack_gap: m, least distance between the footprints of two stacks, and of a stack and the rim.
-        max_stack_height: m, a higher stack is a typed failure.
-        lying_gap: m, between the two objects of a lying pair.
-        standing_gap: m, between the two objects of a standing pair.
-        placement_tries: draws of a stack's place before the layout starts anew, and of new starts.
+        stack_gap: Least distance between the footprints of two stacks, and of a stack and the rim [m].
+        max_stack_height: A higher stack is a typed failure [m].
+        lying_gap: Between the two objects of a lying pair [m].
+        standing_gap: Between the two objects of a standing pair [m].
+        placement_tries: Draws of a stack's place before the layout starts anew, and of new starts.
     """
 
-    tray_side: float = 0.70
-    stack_gap: float = 0.010
-    max_stack_height: float = 0.50
-    lying_gap: float = 0.002
-    standing_gap: float = 0.050
-    placement_tries: int = 100
+    stack_gap: NonNegative = 0.010
+    max_stack_height: NonNegative = 0.50
+    lying_gap: NonNegative = 0.002
+    standing_gap: NonNegative = 0.050
+    placement_tries: Annotated[int, Between(1)] = 100
 
 
-@dataclass
+@config_class
 class SettleConfig:
-    """How Drake settles a scene and what counts as stable (SPEC section 6; DRAKE_NOTES "Verdicts").
+    """How Drake settles a scene and what counts as stable.
 
     Contact properties belong to the assets: see `drake_clutter.assets.contact`.
 
     Attributes:
-        time_step: s.
-        jitter: m, radius of the disc from which each object's random xy offset is drawn.
-        max_displacement: m, a stable object's origin moves less.
-        max_tilt_deg: deg, a stable object turns less (a body of revolution: its axis).
-        max_time: s simulated.
-        rest_drift: m, what went further in the last 0.5 s is "not at rest". Contact chatter and a marker that rocks on the
-            facets of its contact mesh stay below it.
-        calm_speed: m/s; calm_displacement: m, calm_tilt_deg: deg, both since the start. A stack is calm while every object is
-            below all three.
-        calm_samples: calm samples in a row, 0.05 s apart, that end the simulation early.
-        still_displacement: m; so does half a second in which nothing was further than this, or turned by calm_tilt_deg, from
-            where it is: light objects under heavy ones chatter, and are never calm.
+        time_step: Of the simulation [s].
+        jitter: Radius of the disc from which each object's random xy offset is drawn [m].
+        max_displacement: A stable object's origin moves less [m].
+        max_tilt_deg: A stable object turns less (a body of revolution: its axis) [deg].
+        max_time: Simulated at most [s].
+        rest_drift: What went further in the last 0.5 s is not at rest [m]. Contact chatter and a marker that rocks on
+            the facets of its contact mesh stay below it.
+        calm_speed: A stack is calm while every object is below this speed [m/s], and the next two limits.
+        calm_displacement: Since the start [m].
+        calm_tilt_deg: Since the start [deg].
+        calm_samples: Calm samples in a row, 0.05 s apart, that end the simulation early.
+        still_displacement: Half a second in which no object was further than this from where it is [m], or turned by
+            calm_tilt_deg, ends it too: light objects under heavy ones chatter, and are never calm.
     """
 
-    time_step: float = 0.002
-    jitter: float = 0.001
-    max_displacement: float = 0.010
-    max_tilt_deg: float = 8.0
-    max_time: float = 2.0
-    rest_drift: float = 0.0025
-    calm_speed: float = 0.0003
-    calm_displacement: float = 0.001
-    calm_tilt_deg: float = 0.3
-    calm_samples: int = 4
-    still_displacement: float = 0.0005
+    time_step: Annotated[float, Between(1e-4, 0.02)] = 0.002
+    jitter: NonNegative = 0.001
+    max_displacement: NonNegative = 0.010
+    max_tilt_deg: NonNegative = 8.0
+    max_time: Annotated[float, Between(0.1, 60.0)] = 2.0
+    rest_drift: NonNegative = 0.0025
+    calm_speed: NonNegative = 0.0003
+    calm_displacement: NonNegative = 0.001
+    calm_tilt_deg: NonNegative = 0.3
+    calm_samples: Annotated[int, Between(1)] = 4
+    still_displacement: NonNegative = 0.0005
 
 
-@dataclass
-class CameraConfig:
-    """The overhead camera: the colour stream of a RealSense D435 at 640 x 480 (vertical field of view 42.5 deg, data sheet).
-
-    Attributes:
-        width, height: pixels.
-        fov_y_deg: deg, vertical field of view.
-        altitude: m above the tray's floor; the camera looks straight down at the tray's centre.
-        hidden_below: an object is hidden when the camera sees less than this share of its unoccluded pixels.
-    """
-
-    width: int = 640
-    height: int = 480
-    fov_y_deg: float = 42.5
-    altitude: float = 1.60
-    hidden_below: float = 0.30
-
-    @property
-    def focal_length(self) -> float:
-        """Pixels."""
-        return self.height / 2 / math.tan(math.radians(self.fov_y_deg) / 2)
-
-    def project(self, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Column and row (N, 2) of the pixels on which points (N, 3) m in the tray frame fall; whole numbers are their middles.
-
-        Drake's VTK engine draws half a pixel left of and above the principal point that it is given, (width - 1) / 2,
-        (height - 1) / 2: measured in tests/test_camera.py.
-        """
-        distance = self.altitude - p_T[:, 2:]
-        offset = self.focal_length * np.column_stack([p_T[:, 0], -p_T[:, 1]]) / distance
-        return np.asarray(offset + np.array([self.width / 2 - 1, self.height / 2 - 1]))
-
-
-@dataclass
+@config_class
 class ExplorationConfig:
-    """The exploration task (SPEC section 4).
+    """The exploration task.
 
     Attributes:
-        max_moves: moves after which an episode ends.
-        detection_reward: per newly detected object.
-        collapse_penalty: added when a move makes the scene collapse, which ends the episode.
-        clearance: m, kept between a placed object's footprint and anything else the camera sees standing in the way.
-        release_height: m, above its support at which a placed object is let go.
+        max_moves: Moves after which an episode ends.
+        detection_reward: Per newly detected object.
+        collapse_penalty: Added when a move makes the scene collapse, which ends the episode.
+        clearance: Kept between a placed object's footprint and anything else that the camera sees in the way [m].
+        release_height: Above its support, at which a placed object is let go [m].
     """
 
-    max_moves: int = 10
-    detection_reward: float = 1.0
-    collapse_penalty: float = -1.0
-    clearance: float = 0.010
-    release_height: float = 0.001
+    max_moves: Annotated[int, Between(1)] = 10
+    detection_reward: NonNegative = 1.0
+    collapse_penalty: Annotated[float, Between(-1e300, 0.0)] = -1.0
+    clearance: NonNegative = 0.010
+    release_height: NonNegative = 0.001
 
 
-@dataclass
+@config_class
 class ClutterConfig:
-    """The whole simulated world."""
+    """The whole simulated world.
+
+    Attributes:
+        layout: How a graph becomes poses.
+        settle: What counts as stable.
+        exploration: The exploration task.
+        cell: Robot, gripper, support, cameras and fixtures.
+    """
 
     layout: LayoutConfig = field(default_factory=LayoutConfig)
     settle: SettleConfig = field(default_factory=SettleConfig)
-    camera: CameraConfig = field(default_factory=CameraConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    cell: WorkCell = field(default_factory=default_cell)
 
 
-_ANY = (0.0, math.inf)
-_ALLOWED = {
-    "layout.tray_side": (0.1, 2.0),
-    "layout.placement_tries": (1, math.inf),
-    "settle.time_step": (1e-4, 0.02),
-    "settle.max_time": (0.1, 60.0),
-    "settle.calm_samples": (1, math.inf),
-    "camera.width": (16, 4096),
-    "camera.height": (16, 4096),
-    "camera.fov_y_deg": (1.0, 170.0),
-    "camera.altitude": (0.1, 10.0),
-    "camera.hidden_below": (0.0, 1.0),
-    "exploration.max_moves": (1, math.inf),
-    "exploration.collapse_penalty": (-math.inf, 0.0),
-    "task.nodes": (3, 1000),
-    "task.balance_reward": (0.0, math.inf),
-    "task.instability_reward": (-math.inf, 0.0),
-    "learning.steps": (1, math.inf),
-    "learning.environments": (1, math.inf),
-    "learning.batch": (1, math.inf),
-    "learning.steps_per_update": (1, math.inf),
-    "learning.segment": (1, math.inf),
-    "learning.trace": (0.0, 1.0),
-    "learning.replay": (1, math.inf),
-    "learning.halve_every": (1, math.inf),
-    "learning.temperature": (1e-6, math.inf),
-    "learning.target_rate": (0.0, 1.0),
-    "learning.width": (1, math.inf),
-    "learning.episodes": (1, math.inf),
-    "learning.passes": (1, math.inf),
-    "learning.discount": (0.0, 1.0),
-    "learning.clip": (1e-6, math.inf),
-    "learning.rounds": (1, math.inf),
-    "learning.updates": (1, math.inf),
-    "max_moves": (1, math.inf),
-    "most_objects": (1, 64),
-    "evaluation_episodes": (1, math.inf),
-    "base": (-360.0, 360.0),
-    "home": (-2 * math.pi, 2 * math.pi),
-    "suction.cup_diameter": (0.005, 0.1),
-    "suction.cup_length": (0.005, 0.1),
-    "suction.extension": (0.01, 0.5),
-    "suction.stroke": (0.001, 0.05),
-    "suction.stiffness": (100.0, 1e5),
-    "suction.vacuum": (0.01, 1.0),
-    "suction.friction": (0.01, 10.0),
-    "nodes": (3, 1000),
-    "suction.safety": (1.0, 100.0),
-    "evaluate_every": (1, math.inf),
-    "evaluation_scenes": (1, math.inf),
-    "save_every": (1, math.inf),
-}
-"""Least and greatest value of a field, by its last two names or else by its last; of every other number, `_ANY`."""
+def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> ClutterConfig:
+    """Return the simulated world, see `load_typed`."""
+    return load_typed(ClutterConfig(), path, settings, upgrade)
 
 
-def _check(given: Any, defaults: Any, source: str, where: str = "") -> None:
-    """Refuses fields that the defaults lack, values of another kind, and numbers out of range."""
-    names = [item.name for item in dataclasses.fields(defaults)]
+def upgrade(given: Any) -> Any:
+    """Return a config document with the fields of version 0.1 (camera, layout.tray_side, arm) moved into its cell."""
     if not isinstance(given, dict):
-        raise InputError(f"{source}: {where or 'the file'}: {given!r}; allowed is a mapping with some of {', '.join(names)}")
-    for name, value in given.items():
-        field = f"{where}.{name}" if where else str(name)
-        if name not in names:
-            raise InputError(f"{source}: {field}: is unknown; allowed are {', '.join(names)}")
-        default = getattr(defaults, name)
-        if dataclasses.is_dataclass(default):
-            _check(value, default, source, field)
-        elif isinstance(default, bool | str):
-            if type(value) is not type(default):
-                raise InputError(
-                    f"{source}: {field}: {value!r}; allowed is {'a text' if isinstance(default, str) else 'a truth value'}"
-                )
-        elif isinstance(default, list):
-            if not isinstance(value, list) or len(value) != len(default):
-                raise InputError(f"{source}: {field}: {value!r}; allowed is a list of {len(default)} numbers")
-            for number in value:
-                _check_number(number, default[0], source, field)
-        else:
-            _check_number(value, default, source, field)
+        return given
+    made = {key: upgrade(value) for key, value in given.items()}
+    cell: dict[str, Any] = {}
+    if isinstance(camera := made.get("camera"), dict):
+        del made["camera"]
+        cell["cameras"] = {"overhead": _camera(camera)}
+    if isinstance(layout := made.get("layout"), dict) and "tray_side" in layout:
+        made["layout"] = {key: value for key, value in layout.items() if key != "tray_side"}
+        cell["support"] = {"size": [layout["tray_side"]] * 2}
+    if isinstance(arm := made.get("arm"), dict):
+        del made["arm"]
+        world = made.setdefault("world", {})
+        world["cell"] = {**world.get("cell", {}), **upgrade_cell(arm)}
+    if cell:
+        made["cell"] = {**cell, **made.get("cell", {})}
+    return made
 
 
-def _check_number(value: Any, default: float, source: str, field: str) -> None:
-    names = field.split(".")
-    low, high = _ALLOWED.get(".".join(names[-2:]), _ALLOWED.get(names[-1], _ANY))
-    kind = int if isinstance(default, int) else (int, float)
-    if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high or not abs(value) < 1e300:
-        whole = "a whole number" if isinstance(default, int) else "a finite number"
-        raise InputError(f"{source}: {field}: {value!r}; allowed is {whole} from {low:g} to {high:g}")
+def upgrade_head(given: Any) -> Any:
+    """Return a document that holds configs of version 0.1, with complete cells instead of their cameras and arms."""
+    return _with_complete_cells(upgrade(given))
 
 
-Config = TypeVar("Config")
+def _with_complete_cells(given: Any) -> Any:
+    if not isinstance(given, dict):
+        return given
+    made = {key: _with_complete_cells(value) for key, value in given.items()}
+    if isinstance(cell := made.get("cell"), dict):
+        made["cell"] = to_plain(override(default_cell(), cell, "cell"))
+    return made
 
 
-def load_typed(defaults: Config, path: Path | None = None, settings: Sequence[str] = ()) -> Config:
-    """A config: the defaults, with the fields that a YAML file names put over them, and single fields over those.
-
-    Args:
-        defaults: a dataclass, all fields set.
-        path: the file.
-        settings: such as "camera.altitude=2".
-
-    Raises:
-        InputError: the file cannot be read, an unknown field, or a value that is not allowed.
-    """
-    config = defaults
-    if path is not None:
-        try:
-            given = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-        except Exception as error:  # as in scenes/scene_file.py
-            raise InputError(f"{path}: is not YAML ({error}); allowed is a mapping of config fields") from error
-        config = _over(config, given, str(path))
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        try:
-            given = yaml.safe_load(text)
-        except yaml.YAMLError:
-            equals = ""
-        if not equals:
-            raise InputError(f"--set {setting}: allowed is FIELD=VALUE, such as camera.altitude=2")
-        for part in reversed(name.split(".")):
-            given = {part: given}
-        config = _over(config, given, f"--set {setting}")
-    return config
+def _camera(old: dict[str, Any]) -> dict[str, Any]:
+    camera = {key: value for key, value in old.items() if key not in ("altitude", "hidden_below")}
+    if "altitude" in old:
+        camera["pose"] = {"translation": [0.0, 0.0, old["altitude"]], "rpy_deg": [180.0, 0.0, 0.0]}
+    if "hidden_below" in old:
+        camera["visibility_threshold"] = old["hidden_below"]
+    return camera
 
 
-def _over(defaults: Config, given: Any, source: str) -> Config:
-    _check(given, defaults, source)
-    over: Config = yaml_load_typed(schema=type(defaults), data=json.dumps(given), defaults=defaults)
-    return over
-
-
-def load_config(path: Path | None = None) -> ClutterConfig:
-    """The simulated world, see `load_typed`."""
-    return load_typed(ClutterConfig(), path)
-
-
-def config_yaml(config: Any) -> str:
-    """A config as YAML, every field written out."""
-    return str(yaml_dump_typed(config, schema=type(config)))
+def upgrade_cell(old: Any) -> Any:
+    """Return a cell's document with the arm of version 0.1 (base, home, suction, payload) as its robot and gripper."""
+    if not isinstance(old, dict):
+        return old
+    robot = {key: old[key] for key in ("home", "payload") if key in old}
+    made = {key: value for key, value in old.items() if key not in ("home", "payload", "suction", "base")}
+    base = old.get("base")
+    if isinstance(base, list) and len(base) == 4:
+        robot["base"] = {"translation": base[:3], "rpy_deg": [0.0, 0.0, base[3]]}
+    elif "base" in old:
+        made["base"] = base
+    if robot:
+        made["robot"] = robot
+    if "suction" in old:
+        made["gripper"] = old["suction"]
+    return made

@@ -10,7 +10,12 @@ from drake_clutter.files import InputError
 from drake_clutter.resources import git_commit
 
 
-def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterable[Any]]) -> Generator[Any, None, None]:
+def recorded(
+    path: Path,
+    asked: Mapping[str, Any],
+    make: Callable[[int], Iterable[Any]],
+    upgrade: Callable[[Any], Any] = lambda head: head,
+) -> Generator[Any, None, None]:
     """The head of a file, its records, and then those that it lacks, each added to it as soon as it is made.
 
     The head, the first line, says what was asked and at which `commit` the file was begun. A line that was cut off
@@ -20,6 +25,7 @@ def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterabl
         path: the file; made, with its folders, if it is not there.
         asked: all that decides what the records are.
         make: told how many records are there, makes those that follow.
+        upgrade: Turns the head that an older version wrote into today's form.
 
     Raises:
         InputError: the file holds records of something else, or another run is adding to it.
@@ -41,7 +47,8 @@ def recorded(path: Path, asked: Mapping[str, Any], make: Callable[[int], Iterabl
             file.write(lines[0])
             file.flush()
         head, *records = map(json.loads, lines)
-        differing = ", ".join(key for key, value in asked.items() if head.get(key) != value)
+        upgraded = upgrade(head)
+        differing = ", ".join(key for key, value in asked.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(f"{path}: holds records of something else ({differing}); give the same options or another folder")
         yield head

@@ -3,15 +3,16 @@
 Schemas are pydantic models or pydantic dataclasses. `Between` and `NonEmpty` are the annotations for what a value may be.
 """
 
+import dataclasses
 import json
 import math
 import reprlib
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform
 
+import pydantic.dataclasses
 import yaml
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
@@ -44,6 +45,7 @@ _KINDS = {
     "finite_number": "a finite number",
 }
 """What is allowed, by pydantic's type of the error."""
+_ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
 
 
 @dataclass(frozen=True)
@@ -96,19 +98,23 @@ Vector3 = tuple[Finite, Finite, Finite]
 """Three finite numbers."""
 
 
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def config_class(cls: type[Schema]) -> type[Schema]:
+    """Return a class as a frozen, validated dataclass that takes no field but those that are declared."""
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))(cls)
+    return cast(type[Schema], made)
+
+
 class Model(BaseModel):
     """Base of what is read from files: frozen, and no field but those that are declared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,), arbitrary_types_allowed=True)
 
 
-@cache
-def _cached_adapter(schema: Hashable) -> TypeAdapter[Any]:
-    return TypeAdapter(schema)
-
-
 def _adapter(schema: Any) -> TypeAdapter[Any]:
-    return _cached_adapter(schema)
+    if schema not in _ADAPTERS:
+        _ADAPTERS[schema] = TypeAdapter(schema)
+    return _ADAPTERS[schema]
 
 
 def validate(schema: type[Schema], given: Any, source: str) -> Schema:
@@ -207,12 +213,30 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
         InputError: It cannot be read, or is not YAML.
     """
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); allowed is {allowed_content}") from error
-    except Exception as error:  # PyYAML and the decoder raise many kinds for damaged files
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not YAML ({error}); allowed is {allowed_content}") from error
+    return parse_yaml(text, str(path), allowed_content)
+
+
+def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
+    """Return what a YAML text holds.
+
+    Args:
+        text: The text.
+        source: Where it was read, for the message.
+        allowed_content: What it may hold, for the message.
+
+    Raises:
+        InputError: It is not YAML.
+    """
+    try:
+        return yaml.load(text, Loader=yaml.CSafeLoader)
+    except Exception as error:  # PyYAML's constructors raise many kinds for a bad date, number or nesting
         words = " ".join(str(error).split())
-        raise InputError(f"{path}: is not YAML ({words}); allowed is {allowed_content}") from error
+        raise InputError(f"{source}: is not YAML ({words}); allowed is {allowed_content}") from error
 
 
 def load_typed(
@@ -235,9 +259,9 @@ def load_typed(
     config = defaults
     if path is not None:
         given = read_yaml(path, "a mapping of config fields")
-        config = _over(config, convert({} if given is None else given), str(path))
+        config = override(config, convert({} if given is None else given), str(path))
     for setting in settings:
-        config = _over(config, convert(parse_setting(setting, to_plain(config))), f"--set {setting}")
+        config = override(config, convert(parse_setting(setting, to_plain(config))), f"--set {setting}")
     return config
 
 
@@ -283,7 +307,12 @@ def _at(plain: Any, parts: Sequence[str]) -> Any:
     return plain
 
 
-def _over(defaults: Schema, given: Any, source: str) -> Schema:
+def override(defaults: Schema, given: Any, source: str) -> Schema:
+    """Return a config with the fields of a document over its own.
+
+    Raises:
+        InputError: The first field that cannot be used.
+    """
     if not isinstance(given, dict):
         names = ", ".join(_fields_at(type(defaults), ()))
         raise InputError(f"{source}: the file: {_shown(given)}; allowed is a mapping with some of {names}")

@@ -12,7 +12,9 @@ import pytest
 from hypothesis import settings
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.cell.support import Support
+from drake_clutter.cell.work_cell import WorkCell, default_cell
+from drake_clutter.config import ClutterConfig, load_config
 from drake_clutter.grammar import NodeBudget, Orientation, SceneGrammar, resting_rotation, uniform_choice
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.layout import lay_out
@@ -20,6 +22,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.validation import load_typed
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
@@ -27,6 +30,10 @@ settings.load_profile("repeatable")
 CATALOGUE = load_catalogue()
 CLASSES = CATALOGUE.classes
 GRAMMARS = {name: SceneGrammar(CATALOGUE.object_set(name)) for name in ("ycb7", "pantry14")}
+
+DEFAULT_CELL = default_cell()
+TRAY = DEFAULT_CELL.support
+WORLD = ClutterConfig()
 
 
 def resting(
@@ -43,9 +50,24 @@ def resting(
     return SceneObject(name or class_name, object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest)))
 
 
-def scene_of(*objects: SceneObject, tray_side: float = 0.70) -> Scene:
-    """A scene without a graph."""
-    return Scene(objects, tray_side)
+def tray(side: float) -> Support:
+    """The default tray with another inner side, m."""
+    return DEFAULT_CELL.support.model_copy(update={"size": (side, side)})
+
+
+def cell_with(*settings: str) -> WorkCell:
+    """The default cell with some fields changed, such as "robot.base.x=-0.8"."""
+    return load_typed(DEFAULT_CELL, settings=settings)
+
+
+def world_with(*settings: str) -> ClutterConfig:
+    """The default config with some fields changed, such as "settle.jitter=0.003"."""
+    return load_config(settings=settings)
+
+
+def scene_of(*objects: SceneObject, side: float = 0.70) -> Scene:
+    """A scene without a graph, on a tray of an inner side, m."""
+    return Scene(objects, tray(side))
 
 
 def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "ycb7") -> Scene:
@@ -54,7 +76,7 @@ def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "yc
     while True:
         budget = NodeBudget(int(generator.integers(fewest, most + 1)))
         derivation = GRAMMARS[objects].derive(budget, uniform_choice(generator))
-        scene = lay_out(derivation, CLASSES, LayoutConfig(), generator, seed)
+        scene = lay_out(derivation, CLASSES, ClutterConfig(), generator, seed)
         if isinstance(scene, Scene):
             return scene
 
@@ -103,7 +125,7 @@ def fast(config: ClutterConfig) -> FastJudge:
 @pytest.fixture(scope="session")
 def detector(config: ClutterConfig) -> LabelDetector:
     """One detector for all tests, for the same reason."""
-    return LabelDetector(config.camera)
+    return LabelDetector(config.cell.camera)
 
 
 @pytest.fixture(scope="session")

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.cell.suction import SuctionConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
@@ -36,7 +35,7 @@ PLACE = Pose((0.2, -0.2, 0.0885), SCENE["sugar_box"].X_TO.quaternion)
 
 
 def planned(scene: Scene = SCENE, pick: str = "sugar_box", X_TO: Pose = PLACE) -> Plan:
-    found = PickPlacePlanner(ArmConfig(), PlannerConfig(), 0.70, 1.60).plan(scene.objects, pick, X_TO)
+    found = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan(scene.objects, pick, X_TO)
     assert isinstance(found, Plan)
     return found
 
@@ -46,8 +45,8 @@ def plan() -> Plan:
     return planned()
 
 
-def run(plan: Plan, arm: ArmConfig | None = None, jointed: bool = False) -> Carried:
-    return ArmSimulation(arm or ArmConfig(), SCENE, plan, camera_altitude=1.6, jointed=jointed).run()
+def run(plan: Plan, cell: WorkCell | None = None, jointed: bool = False) -> Carried:
+    return ArmSimulation(cell or DEFAULT_CELL, SCENE, plan, jointed=jointed).run()
 
 
 def test_placed_where_it_should_be(plan: Plan) -> None:
@@ -71,15 +70,15 @@ def test_a_locked_joint_does_not_slip(plan: Plan) -> None:
 
 def test_a_vacuum_that_fails_drops_the_object(plan: Plan) -> None:
     """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
-    carried = run(plan, ArmConfig(suction=SuctionConfig(vacuum=0.1)))
+    carried = run(plan, cell_with("gripper.vacuum=0.1"))
     assert carried.sealed
-    on = scheduled(plan, ArmConfig()).suction_on
+    on = scheduled(plan, DEFAULT_CELL).suction_on
     assert on < carried.dropped < on + DWELL + 0.5, "as soon as it is lifted"
     assert carried.place_error > 0.2
 
 
 def test_without_a_seal_nothing_is_lifted(plan: Plan) -> None:
-    carried = run(plan, ArmConfig(suction=SuctionConfig(unevenness=-1.0)))
+    carried = run(plan, cell_with("gripper.unevenness=0"))
     assert not carried.sealed
     assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
 
@@ -95,14 +94,14 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
 
 
 def test_the_schedule(plan: Plan) -> None:
-    schedule = scheduled(plan, ArmConfig())
+    schedule = scheduled(plan, DEFAULT_CELL)
     assert [name for name, _ in schedule.starts] == ["approach", "grasp", "carry", "release", "retreat"]
     assert schedule.end == pytest.approx(plan.duration + 2 * DWELL)
     assert schedule.phase(0.0) == "approach"
     assert schedule.phase(schedule.suction_on) == "grasp"
     assert schedule.phase(schedule.suction_off + 0.01) == "release"
     assert schedule.phase(schedule.end) == "idle"
-    home = np.concatenate([ArmConfig().home, np.zeros(6)])
+    home = np.concatenate([DEFAULT_CELL.robot.home, np.zeros(6)])
     assert schedule.command.value(0.0).ravel()[:12] == pytest.approx(home, abs=1e-3)
     assert schedule.command.value(schedule.end).ravel()[:12] == pytest.approx(home, abs=1e-3)
 
@@ -113,10 +112,10 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(too_
     stands = resting("pudding_box", Orientation.UPRIGHT_0)
     taken_for = resting("sugar_box", Orientation.UPRIGHT_0, floor=-too_tall, name=stands.name) if too_tall else stands
     X_TO = Pose((0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion)
-    guarded = PickPlacePlanner(ArmConfig(), PlannerConfig(descent=0.08), 0.70, 1.60)
+    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, Plan)
-    simulation = ArmSimulation(ArmConfig(), scene_of(stands), plan, camera_altitude=1.6)
+    simulation = ArmSimulation(DEFAULT_CELL, scene_of(stands), plan)
     carried = simulation.run()
     assert simulation.running.lowered == pytest.approx(too_tall + 0.003, abs=0.002)
     assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
@@ -128,9 +127,9 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
     top = support.top
     X_TO = Pose((0.2, -0.2, top - 0.0105 + 0.0875), box.X_TO.quaternion)
     slow = PlannerConfig(descent=0.08, optimise=False)
-    plan = PickPlacePlanner(ArmConfig(), slow, 0.70, 1.60).plan([box], box.name, X_TO)
+    plan = PickPlacePlanner(DEFAULT_CELL, slow).plan([box], box.name, X_TO)
     assert isinstance(plan, Plan)
-    simulation = ArmSimulation(ArmConfig(), scene_of(box, support), plan, camera_altitude=1.6)
+    simulation = ArmSimulation(DEFAULT_CELL, scene_of(box, support), plan)
     carried = simulation.run()
     assert simulation.running.lowered < 0.002
     assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
@@ -138,10 +137,10 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
 
 
 def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
-    guarded = PickPlacePlanner(ArmConfig(), PlannerConfig(descent=0.08), 0.70, 1.60).plan(SCENE.objects, "sugar_box", PLACE)
+    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08)).plan(SCENE.objects, "sugar_box", PLACE)
     assert isinstance(guarded, Plan)
     assert guarded.depth == pytest.approx(0.08)
-    simulation = ArmSimulation(ArmConfig(suction=SuctionConfig(unevenness=-1.0)), SCENE, guarded, camera_altitude=1.6)
+    simulation = ArmSimulation(cell_with("gripper.unevenness=0"), SCENE, guarded)
     simulation.run()
     assert simulation.running.lowered < 0.002
 
@@ -149,10 +148,10 @@ def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
 @pytest.mark.parametrize("jointed", ["", "sugar_box"])
 def test_cameras_see_things_where_they_are(jointed: str) -> None:
     classes = [(o.name, o.object_class) for o in SCENE.objects]
-    options: dict[str, Any] = {"tray_side": 0.7, "camera_altitude": 1.6, "time_step": 0.01, "jointed": jointed, "visuals": True}
-    station = ClutterStation(ArmConfig(), classes, **options)
+    options: dict[str, Any] = {"time_step": 0.01, "jointed": jointed, "visuals": True}
+    station = ClutterStation(DEFAULT_CELL, classes, **options)
     root = station.CreateDefaultContext()
-    station.set_scene(root, np.array(ArmConfig().home), SCENE.objects)
+    station.set_scene(root, np.array(DEFAULT_CELL.robot.home), SCENE.objects)
     query, poses = (station.GetOutputPort(name).Eval(root) for name in ("query", "body_poses"))
     inspector, compared = query.inspector(), 0
     for geometry in inspector.GetAllGeometryIds():
@@ -167,16 +166,16 @@ def test_cameras_see_things_where_they_are(jointed: str) -> None:
 
 
 def test_an_executor_without_a_plan_stays_at_home() -> None:
-    executor = PickPlaceExecutor(config=ArmConfig())
+    executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
-    assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(ArmConfig().home)
+    assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(DEFAULT_CELL.robot.home)
     assert executor.GetOutputPort("suction").Eval(context)[0] == 0
     assert executor.GetOutputPort("status").Eval(context) == "idle"
 
 
 def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     """The executor's state is in its context, not in the system."""
-    executor = PickPlaceExecutor(config=ArmConfig())
+    executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
     executor.GetInputPort("plan").FixValue(context, plan)
     simulator = Simulator(executor, context)
@@ -187,8 +186,8 @@ def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     for port in ("command", "suction"):
         first, second = (executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone))
         assert (first == second).all()
-    assert executor.GetOutputPort("status").Eval(clone.get_context()) == scheduled(plan, ArmConfig()).phase(2.0)
-    assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(ArmConfig().home)
+    assert executor.GetOutputPort("status").Eval(clone.get_context()) == scheduled(plan, DEFAULT_CELL).phase(2.0)
+    assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(DEFAULT_CELL.robot.home)
 
 
 def test_the_same_plan_has_the_same_outcome(plan: Plan) -> None:
@@ -221,21 +220,21 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
 
 
 def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None:
-    motion = ArmSimulation(ArmConfig(), SCENE, plan, camera_altitude=1.6).run(record=True).motion
+    motion = ArmSimulation(DEFAULT_CELL, SCENE, plan).run(record=True).motion
     assert motion[0].arm is not None
-    assert motion[0].arm.q == pytest.approx(ArmConfig().home, abs=0.01)
+    assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)
     moments = arm_moments(motion, "sugar_box")
     times = [frame.time for frame in moments]
     assert times == sorted(times)
     assert moments[0].poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.01)
     assert moments[1].poses["sugar_box"].p[2] > 0.1
     assert moments[2].poses["sugar_box"].p[:2] == pytest.approx(PLACE.p[:2], abs=0.005)
-    picture = strip(SCENE, moments)
+    picture = strip(SCENE, moments, DEFAULT_CELL)
     assert picture.shape == (480, 4 * 480, 3)
     quarters = np.split(picture.astype(int), 4, axis=1)
     assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"
-    write_recording(tmp_path / "with.html", SCENE, motion[::8])
-    write_recording(tmp_path / "without.html", SCENE, [replace(frame, arm=None) for frame in motion[::8]])
+    write_recording(tmp_path / "with.html", SCENE, motion[::8], DEFAULT_CELL)
+    write_recording(tmp_path / "without.html", SCENE, [replace(frame, arm=None) for frame in motion[::8]], DEFAULT_CELL)
     with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))
     assert with_arm > without + 20_000, "its links, and their key frames"
 
@@ -245,6 +244,6 @@ def test_what_is_put_on_an_edge_falls() -> None:
     scene = scene_of(resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0)))
     beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
     plan = planned(scene, "gelatin_box", beside)
-    carried = ArmSimulation(ArmConfig(), scene, plan, camera_altitude=1.6).run()
+    carried = ArmSimulation(DEFAULT_CELL, scene, plan).run()
     assert carried.sealed
     assert carried.poses["gelatin_box"].translation[2] < 0.1

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from conftest import DEFAULT_CELL
 from PIL import Image
 from pydrake.geometry import ProximityProperties, Role
 from pydrake.multibody.parsing import Parser
@@ -21,9 +22,8 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_clutter.assets import MOTIFS, build_assets, build_class
 from drake_clutter.assets.contact import FRICTION, HYDROELASTIC_MODULUS
 from drake_clutter.assets.textures import draw_texture
-from drake_clutter.assets.tray import tray_sdf
 from drake_clutter.catalogue import ObjectClass, Rest, Shape, load_catalogue
-from drake_clutter.config import CameraConfig, LayoutConfig
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 
@@ -238,24 +238,21 @@ def test_keeps_files_that_it_did_not_build(tmp_path: Path) -> None:
     assert (tmp_path / "block" / "scan.stl").read_text() == "mine"
 
 
-def test_station() -> None:
-    plant, contacts = plant_of("package://drake_clutter_models/station.dmd.yaml", shipped_path("models/package.xml"))
-    assert plant.num_positions() == 0
+def test_the_tray(tmp_path: Path) -> None:
+    (tmp_path / "tray.sdf").write_text(support_sdf(DEFAULT_CELL.support))
+    (tmp_path / "package.xml").write_text("<package><name>it</name></package>")
+    plant, contacts = plant_of("package://it/tray.sdf", tmp_path / "package.xml")
+    assert len(contacts) == 5
     for contact in contacts:
         check_contact(contact, rigid=True)
-    X_TC = plant.GetFrameByName("camera").CalcPoseInWorld(plant.CreateDefaultContext())
-    assert X_TC.translation() == pytest.approx([0, 0, CameraConfig().altitude])
-    assert X_TC.rotation().matrix()[:, 2] == pytest.approx([0, 0, -1])
-
-
-def test_the_shipped_tray_is_the_default_config_s() -> None:
-    assert shipped_path("models/tray.sdf").read_text() == tray_sdf(LayoutConfig().tray_side)
+    assert plant.num_bodies() == 2
 
 
 def test_the_builder_leaves_drake_s_reader_alone() -> None:
     """CoACD, loaded before Drake, makes Drake's SDF reader throw."""
     code = (
         "import drake_clutter.assets, drake_clutter.simulation.plant as p; from pydrake.systems.framework import DiagramBuilder;"
-        "p.add_scene_plant(DiagramBuilder(), [], 0.7, 0.01, visuals=False)"
+        "from drake_clutter.cell.work_cell import default_cell;"
+        "p.add_scene_plant(DiagramBuilder(), [], default_cell().support, 0.01, visuals=False)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,7 +6,7 @@ from conftest import resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -48,7 +48,7 @@ def test_an_object_under_a_larger_one_is_hidden(camera: OverheadCamera) -> None:
 
 
 def test_hidden_is_below_the_threshold_in_order() -> None:
-    camera = OverheadCamera(CameraConfig(hidden_below=0.25))
+    camera = OverheadCamera(Camera.over(1.6, visibility_threshold=0.25))
     assert camera.hidden({"b": 0.0, "a": 0.2499, "c": 0.25, "d": 1.0}) == ("b", "a")
 
 
@@ -157,7 +157,7 @@ def test_project_by_hand(camera: OverheadCamera) -> None:
     assert points - middle == pytest.approx(f * np.array([[0, 0], [0.1, 0], [0, -0.1], [0.2, -0.2]]))
 
 
-def test_images_do_not_depend_on_what_was_rendered_before(config_camera: CameraConfig) -> None:
+def test_images_do_not_depend_on_what_was_rendered_before(config_camera: Camera) -> None:
     """Scene A, then one that needs a larger pool, then A again; a camera that has seen only A; one that began with the other."""
     camera = OverheadCamera(config_camera)
     first = camera.render(SCATTERED)
@@ -171,12 +171,12 @@ def test_images_do_not_depend_on_what_was_rendered_before(config_camera: CameraC
 
 
 @pytest.fixture(scope="module")
-def config_camera() -> CameraConfig:
-    return CameraConfig(width=320, height=240)
+def config_camera() -> Camera:
+    return Camera.over(1.6, width=320, height=240)
 
 
 def test_the_order_of_objects_changes_labels_alone(camera: OverheadCamera) -> None:
-    backwards = Scene(SCATTERED.objects[::-1], SCATTERED.tray_side)
+    backwards = Scene(SCATTERED.objects[::-1], SCATTERED.support)
     one, other = camera.render(SCATTERED), camera.render(backwards)
     assert np.array_equal(one.color, other.color)
     assert np.array_equal(one.depth, other.depth)
@@ -186,7 +186,7 @@ def test_the_order_of_objects_changes_labels_alone(camera: OverheadCamera) -> No
 def test_another_tray_is_drawn(camera: OverheadCamera) -> None:
     """The floor ends at the rim, 25 mm high: the depth along a row through the tray tells its side."""
     for side in (0.50, 0.70):
-        depth = camera.render(scene_of(resting("large_marker", name="m"), tray_side=side)).depth[200]
+        depth = camera.render(scene_of(resting("large_marker", name="m"), side=side)).depth[200]
         floor = np.flatnonzero(np.abs(depth - 1.60) < 0.001)
         visible = (floor[-1] - floor[0]) / camera.config.focal_length * 1.60
         assert visible == pytest.approx(side, abs=0.02)
@@ -219,7 +219,7 @@ def test_the_detector_reports_what_is_not_hidden(detector: LabelDetector) -> Non
     with pytest.raises(KeyError, match="'gelatin' is not in view; in view are cover, marker"):
         observation["gelatin"]
     assert np.array_equal(observation.depth, images.depth)
-    assert observation.tray_side == scene.tray_side
+    assert observation.support == scene.support
 
 
 def test_detections_of_a_random_heap_are_those_above_the_threshold(detector: LabelDetector) -> None:

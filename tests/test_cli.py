@@ -189,7 +189,7 @@ def broken(**changes: object) -> str:
         (("generate", "--out", "full"), ("full", "not empty")),
         (("generate", "--out", "scene.yaml"), ("scene.yaml", "is a file")),
         (("generate", "--catalogue", "full", "--out", "new"), ("catalogue.yaml",)),
-        (("generate", "--config", "config.yaml", "--out", "new"), ("config.yaml", "hidden_below")),
+        (("generate", "--config", "config.yaml", "--out", "new"), ("config.yaml", "visibility_threshold")),
         (("explore", "missing.yaml", "--out", "new"), ("missing.yaml",)),
         (("explore", "unknown.yaml", "--out", "new"), ("unknown.yaml", "objects[0].class", "teapot")),
         (("explore", "overlap.yaml", "--out", "new"), ("overlap.yaml", "above", "below", "mm")),
@@ -206,7 +206,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
-    (tmp_path / "config.yaml").write_text("camera: {hidden_below: -1}")
+    (tmp_path / "config.yaml").write_text("camera: {visibility_threshold: -1}")
     (tmp_path / "unknown.yaml").write_text(broken(objects=[{"name": "a", "class": "teapot", "X_TO": ALONE}]))
     (tmp_path / "overlap.yaml").write_text(broken(objects=[BELOW, {**ABOVE, "X_TO": {**ALONE, "translation": [0.0, 0.0, 0.05]}}]))
     high = {**ALONE, "translation": [0.0, 0.0, 0.3]}

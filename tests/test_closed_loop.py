@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import DEFAULT_CELL, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.agents.exploration import LargestClear
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.config import ClutterConfig, upgrade
 from drake_clutter.files import InputError
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
@@ -32,15 +31,16 @@ from drake_clutter.systems.scenario import Scenario, policy_of
 from drake_clutter.systems.scene_perception import for_who_sees
 from drake_clutter.tasks.exploration import Decision, EpisodeEnd, legal_moves
 from drake_clutter.tasks.exploration_graph import seen
+from drake_clutter.validation import load_typed
 
 COVERED = scene_of(
     resting("gelatin_box", xy=(0.05, 0.0)),
     resting("cracker_box", xy=(0.05, 0.0), floor=0.028),
 )
-BEFORE = RayCaster(ClutterConfig().camera).observe(COVERED)[0]
+BEFORE = RayCaster(ClutterConfig().cell.camera).observe(COVERED)[0]
 ASIDE = COVERED.at({"cracker_box": resting("cracker_box", xy=(0.05, 0.25)).X_TO})
 NO_SEAL = NoPlan(PlanFailure.NO_SEAL, "it")
-AFTER = RayCaster(ClutterConfig().camera).observe(ASIDE)[0]
+AFTER = RayCaster(ClutterConfig().cell.camera).observe(ASIDE)[0]
 
 
 def first_allowed(
@@ -81,7 +81,7 @@ class Bench:
 
 
 def a_plan() -> Plan:
-    made = PickPlacePlanner(ArmConfig(), PlannerConfig(optimise=False), 0.70, 1.60).plan(
+    made = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimise=False)).plan(
         COVERED.objects, "cracker_box", Pose((0.05, 0.25, 0.031), COVERED["cracker_box"].X_TO.quaternion)
     )
     assert isinstance(made, Plan)
@@ -191,7 +191,7 @@ def test_the_planner_answers_each_request_once() -> None:
 
 def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     """A marker, which no cup can hold, is refused; the cover goes aside, and the box below it is found."""
-    scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.tray_side)
+    scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.support)
     agent, names = LargestClear(), list[str]()
 
     def marker_first(known: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], *others: Any) -> Decision:
@@ -223,8 +223,9 @@ def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
     (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
-    told = load_typed(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"])
-    assert (told.arm.base, told.arm.payload, told.arm.suction.cup_diameter) == ([-0.65, 0.0, 0.3, 0.0], 5.0, 0.015)
+    told = load_typed(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade)
+    cell = told.world.cell
+    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == ((-0.65, 0.0, 0.3), 5.0, 0.015)
     with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
         policy_of("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):

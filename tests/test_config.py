@@ -1,11 +1,15 @@
-"""The config: defaults, a user's file over them, and what is refused."""
+"""The config: defaults, a user's file over them, what older files say, and what is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import DEFAULT_CELL, tray, world_with
 
-from drake_clutter.config import CameraConfig, ClutterConfig, config_yaml, load_config
+from drake_clutter.cell.camera import Camera
+from drake_clutter.config import ClutterConfig, load_config
 from drake_clutter.files import InputError
+from drake_clutter.validation import config_yaml
 
 
 def config_file(folder: Path, text: str) -> Path:
@@ -16,39 +20,47 @@ def config_file(folder: Path, text: str) -> Path:
 
 def test_defaults() -> None:
     assert load_config() == ClutterConfig()
-    assert load_config() is not load_config()
 
 
 def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
-    config = load_config(config_file(tmp_path, "camera: {altitude: 2}\nexploration: {collapse_penalty: -2.5}\n"))
+    config = load_config(config_file(tmp_path, "settle: {max_time: 3}\nexploration: {collapse_penalty: -2.5}\n"))
     expected = ClutterConfig()
-    expected.camera.altitude = 2.0
-    expected.exploration.collapse_penalty = -2.5
+    expected = replace(
+        expected,
+        settle=replace(expected.settle, max_time=3.0),
+        exploration=replace(expected.exploration, collapse_penalty=-2.5),
+    )
     assert config == expected
 
 
+def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
+    text = "camera: {altitude: 2, width: 320, hidden_below: 0.2}\nlayout: {tray_side: 0.5, stack_gap: 0.02}\n"
+    config = load_config(config_file(tmp_path, text))
+    camera = Camera.over(2.0, width=320, visibility_threshold=0.2)
+    cell = DEFAULT_CELL.model_copy(update={"support": tray(0.5), "cameras": {"overhead": camera}})
+    assert config == replace(ClutterConfig(), layout=replace(ClutterConfig().layout, stack_gap=0.02), cell=cell)
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    config = ClutterConfig()
-    config.layout.tray_side = 0.1 + 0.2
-    config.settle.calm_samples = 7
+    config = world_with(f"cell.support.size={[0.1 + 0.2, 0.5]}", "settle.calm_samples=7", "cell.robot.base.yaw=10")
+    assert config.cell.support.size == (0.1 + 0.2, 0.5)
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
 
 
 def test_the_focal_length_is_that_of_the_field_of_view() -> None:
     """At 45 degrees half the height of the image lies one focal length times tan(22.5 deg) from its middle."""
-    assert CameraConfig(height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
-    assert CameraConfig(height=480, fov_y_deg=45.0).focal_length == pytest.approx(240.0 * (1 + 2**0.5))
+    assert Camera.over(1.6, height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
+    assert Camera.over(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(240.0 * (1 + 2**0.5))
 
 
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         ("camera: {width: 640.5}", "width"),
-        ("camera: {width: 0}", "camera.width"),
-        ("camera: {altitude: 0}", "camera.altitude"),
+        ("camera: {width: 0}", "cameras.overhead.width"),
         ("camera: {zoom: 2}", "zoom"),
-        ("layout: {tray_side: -1}", "layout.tray_side"),
-        ("layout: {tray_side: 0}", "layout.tray_side"),
+        ("layout: {tray_side: -1}", "cell.support.size"),
+        ("layout: {tray_side: 0}", "cell.support.size"),
         ("layout: {stack_gap: .nan}", "layout.stack_gap"),
         ("layout: {lying_gap: -0.001}", "layout.lying_gap"),
         ("settle: {time_step: 0}", "settle.time_step"),
@@ -56,13 +68,13 @@ def test_the_focal_length_is_that_of_the_field_of_view() -> None:
         ("settle: {jitter: .inf}", "settle.jitter"),
         ("exploration: {collapse_penalty: .nan}", "exploration.collapse_penalty"),
         ("exploration: {max_moves: -1}", "exploration.max_moves"),
-        ("camera: {altitude: high}", "altitude"),
-        ("camera: [1, 2]", "camera"),
-        ("camera: {fov_y_deg: 0}", "camera.fov_y_deg"),
-        ("camera: {fov_y_deg: 180}", "camera.fov_y_deg"),
-        ("camera: {hidden_below: 1.5}", "camera.hidden_below"),
+        ("camera: {altitude: high}", "translation"),
+        ("settle: [1, 2]", "settle"),
+        ("camera: {fov_y_deg: 0}", "cameras.overhead.fov_y_deg"),
+        ("camera: {fov_y_deg: 180}", "cameras.overhead.fov_y_deg"),
+        ("camera: {hidden_below: 1.5}", "cameras.overhead.visibility_threshold"),
         ("layout: {placement_tries: 0}", "layout.placement_tries"),
-        ("layout: {tray_side: 5}", "layout.tray_side"),
+        ("layout: {tray_side: 5}", "cell.support.size"),
         ("settle: {calm_samples: 0}", "settle.calm_samples"),
         ("explorer: {}", "explorer"),
         ("- a list", "world.yaml"),
@@ -75,6 +87,7 @@ def test_a_broken_file_is_refused(text: str, named: str, tmp_path: Path) -> None
     with pytest.raises(InputError) as refusal:
         load_config(path)
     assert str(refusal.value).startswith(f"{path}: ")
+    assert "\n" not in str(refusal.value)
     assert named in str(refusal.value).split("allowed are the fields of")[0]
     assert "allowed" in str(refusal.value)
 

@@ -1,11 +1,11 @@
 """Comparing explorers: what is played, and what is refused before anything is."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import world_with
 
 from drake_clutter.commands.evaluate import PlayableScene, evaluate, playable
 from drake_clutter.config import ClutterConfig
@@ -47,7 +47,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
 
 def test_what_hides_nothing_from_the_config_s_camera_is_left_out() -> None:
     """In the first of the set some object is hidden altogether, in the second there is a glimpse of each."""
-    config = replace(CONFIG, camera=replace(CONFIG.camera, hidden_below=1e-6))
+    config = world_with("camera.visibility_threshold=1e-6".replace("1e-6", "0.000001"))
     scenes = playable("sg_star_10", None)[:2]
     (row,) = rows_of(scenes, "random", config=config)
     assert row["episodes"] == 1

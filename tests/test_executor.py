@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import resting, rng, scene_of, world_with
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -86,9 +86,8 @@ def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExe
     observation = detector.look(STACKS).observation
     scene = STACKS
     if pick not in {d.name for d in observation.detections}:  # the can is all but covered: seen here by an open-minded detector
-        config = ClutterConfig()
-        config.camera.hidden_below = 0.0
-        observation = LabelDetector(config.camera).look(STACKS).observation
+        config = world_with("camera.visibility_threshold=0")
+        observation = LabelDetector(config.cell.camera).look(STACKS).observation
     outcome = executor.execute(scene, observation, Move(pick), rng())
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
@@ -99,7 +98,7 @@ def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExe
 
 
 def test_a_move_without_a_free_spot_changes_nothing(executor: SettleExecutor, detector: LabelDetector) -> None:
-    scene = scene_of(resting("cracker_box", name="box"), tray_side=0.26)
+    scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(executor, detector, scene, Move("box"))
     assert (outcome.result, outcome.instability, outcome.motion) == (MoveResult.NO_FREE_SPOT, None, ())
     assert outcome.scene is scene

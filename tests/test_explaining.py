@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from conftest import CLASSES, resting, scene_of
+from conftest import CLASSES, DEFAULT_CELL, resting, scene_of
 
-from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.explaining import chosen, explanation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, SceneObject
 
-CAMERA = CameraConfig()
+CAMERA = DEFAULT_CELL.camera
 BOX = resting("cracker_box", Orientation.FLAT_0)
 ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top)
 BESIDE = resting("gelatin_box", xy=(0.2, 0.1))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CLASSES, resting, rng, scene_of
+from conftest import CLASSES, DEFAULT_CELL, resting, rng, scene_of
 
 from drake_clutter.agents.exploration import (
     BASELINES,
@@ -14,7 +14,7 @@ from drake_clutter.agents.exploration import (
     LargestFirst,
     RandomExplorer,
 )
-from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
+from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Detection, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
@@ -167,14 +167,14 @@ def test_a_real_episode(detector: LabelDetector, config: ClutterConfig) -> None:
 
 def imagined(*detections: tuple[str, str, int]) -> Observation:
     """What a camera might show: (name, class, pixels), side by side, each with a clear top."""
-    camera = CameraConfig()
+    camera = DEFAULT_CELL.camera
     found = []
     for index, (name, class_name, pixels) in enumerate(detections):
         mask = np.zeros((camera.height, camera.width), bool)
         mask.ravel()[1000 * index : 1000 * index + pixels] = True
         found.append(Detection(name, CLASSES[class_name], Pose((0.1 * index - 0.3, 0.0, 0.1)), mask))
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    return Observation(depth, tuple(found), camera, 0.70)
+    return Observation(depth, tuple(found), camera, DEFAULT_CELL.support)
 
 
 def sweep(agent: Explorer, observation: Observation, count: int) -> list[str]:

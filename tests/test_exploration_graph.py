@@ -16,7 +16,7 @@ from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GraphObservation, exploration_graph, seen
 
 NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
-RAYS = RayCaster(ClutterConfig().camera)
+RAYS = RayCaster(ClutterConfig().cell.camera)
 # A marker below a cracker box, which carries a can; a pudding box close by, another one far away.
 SCENE = scene_of(
     resting("large_marker", xy=(0.0, 0.0)),
@@ -120,7 +120,7 @@ def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
 def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
     scene = random_scene(seed)
     order = rng(seed).permutation(len(scene.objects))
-    shuffled = Scene(tuple(scene.objects[k] for k in order), scene.tray_side)
+    shuffled = Scene(tuple(scene.objects[k] for k in order), scene.support)
     torch.manual_seed(seed)
     network = ExplorerNetwork(len(NUMBERS)).double()
     one, other = (network(stacked_graphs([graph_of(s)])) for s in (scene, shuffled))

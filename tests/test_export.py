@@ -64,7 +64,7 @@ def scene(mug: ObjectClass) -> Scene:
         box,
         SceneObject("marker", resting("large_marker").object_class, tilted),
         SceneObject("mug", mug, turned),
-        tray_side=0.65,
+        side=0.65,
     )
 
 

@@ -74,7 +74,7 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
     assert np.hypot(*(after[move.pick].X_TO.p - place.p)[:2]) <= CONFIG.settle.jitter
     assert after.names == STACKS.names
     assert all(after[name] == STACKS[name] for name in STACKS.names if name != move.pick)
-    assert (after.tray_side, after.graph, after.derivation) == (STACKS.tray_side, STACKS.graph, STACKS.derivation)
+    assert (after.support, after.graph, after.derivation) == (STACKS.support, STACKS.graph, STACKS.derivation)
     assert JUDGE.stability(after) is None
 
 
@@ -143,7 +143,7 @@ def test_where_nothing_balances() -> None:
 
 
 def test_no_free_spot_changes_nothing() -> None:
-    scene = scene_of(resting("cracker_box", name="box"), tray_side=0.26)
+    scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(scene, Move("box"))
     assert (outcome.result, outcome.instability, outcome.cannot_judge) == (MoveResult.NO_FREE_SPOT, None, None)
     assert outcome.scene is scene
@@ -255,7 +255,7 @@ def test_drake_is_not_asked_about_the_rest(move: Move) -> None:
 
 
 def test_no_free_spot_is_no_question_for_drake() -> None:
-    scene = scene_of(leaning(resting("gelatin_box", name="box")), tray_side=0.12)
+    scene = scene_of(leaning(resting("gelatin_box", name="box")), side=0.12)
     outcome = carried_out(scene, Move("box"), executor=FastOrDrakeExecutor(CONFIG))
     assert outcome == Outcome(MoveResult.NO_FREE_SPOT, scene)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import resting, rng, scene_of, world_with
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 
@@ -56,8 +56,7 @@ def test_the_tipping_point(class_name: str, axis: int, half: float) -> None:
 def test_the_margin_grows_with_the_offsets() -> None:
     """3 mm instead of 1 mm: a box that is 4 mm inside the edge may be pushed over it."""
     scene = scene_of(BELOW, resting("sugar_box", xy=(0.111, 0.0), floor=0.060, name="above"))
-    wide = ClutterConfig()
-    wide.settle.jitter = 0.003
+    wide = world_with("settle.jitter=0.003")
     assert FAST.stability(scene) is None
     fallen = Instability(InstabilityReason.UNBALANCED, "above")
     assert FastJudge(wide).stability(scene) == FastJudge(ClutterConfig(), margin=0.0041).stability(scene) == fallen
@@ -302,8 +301,7 @@ def test_the_same_rng_gives_the_same_verdict(config: ClutterConfig, fast: FastJu
 
 
 def test_the_threshold_of_hidden_is_the_configs(config: ClutterConfig) -> None:
-    open_minded = ClutterConfig()
-    open_minded.camera.hidden_below = 0.0
+    open_minded = world_with("camera.visibility_threshold=0")
     verdict = FastJudge(open_minded).judge(HIDING, rng())
     assert isinstance(verdict, Verdict)
     assert verdict.hidden == ()

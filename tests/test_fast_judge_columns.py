@@ -158,14 +158,14 @@ def turned(scene: Scene, quarters: int) -> Scene:
 @given(ANYTHING, st.integers(-99, 99), st.integers(-99, 99))
 @settings(max_examples=60)
 def test_the_place_on_the_tray_is_no_matter(layers: Layers, x: int, y: int) -> None:
-    scene = scene_of(*column(layers), tray_side=2.0)
+    scene = scene_of(*column(layers), side=2.0)
     assert reason_of(FAST.stability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))) is reason_of(FAST.stability(scene))
 
 
 @given(ANYTHING, st.integers(1, 3))
 @settings(max_examples=60)
 def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
-    scene = scene_of(*column(layers), tray_side=2.0)
+    scene = scene_of(*column(layers), side=2.0)
     assert reason_of(FAST.stability(turned(scene, quarters))) is reason_of(FAST.stability(scene))
 
 
@@ -173,7 +173,7 @@ def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
 @settings(max_examples=60)
 def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) -> None:
     """Unless two objects cannot be judged, of which the first is named."""
-    scene = scene_of(*column(layers), tray_side=2.0)
+    scene = scene_of(*column(layers), side=2.0)
     supports = FAST.supports(scene)
     assume(not isinstance(supports, CannotJudge))
     objects = list(scene.objects)
@@ -192,7 +192,7 @@ def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) 
 @given(ANYTHING)
 @settings(max_examples=60)
 def test_a_stack_far_away_is_no_matter(layers: Layers) -> None:
-    scene = scene_of(*column(layers), tray_side=2.0)
+    scene = scene_of(*column(layers), side=2.0)
     far = [resting("cracker_box", xy=(0.8, 0.8), name="foot"), resting("sugar_box", xy=(0.8, 0.8), floor=0.060, name="far")]
     for objects in ((*scene.objects, *far), (*far, *scene.objects)):
         assert FAST.stability(replace(scene, objects=objects)) == FAST.stability(scene)

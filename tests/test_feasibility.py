@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.cell.kinematics import jacobian, manipulability
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.cell.suction import SuctionConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
 from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
@@ -39,8 +38,8 @@ SCENE = scene_of(
 )
 
 
-def study(arm: ArmConfig | None = None) -> FeasibilityStudy:
-    return FeasibilityStudy("it", arm or ArmConfig(), ClutterConfig(), PlannerConfig(optimise=False), 0)
+def study(cell: WorkCell | None = None) -> FeasibilityStudy:
+    return FeasibilityStudy("it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimise=False), 0)
 
 
 def test_manipulability_in_closed_form() -> None:
@@ -78,15 +77,15 @@ def test_what_points_up_and_what_lies_below() -> None:
 def test_what_no_arm_can_do_is_a_reason() -> None:
     place = Pose((0.1, 0.1, SCENE["tomato_soup_can"].X_TO.p[2] + 0.001))
 
-    def reason(arm: ArmConfig) -> NoPlan:
-        found = PickPlacePlanner(arm, PlannerConfig(), 0.70, 1.60).plan(SCENE.objects, "tomato_soup_can", place)
+    def reason(cell: WorkCell) -> NoPlan:
+        found = PickPlacePlanner(cell, PlannerConfig()).plan(SCENE.objects, "tomato_soup_can", place)
         assert isinstance(found, NoPlan)
         return found
 
-    in_tray = reason(replace(ArmConfig(), base=[-0.1, 0.0, 0.3, 0.0]))
+    in_tray = reason(cell_with("robot.base.x=-0.1"))
     assert (in_tray.reason, in_tray.about) == (PlanFailure.IN_COLLISION, "pedestal and tray")
-    assert reason(replace(ArmConfig(), base=[-5.0, 0.0, 0.3, 0.0])).reason is PlanFailure.UNREACHABLE
-    assert reason(replace(ArmConfig(), payload=1.0)).reason is PlanFailure.TOO_HEAVY
+    assert reason(cell_with("robot.base.x=-5.0")).reason is PlanFailure.UNREACHABLE
+    assert reason(cell_with("robot.payload=1")).reason is PlanFailure.TOO_HEAVY
 
 
 def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
@@ -101,7 +100,7 @@ def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
 
 
 def test_the_map_agrees_with_the_poses() -> None:
-    reachability = Reachability(ArmConfig(), 0.70, 1.60)
+    reachability = Reachability(DEFAULT_CELL)
     found = reachability.map((0.1, 1.5), 0.3)
     assert found.share.shape == (2, 3, 3)
     assert (found.share[0] == 1).all()
@@ -113,7 +112,7 @@ def test_the_map_agrees_with_the_poses() -> None:
     assert away.branches.tolist() == [0, 0]
     assert away.in_the_way[0] == ""
     assert "table" in away.in_the_way[1] or "floor" in away.in_the_way[1], "through the floor"
-    near, in_tray = base_scores(ArmConfig(), [(-0.65, 0.0), (0.0, 0.0)], 0.70, 1.60)
+    near, in_tray = base_scores(DEFAULT_CELL, [(-0.65, 0.0), (0.0, 0.0)])
     assert near[0] == 1.0
     assert in_tray == (0.0, 0.0)
 
@@ -199,8 +198,8 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
 
 
 def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
-    (one,) = command.setups([], [[0.4, 0.5, -0.3, 30.0]], []).values()
-    X_BT = np.linalg.inv(one.X_TB)
+    (one,) = command.setups([], [[0.4, 0.5, -0.3, 30.0]], [], DEFAULT_CELL).values()
+    X_BT = one.robot.X_TB.inverse().GetAsMatrix4()
     assert X_BT[:3, 3] == pytest.approx([0.4, 0.5, -0.3])
     assert math.degrees(math.atan2(X_BT[1, 0], X_BT[0, 0])) == pytest.approx(30.0)
 
@@ -224,9 +223,9 @@ def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{suction: {cup_diameter: 1.0}}", "suction.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
-        ("{base: [0, 0]}", "base: .* allowed is a list of 4 numbers"),
-        ("{base: [0, 0, 0, north]}", "base: 'north'; allowed is a finite number"),
+        ("{suction: {cup_diameter: 1.0}}", "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
+        ("{base: [0, 0]}", "base: is unknown"),
+        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg.2: 'north'; allowed is a finite number"),
         ("{reach: 3}", "reach: is unknown"),
     ],
 )
@@ -234,11 +233,11 @@ def test_arms_that_are_none(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        command.setups([], [], [path])
+        command.setups([], [], [path], DEFAULT_CELL)
 
 
 def test_an_arm_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
-    found: dict[str, Any] = command.setups([], [], [path])
-    assert found == {"long": replace(ArmConfig(), base=[-0.7, 0.1, 0.3, 10.0], suction=SuctionConfig(extension=0.15))}
+    found: dict[str, Any] = command.setups([], [], [path], DEFAULT_CELL)
+    assert found == {"long": cell_with(*["robot.base.x=-0.7", "robot.base.y=0.1", "robot.base.yaw=10", "gripper.extension=0.15"])}

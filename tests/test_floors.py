@@ -10,8 +10,8 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "config", "files", "learning", "records", "resources", "seeding", "validation", "workers"},
-    1: {"cell", "grammar"},
+    0: {"assets", "catalogue", "files", "learning", "records", "resources", "seeding", "validation", "workers"},
+    1: {"cell", "config", "grammar"},
     2: {"scenes", "stability"},
     3: {"export", "simulation"},
     4: {"perception", "planning"},

@@ -136,7 +136,7 @@ def test_what_is_hidden_elsewhere_is_not_named() -> None:
 
 def test_no_room_for_any_move() -> None:
     """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
-    solution = SEARCH.solve(scene_of(*covered(), tray_side=0.26))
+    solution = SEARCH.solve(scene_of(*covered(), side=0.26))
     assert (solution.answer, solution.plan, solution.never_found) == (Solvability.UNSOLVABLE, (), ())
     assert not solution.fewest
     assert solution.moves_tried > 0

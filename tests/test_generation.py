@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import yaml
-from conftest import CLASSES, GRAMMARS, rng
+from conftest import CLASSES, GRAMMARS, rng, world_with
 
 from drake_clutter.agents.generation import (
     GenerationAgent,
@@ -19,7 +19,7 @@ from drake_clutter.agents.generation import (
     summarise,
     wilson_interval,
 )
-from drake_clutter.config import ClutterConfig, LayoutConfig
+from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
@@ -63,9 +63,7 @@ def test_a_scene_depends_on_its_index_alone() -> None:
 
 def test_graphs_that_cannot_be_laid_out_are_counted_and_drawn_anew() -> None:
     """On a tray of 0.3 m few graphs fit."""
-    world = ClutterConfig()
-    world.layout.tray_side = 0.30
-    world.layout.max_stack_height = 0.25
+    world = world_with("layout.tray_side=0.30", "layout.max_stack_height=0.25")
     generator = SceneGenerator(GenerationJob("random", "ycb7", None, 7, 1, world))
     made = [generator(index) for index in range(4)]
     failures = sum((m.layout_failures for m in made), start=Counter())
@@ -151,7 +149,7 @@ def test_mean_interval() -> None:
 
 
 def laid_out(*rules: str) -> Scene:
-    scene = lay_out(Derivation(GRAMMARS["ycb7"].replay(rules), rules), CLASSES, LayoutConfig(), rng())
+    scene = lay_out(Derivation(GRAMMARS["ycb7"].replay(rules), rules), CLASSES, ClutterConfig(), rng())
     assert isinstance(scene, Scene)
     return scene
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CLASSES, resting, rng
+from conftest import CLASSES, TRAY, resting, rng
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
@@ -109,7 +109,7 @@ def random_pairs(names: tuple[str, str], count: int, reach: float) -> list[tuple
 @pytest.mark.parametrize("names", [("cracker_box", "sugar_box"), ("sugar_box", "pasta_box"), ("gelatin_box", "gelatin_box")])
 def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
     builder = DiagramBuilder()
-    scene_plant = add_scene_plant(builder, [("a", CLASSES[names[0]]), ("b", CLASSES[names[1]])], 0.7, 0.01, visuals=False)
+    scene_plant = add_scene_plant(builder, [("a", CLASSES[names[0]]), ("b", CLASSES[names[1]])], TRAY, 0.01, visuals=False)
     scene_plant.plant.Finalize()
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CLASSES, resting, rng, scene_of, training_script
+from conftest import CLASSES, DEFAULT_CELL, TRAY, resting, rng, scene_of, training_script
 from numpy.typing import NDArray
 
-from drake_clutter.config import CameraConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.depth_noise import D435, DepthNoise, noisy_depth
@@ -77,7 +76,7 @@ def test_holes_are_shadows_and_speckles() -> None:
 
 def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabelledImage]) -> None:
     (tmp_path / ".000000").mkdir()  # of an interrupted run
-    write_images(tmp_path / "000000", images, CameraConfig(), list(CLASSES))
+    write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     assert [path.name for path in tmp_path.iterdir()] == ["000000"]
     read = ImageSet(tmp_path)
     assert len(read) == 2
@@ -102,7 +101,7 @@ def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabelledIma
 
 
 def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabelledImage]) -> None:
-    write_images(tmp_path / "000000", images, CameraConfig(), list(CLASSES))
+    write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     gt, info, eye, coco = (
         json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info", "camera", "gt_coco")
     )
@@ -137,7 +136,7 @@ def test_run_lengths() -> None:
 
 def test_a_heap() -> None:
     classes = [CLASSES[name] for name in ("gelatin_box", "tomato_soup_can", "pudding_box")]
-    start = above_tray(classes, 0.7, rng(2))
+    start = above_tray(classes, TRAY, rng(2))
     for k, one in enumerate(start.objects):
         assert all(
             (np.minimum(one.bounds_T[1], o.bounds_T[1]) < np.maximum(one.bounds_T[0], o.bounds_T[0])).any()

@@ -1,14 +1,13 @@
 """From graphs to poses: nothing penetrates, everything rests on what carries it, gaps and caps hold."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CLASSES, GRAMMARS, rng
+from conftest import CLASSES, GRAMMARS, rng, world_with
 from numpy.typing import NDArray
 
-from drake_clutter.config import LayoutConfig
+from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
 from drake_clutter.grammar.graph import DUMMY
 from drake_clutter.scenes.geometry import deepest_penetration
@@ -28,8 +27,8 @@ def derived(*rules: str) -> Derivation:
     return Derivation(GRAMMARS["pantry14"].replay(rules), rules)
 
 
-def laid_out(derivation: Derivation, config: LayoutConfig | None = None, seed: int = 0) -> Scene:
-    scene = lay_out(derivation, CLASSES, config or LayoutConfig(), rng(seed))
+def laid_out(derivation: Derivation, config: ClutterConfig | None = None, seed: int = 0) -> Scene:
+    scene = lay_out(derivation, CLASSES, config or ClutterConfig(), rng(seed))
     assert isinstance(scene, Scene), str(scene)
     return scene
 
@@ -39,7 +38,7 @@ def random_layout(index: int) -> Scene | LayoutFailure:
     generator = item_rng(2022, index)
     grammar = GRAMMARS["ycb7" if index % 2 else "pantry14"]
     derivation = grammar.derive(NodeBudget(int(generator.integers(3, 26))), uniform_choice(generator))
-    return lay_out(derivation, grammar.classes, LayoutConfig(), generator)
+    return lay_out(derivation, grammar.classes, ClutterConfig(), generator)
 
 
 def carriers(graph: ClutterGraph, node: int) -> list[int]:
@@ -74,7 +73,7 @@ def check_scene(scene: Scene, config: LayoutConfig) -> None:
         below = [objects[node] for node in carriers(scene.graph, o.node)]
         lower, upper = o.bounds_T
         assert abs(lower[2] - max((b.top for b in below), default=0.0)) < ROUNDING
-        assert np.abs(o.bounds_T).max(axis=0)[:2].max() <= config.tray_side / 2 - config.stack_gap + ROUNDING
+        assert np.abs(o.bounds_T).max(axis=0)[:2].max() <= scene.support.size[0] / 2 - config.stack_gap + ROUNDING
         assert upper[2] <= config.max_stack_height
         if below:
             own = [objects[node] for pair in paired if o.node in pair for node in pair] or [o]
@@ -152,7 +151,7 @@ def test_a_stack_by_hand() -> None:
     ],
 )
 def test_a_pair_by_hand(rule: str, gap: float, thickness: float) -> None:
-    config = LayoutConfig(lying_gap=0.002, standing_gap=0.040)
+    config = world_with("layout.lying_gap=0.002", "layout.standing_gap=0.040")
     scene = laid_out(derived("drop_object", "stack_object", "end", rule, "insert_gelatin_box", "orient_flat_0"), config)
     one, other = (o for o in scene.objects if o.object_class.name != "gelatin_box")
     carried = scene.objects[-1]
@@ -169,12 +168,12 @@ def tower(count: int) -> Derivation:
 
 def test_too_high() -> None:
     assert laid_out(tower(2)).objects[-1].top == pytest.approx(0.46)
-    failure = lay_out(tower(3), CLASSES, LayoutConfig(), rng())
+    failure = lay_out(tower(3), CLASSES, ClutterConfig(), rng())
     assert isinstance(failure, LayoutFailure)
     assert (failure.reason, failure.limit) == (LayoutFailureReason.TOO_HIGH, 0.50)
     assert failure.amount == pytest.approx(0.69)
     assert str(failure) == "stack too high: 0.69 of 0.5 m"
-    lower_cap = lay_out(tower(2), CLASSES, replace(LayoutConfig(), max_stack_height=0.45), rng())
+    lower_cap = lay_out(tower(2), CLASSES, world_with("layout.max_stack_height=0.45"), rng())
     assert isinstance(lower_cap, LayoutFailure)
     assert lower_cap.reason is LayoutFailureReason.TOO_HIGH
 
@@ -190,7 +189,7 @@ BOX_ON_TRAY = ("drop_object", "end", "insert_cracker_box", "orient_flat_0")
     ],
 )
 def test_no_room(count: int, side: float) -> None:
-    config = replace(LayoutConfig(), tray_side=side, placement_tries=20)
+    config = world_with(f"layout.tray_side={side}", "layout.placement_tries=20")
     failure = lay_out(derived(*BOX_ON_TRAY * count), CLASSES, config, rng())
     assert isinstance(failure, LayoutFailure)
     assert failure.reason is LayoutFailureReason.NO_ROOM
@@ -198,7 +197,7 @@ def test_no_room(count: int, side: float) -> None:
 
 
 def test_the_smallest_tray_that_holds_a_box() -> None:
-    config = replace(LayoutConfig(), tray_side=0.2501)
+    config = world_with("layout.tray_side=0.2501")
     (box,) = laid_out(derived(*BOX_ON_TRAY), config).objects
     assert abs(box.X_TO.p[0]) <= 0.00005 + ROUNDING
 

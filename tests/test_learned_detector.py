@@ -17,7 +17,7 @@ from drake_clutter.systems.scenario import DETECTORS
 @pytest.fixture(scope="module", params=DETECTORS)
 def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
     network = SegmentationNetwork.load(shipped_path(DETECTORS[request.param]))
-    return LearnedDetector(network, CATALOGUE.object_set("ycb7"), config.camera, config.layout.tray_side)
+    return LearnedDetector(network, CATALOGUE.object_set("ycb7"), config.cell.camera, config.cell.support)
 
 
 def heap() -> Scene:
@@ -29,7 +29,7 @@ def heap() -> Scene:
 
 def test_it_sees_what_is_there_and_is_sure_of_it(detector: LearnedDetector, config: ClutterConfig) -> None:
     scene = heap()
-    images = OverheadCamera(config.camera).render(scene)
+    images = OverheadCamera(config.cell.camera).render(scene)
     seen = detector.detect(images.depth, images.color)
     assert sorted(d.object_class.name for d in seen.detections) == sorted(o.object_class.name for o in scene.objects)
     for o in scene.objects:
@@ -40,5 +40,5 @@ def test_it_sees_what_is_there_and_is_sure_of_it(detector: LearnedDetector, conf
 
 
 def test_an_empty_tray_is_empty(detector: LearnedDetector, config: ClutterConfig) -> None:
-    images = OverheadCamera(config.camera).render(scene_of())
+    images = OverheadCamera(config.cell.camera).render(scene_of())
     assert detector.detect(images.depth, images.color).detections == ()

@@ -102,7 +102,7 @@ def test_shipped_agents_hide_objects_in_stable_stacks(name: str, objects: str, h
     for _ in range(16):
         derivation = agent.derive(grammar, NodeBudget(25), generator)
         forms.add(canonical_form(derivation.graph, grammar.classes))
-        scene = lay_out(derivation, grammar.classes, ClutterConfig().layout, generator)
+        scene = lay_out(derivation, grammar.classes, ClutterConfig(), generator)
         if isinstance(scene, LayoutFailure):
             continue
         verdict = fast.judge(scene, generator)

@@ -144,8 +144,8 @@ def test_the_caster_sees_own_meshes_as_the_camera_does(own: dict[str, ObjectClas
         for name, turn, x in zip(("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False)
     ]
     scene = scene_of(*tumbled, resting("sugar_box", xy=(0.05, 0.0), floor=0.25, name="before"))
-    shares = RayCaster(config.camera).visible_shares(scene.objects)
-    assert shares == pytest.approx(OverheadCamera(config.camera).visible_shares(scene), abs=0.01)
+    shares = RayCaster(config.cell.camera).visible_shares(scene.objects)
+    assert shares == pytest.approx(OverheadCamera(config.cell.camera).visible_shares(scene), abs=0.01)
     assert sum(0.02 < share < 0.98 for share in shares.values()) >= 2
 
 

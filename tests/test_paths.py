@@ -4,12 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from conftest import rng
+from conftest import DEFAULT_CELL, rng
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.planning.paths import (
     ACCELERATION_LIMIT,
     MARGIN,
@@ -26,8 +25,8 @@ from drake_clutter.planning.paths import (
     torques,
 )
 
-ARM = ArmConfig()
-HOME = np.array(ARM.home)
+ARM = DEFAULT_CELL
+HOME = np.array(ARM.robot.home)
 
 
 def test_whole_turns() -> None:
@@ -55,7 +54,7 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
     torque = torques(dynamics_plant(ARM, payload), q, v, a)
     pairs = {"speed": v / VELOCITY_LIMIT, "acceleration": a / ACCELERATION_LIMIT, "torque": torque / TORQUE_LIMIT}
     X_FL = np.eye(4)
-    X_FL[:3, 3] = [0.0, 0.0, ARM.suction.length + payload.p_GCm[2]]
+    X_FL[:3, 3] = [0.0, 0.0, ARM.gripper.length + payload.p_GCm[2]]
     of_load = np.diff((forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0) / (times[1] - times[0]) ** 2
     pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.acceleration
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}

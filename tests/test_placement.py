@@ -81,7 +81,7 @@ def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) ->
         checked += 1
         assert deepest_with(scene, move.pick, X_TO, tuple(carried_by(scene, move.pick))) <= 0
         placed = SceneObject(move.pick, scene[move.pick].object_class, X_TO)
-        assert np.abs(placed.bounds_T)[:, :2].max() <= scene.tray_side / 2 - CONFIG.clearance
+        assert np.abs(placed.bounds_T)[:, :2].max() <= scene.support.size[0] / 2 - CONFIG.clearance
         floor = 0.0 if move.place == TRAY else top_height(observation[move.place])
         assert placed.bounds_T[0][2] == pytest.approx(floor + CONFIG.release_height, abs=1e-9)
         if move.place != TRAY:
@@ -102,10 +102,10 @@ def inside_outline(o: SceneObject, xy: NDArray[np.float64]) -> bool:
 
 def test_no_room_on_the_tray(detector: LabelDetector) -> None:
     """The only place that would hold the box is where it stands, which nobody can see."""
-    scene = scene_of(resting("cracker_box", name="box"), tray_side=0.26)
+    scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     assert placement(detector, scene, "box") is None
     # Beside it 50 mm are left: enough for the marker of 18 mm with 10 mm of clearance on either side.
-    with_marker = scene_of(resting("cracker_box", name="box"), resting("large_marker", floor=0.060, name="m"), tray_side=0.26)
+    with_marker = scene_of(resting("cracker_box", name="box"), resting("large_marker", floor=0.060, name="m"), side=0.26)
     X_TO = placement(detector, with_marker, "m")
     assert X_TO is not None
     assert 0.080 + 0.010 + 0.009 <= abs(X_TO.p[1]) <= 0.130 - 0.010 - 0.009
@@ -156,7 +156,7 @@ def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
         resting("lasagna_box", xy=(-0.07, 0.12), name="another"),
     ]
     box = resting("pasta_box", xy=(0.0, -0.15), name="picked")
-    scene = scene_of(*walls, box, tray_side=0.40)
+    scene = scene_of(*walls, box, side=0.40)
     X_TO = placement(detector, scene, "picked")
     assert X_TO is not None
     turn = box.X_TO.rotation.T @ X_TO.rotation

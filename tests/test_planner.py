@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CLASSES, random_scene, resting, rng
+from conftest import CLASSES, DEFAULT_CELL, cell_with, random_scene, resting, rng
 
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.cell.suction import SuctionConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.attempts import PlannerConfig, inverse, matrix
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
@@ -21,8 +20,8 @@ TRAY_SIDE, ALTITUDE = 0.70, 1.60
 LYING = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
 
-def planner(arm: ArmConfig | None = None, config: PlannerConfig | None = None) -> PickPlacePlanner:
-    return PickPlacePlanner(arm or ArmConfig(), config or PlannerConfig(), TRAY_SIDE, ALTITUDE)
+def planner(cell: WorkCell | None = None, config: PlannerConfig | None = None) -> PickPlacePlanner:
+    return PickPlacePlanner(cell or DEFAULT_CELL, config or PlannerConfig())
 
 
 def lifted(o: SceneObject, x: float, y: float) -> Pose:
@@ -47,7 +46,7 @@ def plan() -> Plan:
 
 def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
     approach, carry, retreat = (phase.trajectory for phase in plan.phases)
-    home = np.array(ArmConfig().home)
+    home = np.array(DEFAULT_CELL.robot.home)
     assert approach.value(0.0).ravel() == pytest.approx(home)
     assert carry.value(0.0).ravel() == pytest.approx(approach.value(approach.end_time()).ravel(), abs=1e-9)
     assert retreat.value(0.0).ravel() == pytest.approx(carry.value(carry.end_time()).ravel(), abs=1e-9)
@@ -58,9 +57,9 @@ def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
 
 
 def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: Plan) -> None:
-    arm = ArmConfig()
+    X_TB, X_FG = DEFAULT_CELL.robot.X_TB.GetAsMatrix4(), DEFAULT_CELL.gripper.X_FG.GetAsMatrix4()
     carry = plan.phases[1].trajectory
-    X_TG_pick, X_TG_place = (arm.X_TB @ forward_kinematics(carry.value(t).ravel()) @ arm.X_FG for t in (0.0, carry.end_time()))
+    X_TG_pick, X_TG_place = (X_TB @ forward_kinematics(carry.value(t).ravel()) @ X_FG for t in (0.0, carry.end_time()))
     assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), "the top of the sugar box"
     assert X_TG_pick[:3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
     assert X_TG_pick @ inverse(plan.X_OG) == pytest.approx(matrix(plan.X_TO_pick), abs=1e-6)
@@ -114,7 +113,7 @@ def test_a_marker_does_not_seal() -> None:
     found = planner().plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
     assert reason(found) is PlanFailure.NO_SEAL
     assert isinstance(found, NoPlan)
-    assert found.number > SuctionConfig().unevenness
+    assert found.number > DEFAULT_CELL.gripper.unevenness
     assert str(found) == "no seal: marker"
 
 
@@ -128,17 +127,17 @@ def test_what_carries_something_is_not_picked() -> None:
 
 def test_too_heavy() -> None:
     """A weak vacuum does not hold half a kilogram; and an arm may not be asked for more than its payload."""
-    weak = ArmConfig(suction=SuctionConfig(vacuum=0.1))
+    weak = cell_with("gripper.vacuum=0.1")
     assert reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
-    frail = ArmConfig(payload=1.0)
+    frail = cell_with("robot.payload=1")
     assert reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
 
 
 def test_out_of_reach() -> None:
-    far = ArmConfig(base=[-2.5, 0.0, 0.3, 0.0])
+    far = cell_with("robot.base.x=-2.5")
     found = planner(far).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
     assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the grasp")
-    nearer = ArmConfig(base=[-1.15, 0.0, 0.3, 0.0])
+    nearer = cell_with("robot.base.x=-1.15")
     found = planner(nearer).plan(PILE, "cracker_box", lifted(PILE[2], 0.3, -0.3))
     assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the place")
 

@@ -5,13 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CATALOGUE, CLASSES, resting, rng, scene_of
+from conftest import CATALOGUE, CLASSES, DEFAULT_CELL, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalogue import ObjectClass, Shape
-from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter, pose_error
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -23,7 +22,7 @@ PANTRY = CATALOGUE.object_sets["pantry14"]
 @pytest.fixture(scope="module")
 def fitter() -> PoseFitter:
     """One fitter for all tests: no fit may depend on the earlier ones."""
-    return PoseFitter(CameraConfig())
+    return PoseFitter(DEFAULT_CELL.camera)
 
 
 def placed(object_class: ObjectClass, R_TO: NDArray[np.float64], xy: NDArray[np.float64]) -> SceneObject:
@@ -141,7 +140,7 @@ def test_a_resting_object_is_exactly_at_rest(fitter: PoseFitter, camera: Overhea
 
 def test_deterministic(camera: OverheadCamera) -> None:
     scene = scene_of(resting("master_chef_can", xy=(0.1, 0.1)))
-    fits = [fitted(PoseFitter(CameraConfig()), camera, scene, "master_chef_can", rng(4), 0.0015) for _ in range(2)]
+    fits = [fitted(PoseFitter(DEFAULT_CELL.camera), camera, scene, "master_chef_can", rng(4), 0.0015) for _ in range(2)]
     assert fits[0] == fits[1]
 
 

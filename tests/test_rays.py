@@ -7,12 +7,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from conftest import CLASSES, random_scene, resting, rng, scene_of
+from conftest import CLASSES, DEFAULT_CELL, random_scene, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -20,10 +20,10 @@ from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.stability.shapes import Shapes
 from drake_clutter.stability.visibility import RayCaster
 
-CAMERA = CameraConfig()
+CAMERA = DEFAULT_CELL.camera
 RAYS = RayCaster(CAMERA)
 # Detects whatever it meets, so that its masks are a label image.
-OPEN_MINDED = RayCaster(replace(CAMERA, hidden_below=1e-9))
+OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))
 ALL_SHAPES = ("cracker_box", "sugar_box", "gelatin_box", "tomato_soup_can", "master_chef_can", "large_marker")
 
 
@@ -77,7 +77,7 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(scene: S
     for detection, seen in zip(observation.detections, look.observation.detections, strict=True):
         assert (detection.object_class, detection.X_TO) == (seen.object_class, seen.X_TO)
         assert np.array_equal(detection.mask, cast == scene.names.index(detection.name))
-    assert (observation.camera, observation.tray_side) == (look.observation.camera, look.observation.tray_side)
+    assert (observation.camera, observation.support) == (look.observation.camera, look.observation.support)
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
@@ -100,15 +100,19 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     assert (observation.depth[nothing] == np.float32(CAMERA.altitude)).all()
 
 
-@pytest.mark.parametrize("config", [CameraConfig(320, 240, 60.0, 1.1), CameraConfig(200, 300, 20.0, 1.6)], ids=["wide", "narrow"])
-def test_another_camera(config: CameraConfig) -> None:
+@pytest.mark.parametrize(
+    "config",
+    [Camera.over(1.1, width=320, height=240, fov_y_deg=60.0), Camera.over(1.6, width=200, height=300, fov_y_deg=20.0)],
+    ids=["wide", "narrow"],
+)
+def test_another_camera(config: Camera) -> None:
     """The narrow one sees 0.38 m of the tray by 0.56 m: objects are cut off by the frame, and a share is one of the pixels in it.
     Fewer pixels: one is up to a hundredth of an object."""
     scene = tumbled(2)
     camera, caster = OverheadCamera(config), RayCaster(config)
     assert caster.visible_shares(scene.objects) == pytest.approx(camera.visible_shares(scene), abs=0.02)
     rendered = camera.label(scene)
-    assert (labels(scene, RayCaster(replace(config, hidden_below=1e-9))) == rendered).mean() >= 0.9995
+    assert (labels(scene, RayCaster(config.model_copy(update={"visibility_threshold": 1e-9}))) == rendered).mean() >= 0.9995
     cut = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).any() for m in (rendered == k for k in range(len(scene.objects)))]
     assert any(cut) == (config.fov_y_deg == 20.0)
 

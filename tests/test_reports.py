@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import DEFAULT_CELL, TRAY, resting, rng, scene_of
 from PIL import Image
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough, ZeroOrderHold
@@ -75,7 +75,7 @@ def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> P
     fallen = Instability(InstabilityReason.TOPPLED, "sugar_box_3", 0.1, 1.5)
     collapse = Step(Move("cracker_box_2"), Outcome(MoveResult.COLLAPSED, task.scene, fallen), step.look, (), -1.0)
     summary = {"agent": HOSTILE, "seed": 3, "success": True, "moves": [{"move": HOSTILE}]}
-    write_episode_page(out, f"Episode {HOSTILE}", task.start, task.first_look, [step, stuck, collapse], summary)
+    write_episode_page(out, f"Episode {HOSTILE}", task.start, task.first_look, [step, stuck, collapse], summary, DEFAULT_CELL)
     return out
 
 
@@ -141,7 +141,7 @@ def test_the_recording_is_one_file_that_moves(folder: Path, tmp_path: Path) -> N
     assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)\s*=", source)
     assert len(source) < 4_000_000
     still = tmp_path / "still.html"
-    write_recording(still, SCENE, [Frame(0.0, SCENE.poses)])
+    write_recording(still, SCENE, [Frame(0.0, SCENE.poses)], DEFAULT_CELL)
     # The last command that the viewer is given; a still scene has none of its kind.
     assert _commands(source, "set_animation") == 1
     assert _commands(still.read_text(encoding="utf-8"), "set_animation") == 0
@@ -173,8 +173,8 @@ def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) ->
 
 
 def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
-    alone = Scene((GELATIN,), 0.70)
-    write_episode_page(tmp_path, "Nothing to do", alone, detector.look(alone), [], {})
+    alone = Scene((GELATIN,), TRAY)
+    write_episode_page(tmp_path, "Nothing to do", alone, detector.look(alone), [], {}, DEFAULT_CELL)
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert "Nothing is hidden." in text
     assert "No move was made." in text
@@ -184,7 +184,7 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
     (step,) = task.steps
     other = next(name for name in task.known if name != step.move.pick)
     decision = Decision(step.move, {other: 0.6, step.move.pick: 0.4}, (other, step.move.pick))
-    write_episode_page(tmp_path, "Believed", task.start, task.first_look, [replace(step, decision=decision)], {})
+    write_episode_page(tmp_path, "Believed", task.start, task.first_look, [replace(step, decision=decision)], {}, DEFAULT_CELL)
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert f"it knew 2 of {len(task.scene.objects)} objects" in text
     assert text.index("60%") < text.index("40%")
@@ -196,7 +196,7 @@ def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> 
     (step,) = task.steps
     seen = task.first_look.observation
     shown = replace(step, decision=Decision(step.move, observation=seen))
-    write_episode_page(tmp_path, "Seen", task.start, task.first_look, [shown], {})
+    write_episode_page(tmp_path, "Seen", task.start, task.first_look, [shown], {}, DEFAULT_CELL)
     picture = np.asarray(Image.open(tmp_path / "images/move_01_seen.png"))
     assert picture.shape == (720, 720, 3)
     assert "recognised in it: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import CATALOGUE, CLASSES, random_scene, resting, rng, scene_of
+from conftest import CATALOGUE, CLASSES, TRAY, random_scene, resting, rng, scene_of
 
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
@@ -52,7 +52,7 @@ def loads_or_is_refused(path: Path) -> bool:
 
 def assert_same(one: Scene, other: Scene) -> None:
     assert one.objects == other.objects
-    assert (one.tray_side, one.derivation, one.seed) == (other.tray_side, other.derivation, other.seed)
+    assert (one.support, one.derivation, one.seed) == (other.support, other.derivation, other.seed)
     assert (one.graph is None) == (other.graph is None)
     if one.graph is not None and other.graph is not None:
         assert list(one.graph.nx.nodes(data="kind")) == list(other.graph.nx.nodes(data="kind"))
@@ -75,7 +75,7 @@ def test_poses_of_every_size_survive(tmp_path: Path) -> None:
         resting("sugar_box", xy=(x, y), floor=z, name=f"box {index}")
         for index, (x, y, z) in enumerate([(1e-5, -1e-17, 0), (1e22, 1 / 3, 5e-324), (-1e-300, 0.0, 1e16)])
     ]
-    assert reloaded(tmp_path, scene_of(*objects, tray_side=0.1 + 0.2)).scene == scene_of(*objects, tray_side=0.1 + 0.2)
+    assert reloaded(tmp_path, scene_of(*objects, side=0.1 + 0.2)).scene == scene_of(*objects, side=0.1 + 0.2)
 
 
 def test_names_are_any_text(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ objects:
     assert math.hypot(*box.X_TO.quaternion) == pytest.approx(1, abs=1e-15)
     assert Pose((0.2, 0.0, 0.0505)) == can.X_TO
     assert (read.verdict, read.scene.graph, read.scene.seed, read.scene.derivation) == (None, None, None, ())
-    assert read.scene.tray_side == 0.70
+    assert read.scene.support == TRAY
     assert read.settled_scene is read.scene or read.settled_scene == read.scene
 
 

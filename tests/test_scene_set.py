@@ -10,7 +10,7 @@ from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, canonical_form
 from drake_clutter.scenes.scene_set import SetScene, lay_anew, load_scene_set, save_scene_set
 
-LAYOUT = ClutterConfig().layout
+WORLD = ClutterConfig()
 SCENES = [random_scene(seed) for seed in (1, 2, 3)]
 
 
@@ -36,20 +36,20 @@ def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
         derivation = held.derivation(number, held.grammar)
         assert dict(derivation.graph.nx.edges) == dict(scene.graph.nx.edges)
         if frozen:
-            settled = held.settled(number, held.grammar, LAYOUT)
+            settled = held.settled(number, held.grammar, WORLD)
             assert settled.names == scene.names
             for pose, laid_out in zip(settled.poses.values(), scene.poses.values(), strict=True):
                 assert pose.p - laid_out.p == pytest.approx([0.001, 0, 0], abs=1e-6)
                 assert pose.rotation == pytest.approx(laid_out.rotation, abs=1e-5)
         else:
             with pytest.raises(InputError, match=r"set\.json: holds graphs without poses"):
-                held.settled(number, held.grammar, LAYOUT)
+                held.settled(number, held.grammar, WORLD)
 
 
 def test_laid_anew_it_is_the_same_scene_elsewhere() -> None:
     grammar, first = GRAMMARS["ycb7"], SCENES[0]
     derivation = Derivation(grammar.replay(first.derivation), first.derivation)
-    scenes = [lay_anew(derivation, grammar, LAYOUT, rng(seed)) for seed in (1, 1, 2)]
+    scenes = [lay_anew(derivation, grammar, WORLD, rng(seed)) for seed in (1, 1, 2)]
     for scene in scenes:
         assert scene.names == first.names
         assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx([o.X_TO.p[2] for o in first.objects])

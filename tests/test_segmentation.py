@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import rng
+from conftest import DEFAULT_CELL, TRAY, rng
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.perception.image_set import LabelledImage
@@ -27,8 +27,8 @@ from drake_clutter.perception.segmentation_learning import SegmentationConfig, S
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene import Pose
 
-CAMERA = CameraConfig(width=160, height=120)
-WINDOW = Window.of(CAMERA, 0.7)
+CAMERA = Camera.over(1.6, width=160, height=120)
+WINDOW = Window.of(CAMERA, TRAY)
 CLASSES = ("gelatin_box", "sugar_box")
 
 
@@ -49,8 +49,8 @@ def picture(number: int) -> LabelledImage:
 
 def test_the_window_holds_the_tray() -> None:
     corner = np.array([[0.35, 0.35, 0.5], [-0.35, -0.35, 0.5]])
-    for camera in (CameraConfig(), CAMERA):
-        window = Window.of(camera, 0.7)
+    for camera in (DEFAULT_CELL.camera, CAMERA):
+        window = Window.of(camera, TRAY)
         (right, top), (left, bottom) = camera.project(corner)
         assert window.side % 16 == 0
         assert window.columns.start <= left < right < window.columns.stop
@@ -171,7 +171,7 @@ def learner() -> SegmentationLearner:
     torch.manual_seed(0)
     config = SegmentationConfig(steps=40, batch=4)
     network = SegmentationNetwork(CLASSES, False)
-    return SegmentationLearner(network, picture, 20, config, CAMERA, 0.7, 0, torch.device("cpu"))
+    return SegmentationLearner(network, picture, 20, config, CAMERA, TRAY, 0, torch.device("cpu"))
 
 
 def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CLASSES, resting, rng, scene_of
+from conftest import CLASSES, TRAY, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import ClutterConfig, SettleConfig
@@ -139,7 +139,7 @@ def test_apart_or_together_the_verdict_is_the_same(
 ) -> None:
     objects = [*moved_aside(first, -0.2, "first "), *moved_aside(second, 0.2, "second ")]
     apart = judge.judge(scene_of(*objects), rng(5))
-    together = settle(jittered(objects, config.settle.jitter, rng(5)), 0.70, config.settle)
+    together = settle(jittered(objects, config.settle.jitter, rng(5)), TRAY, config.settle)
     assert (apart.instability is None) == (together.instability is None)
     if apart.instability is not None and together.instability is not None:
         assert (apart.instability.reason, apart.instability.object) == (
@@ -165,7 +165,7 @@ def test_the_first_stack_that_falls_decides(judge: DrakeJudge) -> None:
 def test_not_at_rest() -> None:
     """A box in free fall for 0.1 s moves at 1 m/s; with limits that wide, it has not fallen over: it is still moving."""
     config = SettleConfig(max_time=0.1, max_displacement=1.0)
-    result = settle([resting("sugar_box", floor=0.2, name="box"), resting("large_marker", xy=(0, 0.2), name="m")], 0.7, config)
+    result = settle([resting("sugar_box", floor=0.2, name="box"), resting("large_marker", xy=(0, 0.2), name="m")], TRAY, config)
     assert result.instability is not None
     assert (result.instability.reason, result.instability.object) == (InstabilityReason.NOT_AT_REST, "box")
     steps, dt = 51, config.time_step  # it looks half a step after 0.1 s, when the step that began at 0.1 s is done
@@ -175,12 +175,12 @@ def test_not_at_rest() -> None:
 
 def test_the_end_comes_when_all_are_calm_or_still() -> None:
     box = resting("sugar_box", name="box")
-    calm = settle([box], 0.7, SettleConfig(), record=True)
+    calm = settle([box], TRAY, SettleConfig(), record=True)
     assert calm.instability is None
     assert calm.motion[-1].time == pytest.approx(0.2)  # four calm samples
-    still = settle([box], 0.7, SettleConfig(max_time=0.8, calm_samples=100), record=True)
+    still = settle([box], TRAY, SettleConfig(max_time=0.8, calm_samples=100), record=True)
     assert still.motion[-1].time == pytest.approx(0.5), "half a second in which nothing left its place"
-    patient = settle([box], 0.7, SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0), record=True)
+    patient = settle([box], TRAY, SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0), record=True)
     assert patient.motion[-1].time == pytest.approx(0.8)
 
 
@@ -194,9 +194,9 @@ def check_motion(result: Settled, start: list[SceneObject]) -> None:
 def test_motion_is_recorded_and_a_fall_followed_if_asked() -> None:
     falling = FALLING["overhang of more than half"][0]
     config = SettleConfig(time_step=0.005)
-    stopped = settle(falling, 0.7, config, record=True)
-    followed = settle(falling, 0.7, config, record=True, follow_falls=True)
-    assert settle(falling, 0.7, config).motion == ()
+    stopped = settle(falling, TRAY, config, record=True)
+    followed = settle(falling, TRAY, config, record=True, follow_falls=True)
+    assert settle(falling, TRAY, config).motion == ()
     check_motion(stopped, falling)
     check_motion(followed, falling)
     assert stopped.instability == followed.instability

@@ -7,11 +7,9 @@ import pytest
 from conftest import CLASSES
 
 from drake_clutter.catalogue import Rest, Shape, load_catalogue
-from drake_clutter.cell.epick import epick_sdf
-from drake_clutter.cell.suction import GRAVITY, SuctionConfig, carried_load, greatest_acceleration, load_share, unevenness
-from drake_clutter.resources import shipped_path
+from drake_clutter.cell.suction import GRAVITY, SuctionGripper, carried_load, greatest_acceleration, load_share, unevenness
 
-CUP = SuctionConfig()
+CUP = SuctionGripper()
 
 
 def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> np.ndarray:
@@ -21,10 +19,6 @@ def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> np.ndarray:
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = turn, (x, 0.0, height)
     return X
-
-
-def test_the_file_is_what_is_written() -> None:
-    assert shipped_path("models/epick.sdf").read_text() == epick_sdf(CUP)
 
 
 def test_a_flat_face_seals() -> None:

@@ -10,7 +10,6 @@ import pytest
 from conftest import resting, scene_of, training_script
 
 from drake_clutter.agents.exploration import LargestClear
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
@@ -26,7 +25,7 @@ COVERED = scene_of(resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box"
 
 def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
     """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
-    observation = LabelDetector(config.camera).look(scene).observation
+    observation = LabelDetector(config.cell.camera).look(scene).observation
     shifted = [replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0))) for k, d in enumerate(observation.detections)]
     return replace(observation, detections=tuple(shifted))
 
@@ -106,7 +105,7 @@ def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_what_the_arm_can() -> None:
     """A marker that lies on a box keeps what is below it hidden for ever: no cup holds it."""
-    ceiling = ArmCeiling(ClutterConfig(), ArmConfig())
+    ceiling = ArmCeiling(ClutterConfig())
     on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
     assert ceiling.never_found(COVERED) == ()
     above = replace(on_top, X_TO=on_top.X_TO.moved((0.0, 0.0, COVERED["cracker_box"].top - on_top.bounds_T[0][2])))

@@ -3,17 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-from conftest import resting, scene_of
+from conftest import DEFAULT_CELL, TRAY, resting, scene_of
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.systems.tracking import recognised, tracked
 
-CLASSES, CAMERA = load_catalogue().classes, CameraConfig()
+CLASSES, CAMERA = load_catalogue().classes, DEFAULT_CELL.camera
 CAN = "tomato_soup_can"
 
 
@@ -26,7 +25,7 @@ def image(*objects: SceneObject, top: float = 0.1) -> Observation:
     depth = np.full((CAMERA.height, CAMERA.width), CAMERA.altitude - top, np.float32)
     nothing = np.zeros(depth.shape, bool)
     detections = [Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)]
-    return Observation(depth, tuple(detections), CAMERA, 0.7)
+    return Observation(depth, tuple(detections), CAMERA, TRAY)
 
 
 def names(known: list[SceneObject], observation: Observation) -> dict[str, tuple[float, float]]:

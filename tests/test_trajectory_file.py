@@ -6,11 +6,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import DEFAULT_CELL, resting, rng, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.cell.ur10 import LINKS
 from drake_clutter.cli import app
 from drake_clutter.config import ClutterConfig
@@ -34,12 +33,13 @@ def outcomes(config: ClutterConfig, detector: LabelDetector) -> list[tuple[Move,
 @pytest.fixture
 def file(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> Path:
     path = tmp_path / "trajectory.h5"
-    assert write_trajectories(path, SCENE, outcomes, ArmConfig()) == 1, "the marker is not moved"
+    assert write_trajectories(path, SCENE, outcomes, DEFAULT_CELL) == 1, "the marker is not moved"
     return path
 
 
 def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Outcome]]) -> None:
-    scene, moves = read_trajectories(file, load_catalogue())
+    scene, cell, moves = read_trajectories(file, load_catalogue())
+    assert cell == DEFAULT_CELL
     assert scene.poses == SCENE.poses
     ((move, motion),) = moves
     assert move == MOVES[0]
@@ -97,7 +97,7 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
     planned, refused = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
     assert planned["planned"]
     assert [phase["name"] for phase in planned["phases"]] == ["approach", "carry", "retreat"]
-    assert planned["phases"][0]["q"][0] == pytest.approx(ArmConfig().home)
+    assert planned["phases"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
     assert len(planned["phases"][1]["q"]) == len(planned["phases"][1]["time"])
     assert (refused["planned"], refused["reason"], refused["about"]) == (False, "no seal", "large_marker")
     assert refused["number"] is None, "its lip would be partly in the air"

@@ -6,11 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import resting, scene_of
+from conftest import DEFAULT_CELL, resting, scene_of
 
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.config import CameraConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import PlannerConfig
@@ -20,7 +18,7 @@ from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
 
-CAMERA = CameraConfig()
+CAMERA = DEFAULT_CELL.camera
 EMPTY = LabelDetector(CAMERA).look(scene_of()).observation.depth
 LOWER = resting("sugar_box", Orientation.FLAT_0)
 UPPER = resting("cracker_box", Orientation.FLAT_0, floor=LOWER.top)
@@ -76,13 +74,14 @@ def test_what_something_unknown_may_lie_on() -> None:
 
 def highest(plan: Plan) -> float:
     """m, of the cup while it carries."""
-    arm, carry = ArmConfig(), plan.phases[1]
+    X_TB, X_FG = DEFAULT_CELL.robot.X_TB.GetAsMatrix4(), DEFAULT_CELL.gripper.X_FG.GetAsMatrix4()
+    carry = plan.phases[1]
     ways = (carry.trajectory.value(time).ravel() for time in np.linspace(0, carry.duration, 40))
-    return max(float((arm.X_TB @ forward_kinematics(q) @ arm.X_FG)[2, 3]) for q in ways)
+    return max(float((X_TB @ forward_kinematics(q) @ X_FG)[2, 3]) for q in ways)
 
 
 def test_plans_keep_clear_of_what_is_unseen() -> None:
-    planner = PickPlacePlanner(ArmConfig(), PlannerConfig(optimise=False), 0.70, CAMERA.altitude)
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimise=False))
     place = Pose((0.2, -0.2, LOWER.X_TO.translation[2] + 0.001), LOWER.X_TO.quaternion)
     between = UnseenBlock((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)
     low, high = (planner.plan([LOWER], LOWER.name, place, unseen) for unseen in ((), (between,)))

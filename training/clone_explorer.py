@@ -5,7 +5,7 @@
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -15,13 +15,14 @@ from drake_clutter.agents.cloning import Cloning, CloningConfig
 from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.config import load_typed
+from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.validation import Between, config_class, load_typed
 
 
-@dataclass
+@config_class
 class CloneExplorer(ExplorerTraining):
     """A training, see `ExplorerTraining`.
 
@@ -32,7 +33,7 @@ class CloneExplorer(ExplorerTraining):
     """
 
     teacher: str = "training/checkpoints/teacher.safetensors"
-    evaluate_every: int = 5
+    evaluate_every: Annotated[int, Between(1)] = 5
     learning: CloningConfig = field(default_factory=CloningConfig)
 
 
@@ -43,7 +44,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_typed(CloneExplorer(), config, settings or [])
+    given = load_typed(CloneExplorer(), config, settings or [], upgrade)
     one_thread_per_operation()
     chosen = device_of(device)
     environment = given.environment()

@@ -28,6 +28,7 @@ from rich.table import Table
 from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import upgrade_head
 from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.records import recorded
@@ -41,6 +42,7 @@ from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 HERE = Path(__file__).parent
@@ -96,14 +98,14 @@ class Player:
         self._catalogue = load_catalogue()
         self._set = cache(lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue))
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
-        self._ceiling = ArmCeiling(Scenario().world, Scenario().arm)
+        self._ceiling = ArmCeiling(Scenario().world)
 
     def __call__(self, asked: Asked) -> dict[str, Any]:
         """Plays one, and tells how it went."""
         row, number = asked.row, asked.number
         held: SceneSet = self._set(row.scenes)
         scenario = Scenario(agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number)
-        scene = held.settled(number, held.grammar, scenario.world.layout)
+        scene = held.settled(number, held.grammar, scenario.world)
         begun = time.perf_counter()
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
         told["arm_can"] = not self._ceiling.never_found(scene)
@@ -121,10 +123,10 @@ class Player:
     def _played(
         self, scene: Scene, scenario: Scenario, motion: str
     ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float, str]:
-        perceive, choose = perception_of(scenario, scene.tray_side), self._policy(scenario.agent)
+        perceive, choose = perception_of(scenario, scene.support), self._policy(scenario.agent)
         options: dict[str, Any] = {"max_moves": scenario.max_moves, "seed": scenario.seed, "world": scenario.world}
         if motion == "arm":
-            loop = ClosedLoop(scene, choose, perceive=perceive, arm=scenario.arm, **options)
+            loop = ClosedLoop(scene, choose, perceive=perceive, **options)
             timing = loop.run()
             return loop.task, loop.known, timing.robot, timing.end
         assert perceive is not None, "labels with settle are not in the rows"
@@ -141,7 +143,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     networks = [checkpoint_path(row.agent, TRAINED)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))
-    scenario = asdict(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
+    scenario = to_plain(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
     scenario.pop("seed")  # each episode's own: the scene's number
     asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": scenario}
     asked |= {"weights": [sha256_of(file) for file in networks]}
@@ -153,7 +155,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
         for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
             yield told | {"commit": commit}
 
-    return list(recorded(path, asked, play))[1 : 1 + count]
+    return list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]
 
 
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:

@@ -6,7 +6,7 @@
 
 import time
 from collections import defaultdict
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +32,7 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.validation import to_plain
 
 SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
 """Bounds between which recall is told apart: how much of an object is seen."""
@@ -95,7 +96,7 @@ def summarised(objects: list[Seen], false: int, seconds: list[float]) -> dict[st
         count = sum(o.named for o in of)
         return {"objects": len(of), "recall": count / len(of), "ci95": wilson_interval(count, len(of))}
 
-    in_view = [o for o in objects if o.share >= ClutterConfig().camera.hidden_below]
+    in_view = [o for o in objects if o.share >= ClutterConfig().cell.camera.visibility_threshold]
     return {
         "in_view": recall(in_view),
         "recall_by_visible_share": {name: recall(by_share[name]) for name in sorted(by_share)},
@@ -120,13 +121,13 @@ def main(
     """Compares detections with the truth."""
     torch.set_num_threads(threads)
     config, catalogue, console = ClutterConfig(), load_catalogue(), Console(stderr=True)
-    network, camera, rows = SegmentationNetwork.load(detector), OverheadCamera(config.camera), dict[str, Any]()
+    network, camera, rows = SegmentationNetwork.load(detector), OverheadCamera(config.cell.camera), dict[str, Any]()
 
     def shown(path: Path) -> tuple[list[str], list[LabelledImage]]:
         held = load_scene_set(path, catalogue)
         found = []
         for k in track(range(min(count, len(held.scenes))), path.stem, console=console):
-            scene = held.settled(k, held.grammar, config.layout)
+            scene = held.settled(k, held.grammar, config)
             image = camera.render(scene)
             share = camera.visible_shares(scene, image.label)
             seen = np.bincount(image.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
@@ -138,7 +139,7 @@ def main(
         return [c.name for c in held.classes], found
 
     def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
-        eye = LearnedDetector(network, [catalogue.classes[n] for n in names], config.camera, config.layout.tray_side)
+        eye = LearnedDetector(network, [catalogue.classes[n] for n in names], config.cell.camera, config.cell.support)
         eye.detect(given[0].depth, given[0].color)  # compiles
         objects, false, seconds = list[Seen](), 0, list[float]()
         for k, image in enumerate(given):
@@ -158,7 +159,7 @@ def main(
         "seed": seed,
         "rows": rows,
     }
-    write_json(out, fields | {"config": asdict(config)})
+    write_json(out, fields | {"config": to_plain(config)})
     console.print_json(data=rows)
 
 

@@ -20,13 +20,14 @@ from rich.table import Table
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, in_words, ratio_interval, summarise_episodes
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig
+from drake_clutter.config import ClutterConfig, upgrade_head
 from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import recorded
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 HERE = Path(__file__).parent
@@ -45,7 +46,7 @@ def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, w
     """The episodes of an agent on a set's first scenes; those that the file has not got are played, and written as they end."""
     config = ClutterConfig()
     asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent, TRAINED)}
-    asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": asdict(config)}
+    asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": to_plain(config)}
     commit = git_commit()
 
     def play(done: int) -> Iterator[dict[str, Any]]:
@@ -54,7 +55,7 @@ def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, w
         for result in track(results, path.stem, count, done, console=Console(stderr=True)):
             yield asdict(result) | {"commit": commit}
 
-    return [episode_of(record) for record in list(recorded(path, asked, play))[1 : 1 + count]]
+    return [episode_of(record) for record in list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]]
 
 
 def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
@@ -93,7 +94,7 @@ def rows_there(path: Path, held: Mapping[str, Any]) -> list[dict[str, Any]]:
         InputError: they were measured otherwise, or it is another file.
     """
     try:
-        there = json.loads(path.read_text())
+        there = upgrade_head(json.loads(path.read_text()))
         rows: list[dict[str, Any]] = there["rows"]
         same = all(there[key] == value for key, value in held.items())
     except FileNotFoundError:
@@ -153,7 +154,7 @@ def main(
     names = [name for name in TABLES if only is None or only in name]
     if not names:
         raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
-    held = {"seed": seed, "fidelity": fidelity, "config": asdict(ClutterConfig())}
+    held = {"seed": seed, "fidelity": fidelity, "config": to_plain(ClutterConfig())}
     sets = {name: load_scene_set(SCENES / f"{name}.json", catalogue) for name in names}
     for name, scenes in sets.items():  # says what is wrong before anything is played
         rows_there(out or RESULTS / f"{TABLES[name][0]}.json", held)

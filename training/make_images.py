@@ -20,7 +20,7 @@ import gc
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +43,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE = "job.json"
@@ -105,17 +106,17 @@ class ItemMaker:
         rng = item_rng(self._job.seed, item)
         count = self._job.images(item)
         scenes = self._heaps(count, rng) if self._job.is_heap(item) else self._generated(count, rng)
-        camera = OverheadCamera(self._config.camera, random_lamps(rng))
+        camera = OverheadCamera(self._config.cell.camera, random_lamps(rng))
         known = dict[SceneObject, int]()
         images = (photograph(camera, scene, known, rng) for scene in scenes)
-        write_images(self._out / f"{item:06d}", images, self._config.camera, list(load_catalogue().classes))
+        write_images(self._out / f"{item:06d}", images, self._config.cell.camera, list(load_catalogue().classes))
         del camera
         gc.collect()  # in this thread: a renderer that another one collects can abort the process
 
     def _heaps(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
         """Heaps of all objects down to one, at any of the moments."""
         classes = [self._classes[k] for k in rng.integers(len(self._classes), size=HEAP_OBJECTS)]
-        moments = dropped(above_tray(classes, self._config.layout.tray_side, rng), self._config.settle.time_step, MOMENTS)
+        moments = dropped(above_tray(classes, self._config.cell.support, rng), self._config.settle.time_step, MOMENTS)
         names = set(moments[-1].names)
         left = moments[-1]
         for most in np.linspace(len(names), 1, count).round():
@@ -157,7 +158,8 @@ def put_elsewhere(taken: SceneObject, rest: Scene, rng: np.random.Generator) -> 
         R_TO = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix() @ taken.X_TO.rotation
         turned = replace(taken, X_TO=Pose.of(R_TO, (0.0, 0.0, 0.0)))
         lower, upper = turned.bounds_T
-        least, most = -rest.tray_side / 2 - lower[:2], rest.tray_side / 2 - upper[:2]
+        half_size = rest.support.half_size
+        least, most = -half_size - lower[:2], half_size - upper[:2]
         if (least < most).all():
             x, y = rng.uniform(least, most)
             placed = replace(taken, X_TO=Pose.of(R_TO, (x, y, -lower[2])))
@@ -235,7 +237,7 @@ def main(
     agents = [agent for agent, _ in job.agents()]
     there = [path.name for path in out.iterdir()] if out.is_dir() else []
     output_directory(out, may_hold=frozenset({JOB_FILE, *(name for name in there if re.fullmatch(r"\.?\d{6}", name))}))
-    about = {**asdict(job), "agents": agents}
+    about = {**to_plain(job), "agents": agents}
     if JOB_FILE in there and json.loads((out / JOB_FILE).read_text()) != about:
         raise InputError(f"--out {out}: holds images of another job; allowed is a folder that is new or of the same options")
     write_json(out / JOB_FILE, about)

@@ -6,7 +6,7 @@
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -15,18 +15,20 @@ import torch
 import typer
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import CameraConfig, LayoutConfig, load_typed
+from drake_clutter.cell.work_cell import WorkCell, default_cell
+from drake_clutter.config import upgrade
 from drake_clutter.files import told_in_one_line
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
 from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
 from drake_clutter.seeding import item_rng
+from drake_clutter.validation import Between, config_class, load_typed
 
 CHECKPOINT = "detector.safetensors"
 
 
-@dataclass
+@config_class
 class TrainDetector:
     """A training.
 
@@ -37,20 +39,19 @@ class TrainDetector:
         warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
         seed: same seed, same weights (on the same kind of machine).
         evaluate_every: steps.
-        learning, camera, layout: see there.
+        learning, cell: see there.
     """
 
     images: str = "runs/images"
-    held_out: int = 200
+    held_out: Annotated[int, Between(0)] = 200
     objects: str = "pantry14"
     catalogue: str = ""
     looks_at_color: bool = False
     warm_start: str = ""
-    seed: int = 0
-    evaluate_every: int = 250
+    seed: Annotated[int, Between(0)] = 0
+    evaluate_every: Annotated[int, Between(1)] = 250
     learning: SegmentationConfig = field(default_factory=SegmentationConfig)
-    camera: CameraConfig = field(default_factory=CameraConfig)
-    layout: LayoutConfig = field(default_factory=LayoutConfig)
+    cell: WorkCell = field(default_factory=default_cell)
 
 
 def main(
@@ -61,9 +62,9 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
 ) -> None:
     """Trains, evaluates as it goes, and writes detector.safetensors."""
-    given = load_typed(TrainDetector(), config, settings or [])
+    given = load_typed(TrainDetector(), config, settings or [], upgrade)
     torch.set_num_threads(threads)
-    chosen, camera, tray_side = device_of(device), given.camera, given.layout.tray_side
+    chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
     classes = [c.name for c in load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(given.objects)]
     images = ImageSet(Path(given.images))
     learned = len(images) - given.held_out
@@ -71,8 +72,8 @@ def main(
     network = SegmentationNetwork(classes, given.looks_at_color)
     if given.warm_start:
         network.begin_with(SegmentationNetwork.load(Path(given.warm_start)))
-    learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, tray_side, given.seed, chosen)
-    run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, tray_side)
+    learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, support, given.seed, chosen)
+    run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, support)
 
     def figures() -> dict[str, float]:
         """Of the images held out: share of the pixels whose class is right, over the union, mean of classes; error of votes."""

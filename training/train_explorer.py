@@ -6,7 +6,7 @@
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -16,13 +16,14 @@ from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
 from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.config import load_typed
+from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.validation import Between, config_class, load_typed
 
 
-@dataclass
+@config_class
 class TrainExplorer(ExplorerTraining):
     """A training, see `ExplorerTraining`.
 
@@ -35,7 +36,7 @@ class TrainExplorer(ExplorerTraining):
 
     privileged: bool = True
     warm_start: str = ""
-    evaluate_every: int = 15_000
+    evaluate_every: Annotated[int, Between(1)] = 15_000
     learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
 
 
@@ -46,7 +47,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_typed(TrainExplorer(), config, settings or [])
+    given = load_typed(TrainExplorer(), config, settings or [], upgrade)
     one_thread_per_operation()
     environment = given.environment(privileged=given.privileged)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))

@@ -6,7 +6,7 @@ A run that was stopped, at any moment, goes on with the same command, and ends w
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,17 +17,18 @@ from drake_clutter.agents.learned_generator import about_values, load_values
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.config import ClutterConfig, upgrade
 from drake_clutter.files import told_in_one_line
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
+from drake_clutter.validation import Between, NonNegative, config_class, load_typed
 
 CHECKPOINT = "generator.safetensors"
 
 
-@dataclass
+@config_class
 class TrainGenerator:
     """A training.
 
@@ -43,12 +44,12 @@ class TrainGenerator:
 
     objects: str = "ycb7"
     catalogue: str = ""
-    seed: int = 0
+    seed: Annotated[int, Between(0)] = 0
     warm_start: str = ""
-    evaluate_every: int = 32_000
-    evaluation_scenes: int = 256
-    save_every: int = 64_000
-    sampling_temperature: float = 0.0
+    evaluate_every: Annotated[int, Between(1)] = 32_000
+    evaluation_scenes: Annotated[int, Between(1)] = 256
+    save_every: Annotated[int, Between(1)] = 64_000
+    sampling_temperature: NonNegative = 0.0
     task: GenerationTask = field(default_factory=GenerationTask)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
     world: ClutterConfig = field(default_factory=ClutterConfig)
@@ -80,7 +81,7 @@ def main(
     threads: Annotated[int, typer.Option(min=1, max=PARTS, help="That work on an update; changes no result.")] = PARTS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
-    given = load_typed(TrainGenerator(), config, settings or [])
+    given = load_typed(TrainGenerator(), config, settings or [], upgrade)
     chosen = device_of(device)
     one_thread_per_operation()
     classes = load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(given.objects)

@@ -5,8 +5,8 @@ between two rounds is the network, its optimiser and the number of rounds.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -17,9 +17,10 @@ from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probabili
 from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.validation import Between, NonNegative, config_class
 
 
-@dataclass
+@config_class
 class ActorCriticConfig:
     """How a teacher learns.
 
@@ -35,17 +36,17 @@ class ActorCriticConfig:
         width: of the network.
     """
 
-    steps: int = 150_000
-    episodes: int = 96
-    passes: int = 4
-    batch: int = 256
-    discount: float = 0.95
-    trace: float = 0.9
-    clip: float = 0.2
-    entropy: float = 0.01
-    value: float = 0.5
-    learning_rate: float = 1e-3
-    width: int = 32
+    steps: Annotated[int, Between(1)] = 150_000
+    episodes: Annotated[int, Between(1)] = 96
+    passes: Annotated[int, Between(1)] = 4
+    batch: Annotated[int, Between(1)] = 256
+    discount: Annotated[float, Between(0.0, 1.0)] = 0.95
+    trace: Annotated[float, Between(0.0, 1.0)] = 0.9
+    clip: Annotated[float, Between(1e-06)] = 0.2
+    entropy: NonNegative = 0.01
+    value: NonNegative = 0.5
+    learning_rate: NonNegative = 1e-3
+    width: Annotated[int, Between(1)] = 32
 
 
 class ActorCritic:

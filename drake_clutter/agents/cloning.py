@@ -6,9 +6,8 @@ only its own mistakes lead.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,9 +19,10 @@ from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, par
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation
+from drake_clutter.validation import Between, NonNegative, config_class
 
 
-@dataclass
+@config_class
 class CloningConfig:
     """How a student learns.
 
@@ -34,13 +34,13 @@ class CloningConfig:
         width: of the network.
     """
 
-    rounds: int = 40
-    episodes: int = 100
+    rounds: Annotated[int, Between(1)] = 40
+    episodes: Annotated[int, Between(1)] = 100
     dagger: bool = True
-    updates: int = 400
-    batch: int = 128
-    learning_rate: float = 1e-3
-    width: int = 32
+    updates: Annotated[int, Between(1)] = 400
+    batch: Annotated[int, Between(1)] = 128
+    learning_rate: NonNegative = 1e-3
+    width: Annotated[int, Between(1)] = 32
 
 
 class Cloning:

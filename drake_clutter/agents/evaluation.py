@@ -75,14 +75,14 @@ class EpisodePlayer:
         self._catalogue = load_catalogue(catalogue_folder)
         self._set = cache(partial(load_scene_set, catalogue=self._catalogue))
         self._executor = EXECUTORS[fidelity](config, follow_falls=False)
-        self._detector = DETECTORS[fidelity](config.camera)
+        self._detector = DETECTORS[fidelity](config.cell.camera)
         self._explorers: dict[str, ExplorerMaker] = {}
 
     def _scene(self, episode: Episode) -> Scene:
         if episode.number is None:
             return load_scene(episode.file, self._catalogue).settled_scene
         held = self._set(episode.file)
-        return held.settled(episode.number, held.grammar, self._config.layout)
+        return held.settled(episode.number, held.grammar, self._config)
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""

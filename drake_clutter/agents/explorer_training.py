@@ -1,7 +1,8 @@
 """What all trainings of explorers have in common: the scenes, the world, and how they are watched."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
+from typing import Annotated
 
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork
@@ -9,11 +10,12 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.validation import Between, config_class
 
 CHECKPOINT = "explorer.safetensors"
 
 
-@dataclass
+@config_class
 class ExplorerTraining:
     """A training.
 
@@ -27,11 +29,11 @@ class ExplorerTraining:
 
     scenes: str = "training/scenes/train_sg_star.json"
     catalogue: str = ""
-    seed: int = 0
+    seed: Annotated[int, Between(0)] = 0
     fidelity: str = "equilibrium"
-    max_moves: int = 20
-    most_objects: int = 24
-    evaluation_episodes: int = 200
+    max_moves: Annotated[int, Between(1)] = 20
+    most_objects: Annotated[int, Between(1, 64)] = 24
+    evaluation_episodes: Annotated[int, Between(1)] = 200
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
     def environment(self, *, privileged: bool = False) -> ClutterExploration:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,6 +22,7 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
+from drake_clutter.validation import to_plain
 
 SEARCH_BUDGET = 400
 """Moves that are tried to find out whether a scene is solvable."""
@@ -136,7 +137,7 @@ class GenerationJob:
         """The same for JSON, with the hash of a trained agent's weights: all that decides what the scenes are."""
         folder = str(self.catalogue_folder.resolve()) if self.catalogue_folder else None
         weights = {"weights": found} if (found := weights_of(self.agent, TRAINED)) else {}
-        return {**asdict(self), **weights, "catalogue_folder": folder}
+        return {**to_plain(self), **weights, "catalogue_folder": folder}
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class SceneGenerator:
         failures: Counter[str] = Counter()
         for _ in range(LAYOUT_TRIES):
             derivation = self._agent.derive(self._grammar, self._budget, rng)
-            scene = lay_out(derivation, self._grammar.classes, self._job.config.layout, rng, self._job.seed)
+            scene = lay_out(derivation, self._grammar.classes, self._job.config, rng, self._job.seed)
             if not isinstance(scene, LayoutFailure):
                 return scene, failures
             failures[scene.reason.value] += 1

@@ -8,10 +8,9 @@ a distribution of scenes, the better the likelier, and no state is worth more be
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
+from drake_clutter.validation import Between, NonNegative, config_class
 
 PARTS = 2
 """Of an update, that are worked on side by side; always so many, so that the number of threads changes no result."""
@@ -31,7 +31,7 @@ KEPT = ("node_kind", "node_flags", "position", "edge", "edge_kind", "remaining")
 """What of an observation the network looks at; the masks follow from the kinds."""
 
 
-@dataclass
+@config_class
 class SoftQConfig:
     """How a generator learns.
 
@@ -49,19 +49,19 @@ class SoftQConfig:
         width: of the network.
     """
 
-    steps: int = 640_000
-    environments: int = 32
-    batch: int = 128
-    segment: int = 8
-    trace: float = 0.95
-    steps_per_update: int = 4
-    replay: int = 100_000
-    warm_up: int = 4_000
-    learning_rate: float = 1e-3
-    halve_every: int = 128_000
-    temperature: float = 0.25
-    target_rate: float = 0.005
-    width: int = 32
+    steps: Annotated[int, Between(1)] = 640_000
+    environments: Annotated[int, Between(1)] = 32
+    batch: Annotated[int, Between(1)] = 128
+    segment: Annotated[int, Between(1)] = 8
+    trace: Annotated[float, Between(0.0, 1.0)] = 0.95
+    steps_per_update: Annotated[int, Between(1)] = 4
+    replay: Annotated[int, Between(1)] = 100_000
+    warm_up: Annotated[int, Between(0)] = 4_000
+    learning_rate: NonNegative = 1e-3
+    halve_every: Annotated[int, Between(1)] = 128_000
+    temperature: Annotated[float, Between(1e-06)] = 0.25
+    target_rate: Annotated[float, Between(0.0, 1.0)] = 0.005
+    width: Annotated[int, Between(1)] = 32
 
 
 class Episode(NamedTuple):

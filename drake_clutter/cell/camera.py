@@ -4,8 +4,7 @@ Frames: T the support's frame; C the camera, z along the optical axis, x to the 
 """
 
 import math
-from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,12 @@ from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.validation import Between, Model
 
 Floats = NDArray[np.float64]
+
+
+D435_FOV_Y_DEG = 42.5
+"""Vertical field of view of the color stream of an Intel RealSense D435 [deg] (data sheet)."""
+D435_FOCAL_LENGTH = 480 / 2 / math.tan(math.radians(D435_FOV_Y_DEG) / 2)
+"""Its focal length at 640 x 480 [px]."""
 
 
 class Camera(Model):
@@ -34,16 +39,31 @@ class Camera(Model):
     pose: PoseSpec
     width: Annotated[int, Between(16, 4096)] = 640
     height: Annotated[int, Between(16, 4096)] = 480
-    fov_y_deg: Annotated[float, Between(1.0, 170.0)] = 42.5
+    fov_y_deg: Annotated[float, Between(1.0, 170.0)] = D435_FOV_Y_DEG
     visibility_threshold: Annotated[float, Between(0.0, 1.0)] = 0.30
     depth_noise: bool = True
+
+    @staticmethod
+    def over(altitude: float, **fields: Any) -> "Camera":
+        """Return a camera above the support's center that looks straight down, x along the support's x.
+
+        Args:
+            altitude: Height above the floor [m].
+            **fields: Other fields.
+        """
+        return Camera(pose=PoseSpec(translation=(0.0, 0.0, altitude), rpy_deg=(180.0, 0.0, 0.0)), **fields)
 
     @property
     def X_TC(self) -> RigidTransform:
         """Pose of the camera."""
         return self.pose.transform
 
-    @cached_property
+    @property
+    def altitude(self) -> float:
+        """Height above the support's floor [m]."""
+        return float(self.pose.translation[2])
+
+    @property
     def focal_length(self) -> float:
         """Focal length, the same along rows and columns [px]."""
         return self.height / 2 / math.tan(math.radians(self.fov_y_deg) / 2)

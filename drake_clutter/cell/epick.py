@@ -1,4 +1,4 @@
-"""The EPick vacuum gripper with tube and cup as a model; `models/epick.sdf` is what `epick_sdf` writes for the default cup.
+"""The EPick vacuum gripper with tube and cup as a model.
 
 Frames: F the flange that it is screwed to, z out of the arm; G the cup, see `suction`. Sources: see `suction`; the masses of tube
 and cup are ours.
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.cell.rods import Rod, sdf_link, sdf_pose
-from drake_clutter.cell.suction import EPICK_LENGTH, EPICK_MASS, EPICK_RADIUS, SuctionConfig
+from drake_clutter.cell.suction import EPICK_LENGTH, EPICK_MASS, EPICK_RADIUS, SuctionGripper
 
 TUBE_RADIUS, TUBE_MASS, CUP_MASS = 0.010, 0.05, 0.02
 """m, kg, kg."""
@@ -19,7 +19,7 @@ _LOAD = 0.5
 """kg."""
 
 
-def epick_sdf(config: SuctionConfig, *, compliant: bool = True) -> str:
+def epick_sdf(config: SuctionGripper, *, compliant: bool = True) -> str:
     """The SDF model, as text: link `body` (its frame is F), link `cup` (its frame is G), on the sliding joint `bellows`.
 
     Args:

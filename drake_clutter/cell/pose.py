@@ -1,6 +1,6 @@
 """A rigid pose as it stands in a cell's file."""
 
-from functools import cached_property
+from functools import lru_cache
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -19,10 +19,15 @@ class PoseSpec(Model):
     translation: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
 
-    @cached_property
+    @property
     def transform(self) -> RigidTransform:
         """X_AB; multiples of 90 deg are exact."""
-        R = RollPitchYaw(np.radians(self.rpy_deg)).ToRotationMatrix().matrix()
-        if all(angle % 90 == 0 for angle in self.rpy_deg):
-            R = np.round(R) + 0.0
-        return RigidTransform(RotationMatrix(R), self.translation)
+        return _transform(self)
+
+
+@lru_cache(maxsize=256)
+def _transform(pose: PoseSpec) -> RigidTransform:
+    R = RollPitchYaw(np.radians(pose.rpy_deg)).ToRotationMatrix().matrix()
+    if all(angle % 90 == 0 for angle in pose.rpy_deg):
+        R = np.round(R) + 0.0
+    return RigidTransform(RotationMatrix(R), pose.translation)

@@ -37,6 +37,10 @@ class Support(Model):
         """Half the inner extents along x and y [m]. Shape (2,)."""
         return np.array(self.size) / 2
 
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a point (x, y) [m] is above the floor."""
+        return bool(abs(x) <= self.size[0] / 2 and abs(y) <= self.size[1] / 2)
+
     @property
     def area(self) -> float:
         """Of the floor [m^2]."""

@@ -5,7 +5,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import field_validator
+from pydrake.math import RigidTransform
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.fixture import Fixture
@@ -46,6 +48,32 @@ class WorkCell(Model):
     def camera(self) -> Camera:
         """The camera that the explorer sees through."""
         return next(iter(self.cameras.values()))
+
+    @property
+    def table_height(self) -> float:
+        """Of the table on which support and pedestal stand, in T [m]."""
+        return -self.support.floor_thickness - self.support.floor_height
+
+    @property
+    def pedestal(self) -> tuple[RigidTransform, tuple[float, float, float]] | None:
+        """Pose X_TS and extents [m] of the box under the robot's base; None if it has none."""
+        side, X_TB = self.robot.pedestal_side, self.robot.X_TB
+        height = X_TB.translation()[2] - self.table_height
+        if not side or height <= 0.01:
+            return None
+        x, y = X_TB.translation()[:2]
+        return RigidTransform(X_TB.rotation(), [x, y, height / 2 + self.table_height]), (side, side, height - 0.002)
+
+    @property
+    def pedestal_in_support(self) -> bool:
+        """Whether the pedestal would stand in the support."""
+        x, y = np.abs(self.robot.X_TB.translation()[:2])
+        beside = self.support.half_size + self.support.wall_thickness + self.robot.pedestal_side / 2
+        return bool(x < beside[0] and y < beside[1])
+
+    def with_support(self, support: Support) -> "WorkCell":
+        """Return the cell with another support."""
+        return self if support == self.support else self.model_copy(update={"support": support})
 
     def __hash__(self) -> int:
         """Hash of the whole content, so that what is derived from a cell can be kept."""

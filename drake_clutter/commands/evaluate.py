@@ -14,6 +14,7 @@ from drake_clutter.files import InputError, sha256_of, write_json
 from drake_clutter.resources import git_commit, shipped_path
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 _READ_AT = 10
@@ -113,7 +114,7 @@ def evaluate(
     if out is None:
         return rows
     files = sorted({scene.file for scene in scenes})
-    fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": asdict(config), "rows": rows}
+    fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": to_plain(config), "rows": rows}
     fields |= {"commit": git_commit(), "scenes": {str(file): sha256_of(file) for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

@@ -7,7 +7,6 @@ from typing import Any
 import yaml
 
 from drake_clutter.agents.exploration import make_explorers, play
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -38,7 +37,9 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
 
 
 def _task(scene: Scene, config: ClutterConfig, max_moves: int, fidelity: str) -> ExplorationTask:
-    return ExplorationTask(scene, EXECUTORS[fidelity](config), DETECTORS[fidelity](config.camera), config.exploration, max_moves)
+    return ExplorationTask(
+        scene, EXECUTORS[fidelity](config), DETECTORS[fidelity](config.cell.camera), config.exploration, max_moves
+    )
 
 
 def explore(
@@ -91,7 +92,7 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
     Raises:
         InputError: as `carry_out`.
     """
-    look, rng, executor = LabelDetector(config.camera).look(scene), item_rng(seed), ArmExecutor(config)
+    look, rng, executor = LabelDetector(config.cell.camera).look(scene), item_rng(seed), ArmExecutor(config)
     plans = list[dict[str, Any]]()
     for number, move in enumerate(moves):
         _check_names(moves, number, [d.name for d in look.observation.detections], scene)
@@ -177,8 +178,8 @@ def write_episode(
     agent: str,
     fidelity: str,
     seed: int,
+    config: ClutterConfig,
     *,
-    arm: ArmConfig | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
@@ -187,10 +188,8 @@ def write_episode(
     """
     fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
     save_scene(out / "after.yaml", task.scene)
-    write_episode_page(out, title, task.start, task.first_look, task.steps, fields)
+    write_episode_page(out, title, task.start, task.first_look, task.steps, fields, config.cell)
     if fidelity == "arm":
-        write_trajectories(
-            out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], arm or ArmConfig()
-        )
+        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], config.cell)
     write_json(out / "episode.json", fields)
     return fields

@@ -16,8 +16,9 @@ import yaml
 
 from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.config import ClutterConfig, load_typed
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, output_directory, write_json, write_text
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
@@ -27,6 +28,7 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
+from drake_clutter.validation import load_typed, to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
@@ -58,7 +60,7 @@ class FeasibilityJob:
     """
 
     scenes: tuple[Path, ...]
-    setups: dict[str, ArmConfig]
+    setups: dict[str, WorkCell]
     targets: tuple[Target, ...]
     seed: int
     world: ClutterConfig
@@ -68,10 +70,10 @@ class FeasibilityJob:
         """As a document."""
         return {
             "scenes": [str(path.resolve()) for path in self.scenes],
-            "setups": {name: asdict(arm) for name, arm in self.setups.items()},
+            "setups": {name: to_plain(cell) for name, cell in self.setups.items()},
             "targets": [asdict(target) for target in self.targets],
             "seed": self.seed,
-            "world": asdict(self.world),
+            "world": to_plain(self.world),
             "catalogue_folder": str(self.catalogue_folder.resolve()) if self.catalogue_folder else None,
         }
 
@@ -93,21 +95,30 @@ def scene_files(given: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def setups(bases: Sequence[list[float]], trays: Sequence[list[float]], files: Sequence[Path]) -> dict[str, ArmConfig]:
-    """Arms by name: the files', and the default one at other places; the default one if nothing is given.
+def setups(
+    bases: Sequence[list[float]], trays: Sequence[list[float]], files: Sequence[Path], default: WorkCell
+) -> dict[str, WorkCell]:
+    """Return cells by name: the files', and the default one with other bases; the default one if nothing is given.
 
     Args:
         bases: X_TB as x, y, z (m) and yaw (deg). trays: X_BT likewise.
-        files: YAML with fields of `ArmConfig`.
+        files: YAML with fields of `WorkCell` over those of the default.
+        default: A cell.
     """
-    found = {path.stem: load_typed(ArmConfig(), path) for path in files}
+    found = {path.stem: load_typed(default, path, convert=upgrade_cell) for path in files}
     for base in bases:
-        found[f"base {', '.join(f'{v:g}' for v in base)}"] = replace(ArmConfig(), base=base)
+        found[f"base {', '.join(f'{v:g}' for v in base)}"] = _moved(default, base)
     for x, y, z, yaw in trays:
         c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
         seen_from_tray = [-(c * x + s * y), -(c * y - s * x), -z, -yaw]
-        found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = replace(ArmConfig(), base=seen_from_tray)
-    return found or {"default": ArmConfig()}
+        found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = _moved(default, seen_from_tray)
+    return found or {"default": default}
+
+
+def _moved(cell: WorkCell, base: Sequence[float]) -> WorkCell:
+    x, y, z, yaw = base
+    pose = PoseSpec(translation=(x, y, z), rpy_deg=(0.0, 0.0, yaw))
+    return cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": pose})})
 
 
 def read_targets(path: Path) -> tuple[Target, ...]:
@@ -165,18 +176,17 @@ class Worker:
 
     def __call__(self, part: Part) -> dict[str, Any]:
         """A part's result."""
-        arm, world = self._job.setups[part.setup], self._job.world
+        cell = self._job.setups[part.setup]
         if part.base_x is not None:
             places = [(part.base_x, y) for y in BASE_Y]
-            scores = zip(places, base_scores(arm, places, world.layout.tray_side, world.camera.altitude), strict=True)
+            scores = zip(places, base_scores(cell, places), strict=True)
             return {"bases": [{"x": x, "y": y, "share": share, "manipulability": best} for (x, y), (share, best) in scores]}
         if part.scene is None:
-            return self._reach(arm)
+            return self._reach(cell)
         return self._moves(part.setup, part.scene)
 
-    def _reach(self, arm: ArmConfig) -> dict[str, Any]:
-        world = self._job.world
-        reachability = Reachability(arm, world.layout.tray_side, world.camera.altitude)
+    def _reach(self, cell: WorkCell) -> dict[str, Any]:
+        reachability = Reachability(cell)
         found = reachability.map(HEIGHTS, SPACING)
         targets = []
         for target in self._job.targets:
@@ -207,8 +217,9 @@ class Worker:
         if scene is None:
             return {"scene": path.stem, "unstable": True, "moves": [], "noise": []}
         if setup not in self._studies:
-            arm, planner = self._job.setups[setup], PlannerConfig(optimise=False, time_limit=TIME_LIMIT)
-            self._studies[setup] = FeasibilityStudy(setup, arm, self._job.world, planner, self._job.seed)
+            world = replace(self._job.world, cell=self._job.setups[setup])
+            planner = PlannerConfig(optimise=False, time_limit=TIME_LIMIT)
+            self._studies[setup] = FeasibilityStudy(setup, world, planner, self._job.seed)
         study = self._studies[setup]
         rows = study.moves(path.stem, number, scene)
         noise = study.noise(path.stem, number, scene, rows)

@@ -4,7 +4,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.tasks.full_knowledge import Solvability
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
 JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
@@ -103,7 +104,12 @@ def generate(
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
     answers = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
     summary = summarise(job, judged, answers)
-    summary |= {"layout_failures": dict(failures), "seconds": round(seconds, 2), "workers": workers, "config": asdict(job.config)}
+    summary |= {
+        "layout_failures": dict(failures),
+        "seconds": round(seconds, 2),
+        "workers": workers,
+        "config": to_plain(job.config),
+    }
     write_json(out / SUMMARY_FILE, summary)
     write_contact_sheet(out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])])
     return summary

@@ -20,7 +20,7 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
 
     `label.png` holds 0 for what is no object and k for the k-th object of the scene.
     """
-    camera = OverheadCamera(config.camera)
+    camera = OverheadCamera(config.cell.camera)
     images, shares = camera.render(scene), camera.visible_shares(scene)
     depth = np.where(np.isfinite(images.depth), images.depth / DEPTH_UNIT, 0)
     Image.fromarray(images.color).save(out / "color.png")

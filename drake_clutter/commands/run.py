@@ -8,7 +8,6 @@ from typing import Any
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.explore import Report, at_rest, write_episode
-from drake_clutter.config import config_yaml
 from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
@@ -16,6 +15,7 @@ from drake_clutter.systems.closed_loop import ClosedLoop, Timing
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.validation import config_yaml
 
 DEMO_TRIES = 5
 """Scenes that the demo explores at most."""
@@ -46,8 +46,8 @@ def scene_of(scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] 
 def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
     """Plays a scenario on a scene at rest."""
     choose, options = policy_of(scenario.agent, scenario.world), {"max_moves": scenario.max_moves, "seed": scenario.seed}
-    perceive = perception_of(scenario, scene.tray_side)
-    loop = ClosedLoop(scene, choose, perceive=perceive, world=scenario.world, arm=scenario.arm, **options)
+    perceive = perception_of(scenario, scene.support)
+    loop = ClosedLoop(scene, choose, perceive=perceive, world=scenario.world, **options)
     timing = loop.run(report, record=True)
     return loop.task, timing
 
@@ -57,7 +57,7 @@ def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, 
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.start)
     told: dict[str, Any] = {"timing": asdict(timing), **more} | ({"ended": timing.end} if timing.end else {})
-    return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, arm=scenario.arm, more=told)
+    return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told)
 
 
 def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def demo(seed: int, nodes: int, out: Path, report: Report) -> dict[str, Any]:
     Scenes in which no arm finds everything are passed over.
     """
     scenario, index = Scenario(nodes=nodes, seed=seed, perception="depth"), -1
-    ceiling = ArmCeiling(scenario.world, scenario.arm)
+    ceiling = ArmCeiling(scenario.world)
     for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
         scene, index = scene_of(scenario, index + 1, lambda scene: not ceiling.never_found(scene))
         task, timing = play(scenario, scene, report)

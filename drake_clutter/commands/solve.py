@@ -49,6 +49,6 @@ def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: Cl
         write_text(out / "moves.yaml", yaml.safe_dump(moves, sort_keys=False))
         task = carry_out(scene, solution.plan, seed, config, report)
         fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
-        write_episode(out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed)
+        write_episode(out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed, config)
     write_json(out / "solution.json", fields)
     return fields

@@ -7,7 +7,7 @@ from pydrake.common.schema import Transform
 from pydrake.common.yaml import yaml_dump_typed
 from pydrake.multibody.parsing import AddModel, AddWeld, ModelDirective, ModelDirectives
 
-from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.parts import classes_of
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.plant import rigid_transform
@@ -33,7 +33,7 @@ def write_dmd(scene: Scene, folder: Path) -> Path:
         target.mkdir()
         for file in object_class.folder.iterdir():
             shutil.copyfile(file, target / file.name)  # not copytree: an installed package's modes may be read-only
-    (folder / "tray.sdf").write_text(tray_sdf(scene.tray_side), encoding="utf-8")
+    (folder / "tray.sdf").write_text(support_sdf(scene.support), encoding="utf-8")
     (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
     directives = [
         ModelDirective(add_model=AddModel(name=TRAY, file=f"package://{PACKAGE}/tray.sdf")),

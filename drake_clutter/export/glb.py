@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from drake_clutter.cell.support import Support
 from drake_clutter.export.parts import Z_UP_OF_Y_UP, class_visual, classes_of, tray_boxes
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.plant import rigid_transform
@@ -16,9 +17,9 @@ ROOT = "tray_frame"
 """The node of the tray frame T."""
 
 
-def _add_tray(picture: trimesh.Scene, side: float) -> None:
+def _add_tray(picture: trimesh.Scene, support: Support) -> None:
     picture.graph.update(frame_to=TRAY, frame_from=ROOT, matrix=np.eye(4))
-    for tray_box in tray_boxes(side):
+    for tray_box in tray_boxes(support):
         box = trimesh.creation.box(tray_box.size)
         # glTF takes for metal whatever does not say otherwise.
         material = trimesh.visual.material.PBRMaterial(baseColorFactor=tray_box.colour, metallicFactor=0.0, roughnessFactor=0.8)
@@ -38,7 +39,7 @@ def write_glb(scene: Scene, folder: Path) -> Path:
     picture.graph.update(frame_to=ROOT, matrix=np.linalg.inv(Z_UP_OF_Y_UP))
     for object_class in classes_of(scene):
         picture.geometry[object_class.name] = class_visual(object_class)
-    _add_tray(picture, scene.tray_side)
+    _add_tray(picture, scene.support)
     for scene_object in scene.objects:
         picture.graph.update(
             frame_to=scene_object.name,

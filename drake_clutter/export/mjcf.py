@@ -6,6 +6,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from drake_clutter.assets.contact import FRICTION
 from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.cell.support import Support
 from drake_clutter.export.parts import class_inertial, classes_of, text_of, tray_boxes, write_class_meshes, write_xml
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 
@@ -30,9 +31,9 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
         SubElement(asset, "mesh", name=f"{name}/{piece}", file=f"{name}/{piece}.obj")
 
 
-def _add_tray(worldbody: Element, side: float) -> None:
+def _add_tray(worldbody: Element, support: Support) -> None:
     tray = SubElement(worldbody, "body", name=TRAY)
-    for box in tray_boxes(side):
+    for box in tray_boxes(support):
         geometry = {"type": "box", "size": text_of(box.size / 2), "pos": text_of(box.p_TG), "rgba": text_of(box.colour)}
         # Seen as well as touched, so it is in the group of the visuals.
         SubElement(tray, "geom", {"class": "collision", "name": f"{TRAY}/{box.name}", "group": "2"} | geometry)
@@ -67,7 +68,7 @@ def write_mjcf(scene: Scene, folder: Path) -> Path:
         _add_assets(asset, object_class, pieces[object_class.name])
     worldbody = SubElement(root, "worldbody")
     SubElement(worldbody, "light", pos="0 0 2", dir="0 0 -1", directional="true")
-    _add_tray(worldbody, scene.tray_side)
+    _add_tray(worldbody, scene.support)
     for scene_object in scene.objects:
         _add_object(worldbody, scene_object, pieces[scene_object.object_class.name])
     path = folder / "scene.xml"

@@ -14,8 +14,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from drake_clutter.assets.tray import tray_sdf
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.support import Support
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -88,10 +89,10 @@ def class_visual(object_class: ObjectClass) -> Any:
     return mesh
 
 
-def tray_boxes(side: float) -> list[TrayBox]:
-    """The boxes of a tray of inner side `side`, m."""
+def tray_boxes(support: Support) -> list[TrayBox]:
+    """The boxes of a support."""
     boxes = []
-    for visual in ElementTree.fromstring(tray_sdf(side)).iter("visual"):
+    for visual in ElementTree.fromstring(support_sdf(support)).iter("visual"):
         pose, size, colour = (
             np.array([float(value) for value in visual.findtext(path, "").split()])
             for path in ("pose", "geometry/box/size", "material/diffuse")

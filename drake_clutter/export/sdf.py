@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydrake.math import RollPitchYaw
 
-from drake_clutter.assets.tray import tray_sdf
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.parts import classes_of, text_of, write_class_meshes, write_xml
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.simulation.plant import rigid_transform
@@ -47,7 +47,7 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
         write_class_meshes(object_class, folder)
     root = ElementTree.Element("sdf", version="1.10")
     world = ElementTree.SubElement(root, "world", name="scene")
-    tray = _model(tray_sdf(scene.tray_side), TRAY)
+    tray = _model(support_sdf(scene.support), TRAY)
     static = ElementTree.Element("static")
     static.text = "1"  # PyBullet knows no "true"
     tray.insert(0, static)

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,10 +11,10 @@ from rich.console import Console
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
-from drake_clutter.config import config_yaml
 from drake_clutter.files import InputError, output_directory, sha256_of, write_json, write_text
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
+from drake_clutter.validation import config_yaml, to_plain
 
 CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
 
@@ -95,7 +94,7 @@ class TrainingRun:
         save_checkpoint(
             self._out / name,
             network,
-            {**about, "config": asdict(self._config), "files": self._files, "metrics": metrics, "commits": commits},
+            {**about, "config": to_plain(self._config), "files": self._files, "metrics": metrics, "commits": commits},
         )
         self.save()
 

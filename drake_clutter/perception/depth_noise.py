@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import D435_FOCAL_LENGTH
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class DepthNoise:
         speckle_radius: px, of the largest.
     """
 
-    focal_length: float = CameraConfig().focal_length
+    focal_length: float = D435_FOCAL_LENGTH
     baseline: float = 0.050
     subpixel: float = 0.08
     step: float = 1 / 32

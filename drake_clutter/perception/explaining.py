@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Shape
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds
 from drake_clutter.scenes.scene import Pose
 
@@ -89,7 +89,7 @@ def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ig
     return said, far, alone
 
 
-def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: CameraConfig) -> Explanation:
+def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera) -> Explanation:
     """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
     half, R, p = np.asarray(object_class.size) / 2, np.ascontiguousarray(X_TO.rotation), np.asarray(X_TO.p, float)
     depth = np.ascontiguousarray(depth, np.float32)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import Pose
 
@@ -70,7 +70,7 @@ class LabelledImage:
         return np.asarray(self.seen / np.maximum(self.alone, 1))
 
 
-def write_images(folder: Path, images: Iterable[LabelledImage], camera: CameraConfig, class_names: Sequence[str]) -> None:
+def write_images(folder: Path, images: Iterable[LabelledImage], camera: Camera, class_names: Sequence[str]) -> None:
     """Writes the images of one scene to a folder that is there once it is complete.
 
     Args:
@@ -84,7 +84,7 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: CameraCo
     for kind in (COLOR, DEPTH, LABEL):
         (temporary / kind).mkdir(parents=True)
     p_CT = [0.0, 0.0, 1000 * camera.altitude]
-    middle = (camera.width / 2 - 1, camera.height / 2 - 1)  # see CameraConfig.project
+    middle = (camera.width / 2 - 1, camera.height / 2 - 1)  # see Camera.project
     K = [camera.focal_length, 0.0, middle[0], 0.0, camera.focal_length, middle[1], 0.0, 0.0, 1.0]
     eye = {"cam_K": K, "depth_scale": 1000 * _DEPTH_UNIT, "cam_R_w2c": _R_TC.T.ravel().tolist(), "cam_t_w2c": p_CT}
     eyes, poses, infos = dict[str, Any](), dict[str, Any](), dict[str, Any]()
@@ -132,7 +132,7 @@ def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
     return [int(count) for count in np.diff(ends)]
 
 
-def _in_camera(X_TO: Pose, camera: CameraConfig) -> dict[str, list[float]]:
+def _in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
     R_CO = _R_TC.T @ X_TO.rotation
     p_CO = _R_TC.T @ (X_TO.p - [0.0, 0.0, camera.altitude])
     return {"cam_R_m2c": R_CO.round(9).ravel().tolist(), "cam_t_m2c": (1000 * p_CO).round(6).tolist()}

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera import OverheadCamera
@@ -24,7 +24,7 @@ class Look:
 class LabelDetector:
     """Detects every object that is in the frame and not hidden, with its true class and pose."""
 
-    def __init__(self, config: CameraConfig) -> None:
+    def __init__(self, config: Camera) -> None:
         self.camera = OverheadCamera(config)
 
     def look(self, scene: Scene) -> Look:
@@ -37,4 +37,4 @@ class LabelDetector:
             for index, o in enumerate(scene.objects)
             if o.name not in hidden and (mask := label == index).any()
         )
-        return Look(Observation(depth, detections, self.camera.config, scene.tray_side), shares)
+        return Look(Observation(depth, detections, self.camera.config, scene.support), shares)

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
 from drake_clutter.perception.explaining import Explanation, chosen, explanation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
 from drake_clutter.perception.pose_score import FLOOR_SLACK
@@ -83,13 +84,11 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour."""
 
-    def __init__(
-        self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: CameraConfig, tray_side: float
-    ) -> None:
+    def __init__(self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: Camera, support: Support) -> None:
         """With a trained network, for objects of these classes, of which it must know all."""
-        self._network, self._camera, self._tray_side = network, camera, tray_side
+        self._network, self._camera, self._support = network, camera, support
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, tray_side)
+        self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, support)
         self._unknown = torch.tensor([False] + [name not in self._classes for name in self._network.classes])
         self._radii = [min(self._classes[n].size) / 2 if n in self._classes else 0.0 for n in self._network.classes]
         self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(SIDE_BY_SIDE)
@@ -135,7 +134,7 @@ class LearnedDetector:
             answers = coarse(mask[window.rows, window.columns])
             sure = _sure(candidate.fitted.X_TO, chances[network.classes.index(name)][answers], votes_T[answers])
             found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask, sure))
-        return Observation(clean, tuple(found), self._camera, self._tray_side)
+        return Observation(clean, tuple(found), self._camera, self._support)
 
     def _guessed(
         self, masks: Sequence[Mask], chances: NDArray[np.float32], votes_T: NDArray[np.float32], shape: tuple[int, int]
@@ -179,4 +178,6 @@ class LearnedDetector:
     def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
         """Whether an object can be there: within the rim, and not below the floor."""
         corners = X_TO.apply(object_class.corners)
-        return bool(np.abs(corners[:, :2]).max() < self._tray_side / 2 + RIM_SLACK and corners[:, 2].min() > -2 * FLOOR_SLACK)
+        return bool(
+            (np.abs(corners[:, :2]) < self._support.half_size + RIM_SLACK).all() and corners[:, 2].min() > -2 * FLOOR_SLACK
+        )

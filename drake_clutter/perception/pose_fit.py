@@ -11,7 +11,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Shape
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.pose_candidates import FEWEST_POINTS, SLACKS, candidates, spread_points
 from drake_clutter.perception.pose_score import FINE_RAYS, WITHIN, View, search, share_explained, turned, worth
 from drake_clutter.scenes.scene import Pose
@@ -83,7 +83,7 @@ def _surface(object_class: ObjectClass) -> Floats:
 class PoseFitter:
     """Fits boxes and cylinders to what the overhead camera sees of them."""
 
-    def __init__(self, config: CameraConfig) -> None:
+    def __init__(self, config: Camera) -> None:
         """Makes a fitter for the camera's images."""
         self.config = config
         self._models: dict[ObjectClass, tuple[Any, Any]] = {}

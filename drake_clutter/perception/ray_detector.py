@@ -1,6 +1,6 @@
 """The perfect detector without rendering: it casts the camera's rays at the true objects, which is what training needs."""
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.label_detector import Look
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.visibility import RayCaster
@@ -9,7 +9,7 @@ from drake_clutter.stability.visibility import RayCaster
 class RayDetector:
     """Detects what `LabelDetector` does (a `Detector`), of convex objects, without a renderer."""
 
-    def __init__(self, config: CameraConfig) -> None:
+    def __init__(self, config: Camera) -> None:
         self._rays = RayCaster(config)
 
     def look(self, scene: Scene) -> Look:

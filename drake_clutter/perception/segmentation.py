@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor, nn
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 
@@ -53,9 +54,9 @@ class Window:
     columns: slice
 
     @staticmethod
-    def of(camera: CameraConfig, tray_side: float) -> "Window":
+    def of(camera: Camera, support: Support) -> "Window":
         """Of a camera over a tray."""
-        reach = camera.focal_length * tray_side / 2 / (camera.altitude - _HIGHEST)
+        reach = camera.focal_length * max(support.half_size) / (camera.altitude - _HIGHEST)
         side = min(_MULTIPLE * math.ceil(2 * reach / _MULTIPLE), min(camera.width, camera.height) // _MULTIPLE * _MULTIPLE)
         top, left = (camera.height - side) // 2, (camera.width - side) // 2
         return Window(slice(top, top + side), slice(left, left + side))
@@ -66,7 +67,7 @@ class Window:
         return int(self.rows.stop - self.rows.start)
 
 
-def points(depth: NDArray[np.float32], camera: CameraConfig, window: Window) -> NDArray[np.float32]:
+def points(depth: NDArray[np.float32], camera: Camera, window: Window) -> NDArray[np.float32]:
     """(side, side, 3) p_TP, m, of what the pixels of a window show; NaN where nothing is measured.
 
     Args:

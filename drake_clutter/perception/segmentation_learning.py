@@ -3,16 +3,16 @@
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
 from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import LabelledImage
@@ -26,6 +26,7 @@ from drake_clutter.perception.segmentation import (
     points,
 )
 from drake_clutter.seeding import item_rng
+from drake_clutter.validation import Between, NonNegative, config_class
 
 RISING = 0.1
 """Share of the steps in which the learning rate rises."""
@@ -33,7 +34,7 @@ _COUNTED = 200
 """Images, at most, whose pixels are counted for the weights of the classes."""
 
 
-@dataclass
+@config_class
 class SegmentationConfig:
     """How the network learns.
 
@@ -44,11 +45,11 @@ class SegmentationConfig:
         vote_weight: of a vote's error, per m, against the classes' cross entropy.
     """
 
-    steps: int = 5000
-    batch: int = 8
-    learning_rate: float = 3e-3
-    weight_decay: float = 1e-4
-    vote_weight: float = 5.0
+    steps: Annotated[int, Between(1)] = 5000
+    batch: Annotated[int, Between(1)] = 8
+    learning_rate: NonNegative = 3e-3
+    weight_decay: NonNegative = 1e-4
+    vote_weight: NonNegative = 5.0
 
 
 class Example(NamedTuple):
@@ -62,7 +63,7 @@ class Example(NamedTuple):
 def example(
     image: LabelledImage,
     classes: Sequence[str],
-    camera: CameraConfig,
+    camera: Camera,
     window: Window,
     rng: np.random.Generator | None,
     looks_at_color: bool,
@@ -105,15 +106,15 @@ class SegmentationLearner:
         read: Callable[[int], LabelledImage],
         count: int,
         config: SegmentationConfig,
-        camera: CameraConfig,
-        tray_side: float,
+        camera: Camera,
+        support: Support,
         seed: int,
         device: torch.device,
     ) -> None:
         """Begins a training with `count` images, each of which `read` reads."""
         self.step, self.losses = 0, dict[str, float]()
         self._read, self._count, self._config, self._camera, self._seed = read, count, config, camera, seed
-        self._window, self._device = Window.of(camera, tray_side), device
+        self._window, self._device = Window.of(camera, support), device
         self.network = network.to(device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)

@@ -6,23 +6,25 @@ Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked obje
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.clearance import Clearance, ClearanceScene
 from drake_clutter.planning.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
 from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.shorten import Wall, Way, shortened
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.validation import Between, NonNegative, config_class
 
 Floats = NDArray[np.float64]
 
 
-@dataclass
+@config_class
 class PlannerConfig:
     """How plans are searched.
 
@@ -40,17 +42,17 @@ class PlannerConfig:
         optimise: whether the sure way is made quicker by trajectory optimisation, see `planning/shorten.py`.
     """
 
-    clearance: float = 0.005
-    rise: float = 0.020
-    lip_gap: float = 0.0005
-    grasp_spacing: float = 0.012
-    grasps: int = 9
-    yaws: int = 12
-    attempts: int = 400
-    least_acceleration: float = 0.3
-    time_limit: float = 600.0
-    descent: float = 0.0
-    above: float = 0.0
+    clearance: NonNegative = 0.005
+    rise: NonNegative = 0.020
+    lip_gap: NonNegative = 0.0005
+    grasp_spacing: NonNegative = 0.012
+    grasps: Annotated[int, Between(0)] = 9
+    yaws: Annotated[int, Between(0)] = 12
+    attempts: Annotated[int, Between(0)] = 400
+    least_acceleration: NonNegative = 0.3
+    time_limit: NonNegative = 600.0
+    descent: NonNegative = 0.0
+    above: NonNegative = 0.0
     optimise: bool = True
 
 
@@ -125,7 +127,7 @@ class Attempts:
 
     def __init__(
         self,
-        arm: ArmConfig,
+        cell: WorkCell,
         config: PlannerConfig,
         reach: Callable[[Floats], Floats],
         scene: ClearanceScene,
@@ -135,7 +137,7 @@ class Attempts:
         tops: Sequence[float] = (),
     ) -> None:
         """Nothing tried yet; `reach` gives the branches for poses X_TG (..., 4, 4), `tops` are of what else there is, m."""
-        self._arm, self._config, self._reach, self._scene, self._picked = arm, config, reach, scene, picked
+        self._cell, self._config, self._reach, self._scene, self._picked = cell, config, reach, scene, picked
         self._X_TO, self._X_TO_place, self._place = matrix(picked.X_TO), matrix(X_TO_place), X_TO_place
         self.count, self.furthest = 0, NoPlan(PlanFailure.UNREACHABLE, "the grasp")
         self._progress = -1
@@ -144,7 +146,7 @@ class Attempts:
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
         tops = sorted({round(top, 3) for top in (*tops, *(o.top for o in others)) if top > bottom})
         self._bottoms = [bottom + self._config.rise] + [top + self._config.rise for top in tops if top > bottom]
-        self._home = np.array(arm.home)
+        self._home = np.array(cell.robot.home)
 
     def fail(self, progress: int, reason: PlanFailure, about: str, number: float = math.nan) -> None:
         """Remembers why an attempt failed, if it came further than those before."""
@@ -310,7 +312,8 @@ class Attempts:
 
     def _homewards(self, start: Floats, branch: int) -> list[Floats]:
         """(n, 6) each: straight home, and at the same height until the cup is where it is at home, seen from above."""
-        X_TG_home, X_TG = (self._arm.X_TB @ forward_kinematics(q) @ self._arm.X_FG for q in (self._home, start))
+        X_TB, X_FG = self._cell.robot.X_TB.GetAsMatrix4(), self._cell.gripper.X_FG.GetAsMatrix4()
+        X_TG_home, X_TG = (X_TB @ forward_kinematics(q) @ X_FG for q in (self._home, start))
         X_TG[:2, 3] = X_TG_home[:2, 3]
         back = nearest_turns(self._reach(X_TG)[branch], start)
         direct = straight(start, self._home)
@@ -332,7 +335,7 @@ class Attempts:
         clearance = self._checked(name, path, X_OG, ends, progress)
         if clearance is None:
             return None
-        trajectory = timed(path, self._arm, payload)
+        trajectory = timed(path, self._cell, payload)
         if trajectory is None:
             self.fail(progress, PlanFailure.TRAJECTORY_INFEASIBLE, name)
             return None
@@ -382,7 +385,7 @@ class Attempts:
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
         quick = shortened(Way(phase.trajectory, upright, carried, payload.along_axis, walls, self._scene.cup_jacobian))
-        trajectory = slowed(quick, self._arm, payload) if quick else None
+        trajectory = slowed(quick, self._cell, payload) if quick else None
         if trajectory is None or trajectory.end_time() >= phase.sure:
             return phase
         # It goes round edges as near as it may: looked at more closely than a way that rises over everything.

@@ -12,7 +12,8 @@ from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.cell.station import Arm, ArmConfig, add_arm, joint_numbers
+from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
@@ -46,17 +47,15 @@ class ClearanceScene:
 
     def __init__(
         self,
-        config: ArmConfig,
+        cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
-        tray_side: float,
-        camera_altitude: float,
         unseen: Sequence[UnseenBlock] = (),
     ) -> None:
         """Makes a plant of the arm, named objects, and space that must be taken for full."""
         builder = DiagramBuilder()
-        made = add_scene_plant(builder, objects, tray_side, 0.0, visuals=False)
+        made = add_scene_plant(builder, objects, cell.support, 0.0, visuals=False)
         self.plant, self._bodies = made.plant, made.bodies
-        self._arm: Arm = add_arm(made.plant, made.scene_graph, config, camera_altitude, compliant=False, visuals=False)
+        self._arm: Arm = add_work_cell(made.plant, made.scene_graph, cell, compliant=False, visuals=False)
         for k, block in enumerate(unseen):
             X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.middle)
             made.plant.RegisterCollisionGeometry(

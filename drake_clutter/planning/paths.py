@@ -16,8 +16,8 @@ from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory,
 from drake_clutter.cell.epick import epick_sdf
 from drake_clutter.cell.kinematics import forward_kinematics
 from drake_clutter.cell.sdf import sdf_text
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.cell.ur10 import JOINT_RANGE, LINKS
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.time_optimal import squared_speeds
 from drake_clutter.resources import shipped_path
 
@@ -59,14 +59,12 @@ class Payload:
 
 
 @lru_cache(maxsize=64)
-def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], base: tuple[float, ...]) -> MultibodyPlant:
+def _plant(cell: WorkCell, mass: float, p_GCm: tuple[float, float, float]) -> MultibodyPlant:
     """The arm alone, the cup rigid, with a load; for dynamics."""
-    config = ArmConfig(base=list(base))
-    config.suction.extension = extension
     plant = MultibodyPlant(0.0)
     (robot,) = Parser(plant).AddModelsFromString(sdf_text(shipped_path("models/ur10.sdf"), visuals=False), "sdf")
-    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(config.suction, compliant=False), "sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), RigidTransform(config.X_TB))
+    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(cell.gripper, compliant=False), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), cell.robot.X_TB)
     plant.WeldFrames(plant.GetFrameByName("flange", robot), plant.GetFrameByName("body", tool))
     if mass:
         inertia = SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(0.05))
@@ -76,9 +74,9 @@ def _plant(extension: float, mass: float, p_GCm: tuple[float, float, float], bas
     return plant
 
 
-def dynamics_plant(config: ArmConfig, payload: Payload) -> MultibodyPlant:
+def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
     """The arm with a rigid cup and the load, no geometry."""
-    return _plant(config.suction.extension, payload.mass, payload.p_GCm, tuple(config.base))
+    return _plant(cell, payload.mass, payload.p_GCm)
 
 
 def nearest_turns(q: Floats, reference: Floats) -> Floats:
@@ -120,9 +118,9 @@ def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
     return np.asarray(path.vector_values(np.linspace(path.start_time(), path.end_time(), count)).T)
 
 
-def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
+def timed(path: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
     """The path as fast as velocity, acceleration, torque and the cup's hold allow; None if they do not."""
-    plant = dynamics_plant(config, payload)
+    plant = dynamics_plant(cell, payload)
     grid = np.linspace(path.start_time(), path.end_time(), _GRID)
     velocity = path.MakeDerivative(1)
     q, slope, curve = path.vector_values(grid).T, velocity.vector_values(grid).T, velocity.MakeDerivative(1).vector_values(grid).T
@@ -131,7 +129,7 @@ def timed(path: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory |
     limit = np.broadcast_to(MARGIN * ACCELERATION_LIMIT, slope.shape)
     rows = [(slope, curve, -limit, limit)]
     if math.isfinite(payload.acceleration):
-        p_BCm = (forward_kinematics(q) @ _p_FCm(config, payload))[:, :3]
+        p_BCm = (forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
         limit = np.full(p_BCm.shape, payload.along_axis)
         of_load = np.gradient(p_BCm, grid, axis=0, edge_order=2)
         rows.append((of_load, np.gradient(of_load, grid, axis=0, edge_order=2), -limit, limit))
@@ -170,9 +168,9 @@ def softened(along: Trajectory) -> Trajectory:
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(np.arange(len(mean)) * step, mean[None], rest, rest)
 
 
-def slowed(trajectory: Trajectory, config: ArmConfig, payload: Payload) -> Trajectory | None:
+def slowed(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
     """The same motion, evenly slower until velocity, acceleration, torque and the cup's hold allow it; None if they never do."""
-    plant, end = dynamics_plant(config, payload), trajectory.end_time()
+    plant, end = dynamics_plant(cell, payload), trajectory.end_time()
     count = max(200, math.ceil(end / 0.005))
     q, v, a = motion(trajectory, count)
     held = torques(plant, q, np.zeros_like(q), np.zeros_like(q))
@@ -183,7 +181,7 @@ def slowed(trajectory: Trajectory, config: ArmConfig, payload: Payload) -> Traje
     square = max((np.abs(v) / VELOCITY_LIMIT / MARGIN).max() ** 2, (np.abs(a) / ACCELERATION_LIMIT / MARGIN).max())
     square = max(square, (np.abs(moving) / room).max())
     if math.isfinite(payload.acceleration):
-        p_BCm = (forward_kinematics(q) @ _p_FCm(config, payload))[:, :3]
+        p_BCm = (forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
         of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
         square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.acceleration)
     by = max(1.0, math.sqrt(square))
@@ -197,8 +195,8 @@ def motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
     return trajectory.vector_values(times).T, v, a
 
 
-def _p_FCm(config: ArmConfig, payload: Payload) -> Floats:
-    return np.asarray(config.X_FG @ np.array([*payload.p_GCm, 1.0]))
+def _p_FCm(cell: WorkCell, payload: Payload) -> Floats:
+    return np.asarray(cell.gripper.X_FG.GetAsMatrix4() @ np.array([*payload.p_GCm, 1.0]))
 
 
 @lru_cache(maxsize=64)

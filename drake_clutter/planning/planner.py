@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.kinematics import branches
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.cell.suction import EPICK_MASS, greatest_acceleration, unevenness
+from drake_clutter.cell.suction import greatest_acceleration, unevenness
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.attempts import Attempts, Grasp, PlannerConfig, downwards, inverse, matrix
 from drake_clutter.planning.clearance import ClearanceScene
 from drake_clutter.planning.paths import Payload
@@ -29,10 +29,10 @@ Floats = NDArray[np.float64]
 class PickPlacePlanner:
     """Plans moves of objects among objects; the same question has the same answer."""
 
-    def __init__(self, config: ArmConfig, planner: PlannerConfig, tray_side: float, camera_altitude: float) -> None:
-        self.config, self.planner = config, planner
-        self.tray_side, self._camera_altitude = tray_side, camera_altitude
-        self._X_BT, self._X_GF = inverse(config.X_TB), inverse(config.X_FG)
+    def __init__(self, cell: WorkCell, planner: PlannerConfig) -> None:
+        self.cell, self.planner = cell, planner
+        self._X_BT = cell.robot.X_TB.inverse().GetAsMatrix4()
+        self._X_GF = cell.gripper.X_FG.inverse().GetAsMatrix4()
         self._scenes: dict[Hashable, ClearanceScene] = {}
         self._grasps = lru_cache(maxsize=256)(self._find_grasps)
 
@@ -42,7 +42,7 @@ class PickPlacePlanner:
         key = named, tuple(unseen)
         if key not in self._scenes:
             self._scenes.clear()
-            self._scenes[key] = ClearanceScene(self.config, named, self.tray_side, self._camera_altitude, unseen)
+            self._scenes[key] = ClearanceScene(self.cell, named, unseen)
         scene = self._scenes[key]
         scene.put(objects)
         return scene
@@ -79,14 +79,14 @@ class PickPlacePlanner:
         grasps = self._grasps(picked)
         if isinstance(grasps, NoPlan):
             return grasps
-        if self.config.over_tray(self.tray_side):
+        if self.cell.pedestal_in_support:
             return NoPlan(PlanFailure.IN_COLLISION, "pedestal and tray")
         scene = self.clearance_scene(objects, unseen)
-        if hit := scene.close(np.array(self.config.home), self.planner.clearance):
+        if hit := scene.close(np.array(self.cell.robot.home), self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
             return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
         tops = [block.top for block in unseen]
-        attempt = Attempts(self.config, self.planner, self.reach, scene, objects, picked, X_TO_place, tops)
+        attempt = Attempts(self.cell, self.planner, self.reach, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
             for q_pick, q_place, branch, yaw in attempt.ends(grasp):
                 if attempt.count >= self.planner.attempts:
@@ -108,7 +108,7 @@ class PickPlacePlanner:
 
     def _find_grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
         """Where the cup seals on top and can hold, the nearest to its middle first."""
-        suction = self.config.suction
+        suction = self.cell.gripper
         lower, upper = picked.bounds_T
         X_TO = matrix(picked.X_TO)
         top = float(upper[2])
@@ -134,7 +134,7 @@ class PickPlacePlanner:
                 found.append(Grasp(X_TG[:3, 3], payload))
                 if len(found) == self.planner.grasps:
                     break
-        if picked.object_class.mass + EPICK_MASS > self.config.payload:
+        if picked.object_class.mass + self.cell.gripper.mass > self.cell.robot.payload:
             return NoPlan(PlanFailure.TOO_HEAVY, picked.name, picked.object_class.mass)
         if not found:
             reason = PlanFailure.NO_SEAL if least > suction.unevenness else PlanFailure.TOO_HEAVY
@@ -148,7 +148,7 @@ class PickPlacePlanner:
         if rests_on(picked, objects) or isinstance(grasps, NoPlan):
             return False
         scene = self.clearance_scene(objects)
-        attempts = Attempts(self.config, self.planner, self.reach, scene, objects, picked, X_TO_place)
+        attempts = Attempts(self.cell, self.planner, self.reach, scene, objects, picked, X_TO_place)
         return any(attempts.exist(grasp) for grasp in grasps)
 
     def reach(self, X_TG: Floats) -> Floats:

@@ -4,13 +4,13 @@ Frames: T the tray, G the cup. The cell has table, tray, pedestal and camera, an
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.kinematics import manipulability
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.attempts import PlannerConfig, downwards
 from drake_clutter.planning.paths import nearest_turns
 from drake_clutter.planning.planner import PickPlacePlanner
@@ -42,10 +42,10 @@ class Reach:
 class Reachability:
     """Of an arm in its cell."""
 
-    def __init__(self, config: ArmConfig, tray_side: float, camera_altitude: float) -> None:
+    def __init__(self, cell: WorkCell) -> None:
         """Makes the empty cell."""
-        self._config, self._tray_side = config, tray_side
-        self._planner = PickPlacePlanner(config, PlannerConfig(), tray_side, camera_altitude)
+        self._cell = cell
+        self._planner = PickPlacePlanner(cell, PlannerConfig())
         self._scene = self._planner.clearance_scene(())
         self._least = self._planner.planner.clearance
 
@@ -59,7 +59,7 @@ class Reachability:
             for branch in np.argsort(-worth[k]):
                 if worth[k, branch] < 0:
                     break
-                at = nearest_turns(q[k, branch], np.array(self._config.home))
+                at = nearest_turns(q[k, branch], np.array(self._cell.robot.home))
                 if hit := self._scene.close(at, self._least):
                     in_the_way[k] = in_the_way[k] or " and ".join(min(hit, key=lambda c: c.distance).pair)
                     continue
@@ -75,7 +75,7 @@ class Reachability:
             heights: m, of the lip over the tray's floor.
             spacing: m, of the grid.
         """
-        half = self._tray_side / 2 - MARGIN
+        half = max(self._cell.support.half_size) - MARGIN
         along = np.linspace(-half, half, max(2, round(2 * half / spacing) + 1))
         share, best = np.zeros((2, len(heights), len(along), len(along)))
         yaws = np.arange(YAWS) * (2 * np.pi / YAWS)
@@ -103,19 +103,18 @@ class ReachMap:
     manipulability: Floats
 
 
-def base_scores(
-    config: ArmConfig, places: Sequence[tuple[float, float]], tray_side: float, camera_altitude: float
-) -> list[tuple[float, float]]:
+def base_scores(cell: WorkCell, places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """For bases at (x, y) m, as high and turned as the config's: the mean share that is reached, and the mean manipulability.
 
     A base in or over the tray scores nothing.
     """
     found = []
     for x, y in places:
-        moved = replace(config, base=[x, y, *config.base[2:]])
-        if moved.over_tray(tray_side):
+        base = cell.robot.base.model_copy(update={"translation": (x, y, cell.robot.base.translation[2])})
+        moved = cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": base})})
+        if moved.pedestal_in_support:
             found.append((0.0, 0.0))
             continue
-        reached = Reachability(moved, tray_side, camera_altitude).map((0.05, 0.25, 0.45), 0.15)
+        reached = Reachability(moved).map((0.05, 0.25, 0.45), 0.15)
         found.append((float(reached.share.mean()), float(reached.manipulability.mean())))
     return found

@@ -15,8 +15,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drake_clutter.cell.station import ArmConfig, add_arm, set_joint_angles
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.plant import add_work_cell, set_joint_angles
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.reports.pictures import ENGINE, look_at
 from drake_clutter.scenes.interfaces import Frame
 from drake_clutter.scenes.scene import Scene
@@ -40,12 +40,12 @@ def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
     return [frames[k] for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)]
 
 
-def strip(scene: Scene, frames: Sequence[Frame], arm_config: ArmConfig | None = None) -> NDArray[np.uint8]:
+def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.uint8]:
     """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
     builder = DiagramBuilder()
-    made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.tray_side, 0.01, visuals=True)
+    made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.support, 0.01, visuals=True)
     plant = made.plant
-    arm = add_arm(plant, made.scene_graph, arm_config or ArmConfig(), CameraConfig().altitude, compliant=True, visuals=True)
+    arm = add_work_cell(plant, made.scene_graph, cell, compliant=True, visuals=True)
     plant.Finalize()
     made.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(ENGINE))
     diagram = builder.Build()

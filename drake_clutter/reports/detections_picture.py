@@ -21,7 +21,7 @@ _INK = "#d7263d"
 def detections_picture(observation: Observation) -> NDArray[np.uint8]:
     """(720, 720, 3) the middle of the image, the brighter, the higher above the tray; with outlines of what was recognised."""
     camera, depth = observation.camera, observation.depth
-    reach = camera.focal_length * observation.tray_side / (camera.altitude - _TALL)
+    reach = camera.focal_length * max(observation.support.size) / (camera.altitude - _TALL)
     side = min(round(reach), camera.width, camera.height)
     rows, columns = (slice((n - side) // 2, (n - side) // 2 + side) for n in (camera.height, camera.width))
     height = camera.altitude - np.where(np.isfinite(depth) & (depth > 0), depth, camera.altitude)[rows, columns]

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from pydrake.systems.framework import Diagram
 
+from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.closed_loop import ClosedLoop
@@ -79,5 +80,5 @@ def _at_box(middle: np.ndarray, way: np.ndarray, aside: np.ndarray) -> np.ndarra
 
 
 if __name__ == "__main__":
-    empty = ClosedLoop(Scene((), 0.7), lambda *_: Decision(None), max_moves=1, seed=0, world=ClutterConfig())
+    empty = ClosedLoop(Scene((), default_cell().support), lambda *_: Decision(None), max_moves=1, seed=0, world=ClutterConfig())
     draw_diagram(empty.diagram, Path(sys.argv[1]))

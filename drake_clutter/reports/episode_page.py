@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import replacing, write_text
 from drake_clutter.perception.label_detector import Look
 from drake_clutter.reports.arm_pictures import arm_moments, strip
@@ -38,7 +39,7 @@ _BADGES = {MoveResult.PLACED: "good", MoveResult.COLLAPSED: "bad", MoveResult.DR
 
 
 def write_episode_page(
-    out: Path, title: str, start: Scene, first_look: Look, steps: Sequence[Step], summary: Mapping[str, Any]
+    out: Path, title: str, start: Scene, first_look: Look, steps: Sequence[Step], summary: Mapping[str, Any], cell: WorkCell
 ) -> None:
     """Writes `index.html`, `recording.html` and `images/*.png`; the page needs nothing else, and no network.
 
@@ -49,6 +50,7 @@ def write_episode_page(
         first_look: what the camera showed of it.
         steps: the moves in order.
         summary: JSON values by key; the numbers, words and truth values among them become key figures.
+        cell: in which the moves were made.
     """
     pictures = _Pictures(out)
     known = set(_in_view(first_look))
@@ -56,10 +58,10 @@ def write_episode_page(
     start_html = _start(pictures, start, hidden_at_start)
     moves, scene, look = [], start, first_look
     for number, step in enumerate(steps, start=1):
-        moves.append(_move(pictures, number, scene, look, step, frozenset(known)))
+        moves.append(_move(pictures, number, scene, look, step, frozenset(known), cell))
         known.update(step.newly_found)
         scene, look = step.outcome.scene, step.look
-    write_recording(out / "recording.html", start, episode_frames(start, steps))
+    write_recording(out / "recording.html", start, episode_frames(start, steps), cell)
     found = [name for name in hidden_at_start if name in known]
     page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=escape(title),
@@ -103,7 +105,7 @@ def _start(pictures: _Pictures, start: Scene, hidden: Sequence[str]) -> str:
     )
 
 
-def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step, known: frozenset[str]) -> str:
+def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step, known: frozenset[str], cell: WorkCell) -> str:
     """One move's part of the page; `scene` and `look` are from before it, `known` is what had been found by then."""
     outcome, words = step.outcome, _move_in_words(step.move)
     before_view, after_view = _in_view(look), _in_view(step.look)
@@ -148,9 +150,14 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
     if outcome.motion and outcome.motion[0].arm:
         moments = arm_moments(outcome.motion, step.move.pick)
         alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"
-        figures += pictures.figure(f"move_{number:02d}_arm", strip(scene, moments), alt, "The arm: lift, carry, place, retreat.")
+        figures += pictures.figure(
+            f"move_{number:02d}_arm",
+            strip(scene, moments, cell.with_support(scene.support)),
+            alt,
+            "The arm: lift, carry, place, retreat.",
+        )
     badge = f'<span class="badge {_BADGES.get(outcome.result, "")}">{escape(outcome.result.value)}</span>'
-    threshold = look.observation.camera.hidden_below
+    threshold = look.observation.camera.visibility_threshold
     return (
         f'<article><div class="head"><h3>{number}. {escape(words)}</h3>{badge}</div><p>{" ".join(notes)}</p>'
         f'<div class="pair">{figures}</div>'

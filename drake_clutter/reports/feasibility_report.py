@@ -19,7 +19,7 @@ from PIL import Image
 
 from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
 from drake_clutter.planning.attempts import PlannerConfig, inverse
@@ -45,7 +45,7 @@ img{max-width:100%;margin:.5em 0}figure{margin:1em 0}
 
 def write_report(
     path: Path,
-    setups: Mapping[str, ArmConfig],
+    setups: Mapping[str, WorkCell],
     moves: Rows,
     noise: Rows,
     reach: Mapping[str, Mapping[str, Any]],
@@ -87,19 +87,19 @@ def write_report(
     write_text(path, page + "</body></html>")
 
 
-def _setups_table(setups: Mapping[str, ArmConfig], summary: Mapping[str, Any]) -> str:
+def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) -> str:
     rows = ""
-    for name, arm in setups.items():
+    for name, cell in setups.items():
         found = summary["setups"][name]
         low, high = found["planned_ci95"]
         share = "-" if found["planned_share"] is None else f"{found['planned_share']:.3f} ({low:.3f} to {high:.3f})"
         motion = "-" if found["motion_s_median"] is None else f"{found['motion_s_median']:.2f} s"
-        base = ", ".join(f"{v:g}" for v in arm.base)
+        base = ", ".join(f"{v:g}" for v in (*cell.robot.base.translation, cell.robot.base.rpy_deg[2]))
         cells = (
             name,
             base,
-            f"{1000 * arm.suction.cup_diameter:g} mm, {1000 * arm.suction.extension:g} mm",
-            f"{arm.payload:g} kg",
+            f"{1000 * cell.gripper.cup_diameter:g} mm, {1000 * cell.gripper.extension:g} mm",
+            f"{cell.robot.payload:g} kg",
             f"{found['planned']} of {found['moves']}",
             share,
             motion,
@@ -221,7 +221,7 @@ def _reach(found: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _bases(bases: Rows, arm: ArmConfig) -> Figure:
+def _bases(bases: Rows, cell: WorkCell) -> Figure:
     x, y = sorted({row["x"] for row in bases}), sorted({row["y"] for row in bases})
     figure, axes = plt.subplots(1, 2, figsize=(13, 6))
     half_x, half_y = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
@@ -231,7 +231,7 @@ def _bases(bases: Rows, arm: ArmConfig) -> Figure:
         at = {(row["x"], row["y"]): row[name] for row in bases}
         values = np.array([[at[i, j] for j in y] for i in x])
         figure.colorbar(_heat(panel, values, extent, max(0.01, float(values.max()))), ax=panel, label=label)
-        panel.plot(*arm.base[:2], "r*", markersize=18, label="first setup")
+        panel.plot(*cell.robot.base.translation[:2], "r*", markersize=18, label="first setup")
         best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
         panel.plot(best["x"], best["y"], "wo", markersize=12, markeredgecolor="black", label="best of the grid")
         panel.set(xlabel="x of the base, m (the tray's middle is 0, 0)", ylabel="y, m")
@@ -257,7 +257,7 @@ def _noise(noise: Rows) -> Figure:
     return figure
 
 
-def _worst(moves: Rows, setups: Mapping[str, ArmConfig], scene_of: Callable[[str], Scene], world: ClutterConfig) -> list[str]:
+def _worst(moves: Rows, setups: Mapping[str, WorkCell], scene_of: Callable[[str], Scene], world: ClutterConfig) -> list[str]:
     planned = [row for row in moves if row["result"] == PLANNED]
     closest = sorted((row for row in planned if row["clearance"] is not None), key=lambda row: float(row["clearance"]))
     long = sorted(planned, key=lambda row: -float(row["motion_s"]))
@@ -266,7 +266,7 @@ def _worst(moves: Rows, setups: Mapping[str, ArmConfig], scene_of: Callable[[str
         chosen.append((reason, next(row for row in moves if row["result"] == reason)))
     camera, parts = PictureCamera(), []
     for kind, row in chosen:
-        scene, arm = scene_of(row["scene"]), setups[row["setup"]]
+        scene, cell = scene_of(row["scene"]), setups[row["setup"]]
         known = row["place_x"] is not None
         X_TO = Pose((row["place_x"], row["place_y"], row["place_z"]), scene[row["pick"]].X_TO.quaternion) if known else None
         told = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
@@ -278,21 +278,22 @@ def _worst(moves: Rows, setups: Mapping[str, ArmConfig], scene_of: Callable[[str
             why = ": ".join(filter(None, (row["result"], row["about"])))
         pictures = [camera.annotated(scene, Marks(moved=row["pick"], X_T_placed=X_TO))]
         if row["result"] == PLANNED and X_TO is not None:
-            planner = PickPlacePlanner(arm, PlannerConfig(optimise=False), scene.tray_side, world.camera.altitude)
+            planner = PickPlacePlanner(cell.with_support(scene.support), PlannerConfig(optimise=False))
             plan = planner.plan(scene.objects, row["pick"], X_TO)
             if isinstance(plan, Plan):
-                pictures.append(strip(scene, _moments(plan, scene, arm), arm))
+                pictures.append(strip(scene, _moments(plan, scene, cell), cell))
         images = "".join(_embedded(_png(picture), told) for picture in pictures)
         parts.append(f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(told)}: {escape(why)}</p>{images}</div>')
     return parts
 
 
-def _moments(plan: Plan, scene: Scene, arm: ArmConfig) -> list[Frame]:
+def _moments(plan: Plan, scene: Scene, cell: WorkCell) -> list[Frame]:
     """At the grasp, in the middle of the way, and at the place."""
     carry, frames = plan.phases[1].trajectory, []
+    X_TB, X_FG = cell.robot.X_TB.GetAsMatrix4(), cell.gripper.X_FG.GetAsMatrix4()
     for time in (0.0, carry.end_time() / 2, carry.end_time()):
         q = carry.value(time).ravel()
-        X_TO = arm.X_TB @ forward_kinematics(q) @ arm.X_FG @ inverse(plan.X_OG)
+        X_TO = X_TB @ forward_kinematics(q) @ X_FG @ inverse(plan.X_OG)
         poses = {**scene.poses, plan.pick: Pose.of(X_TO[:3, :3], X_TO[:3, 3])}
         frames.append(Frame(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
     return frames

@@ -11,7 +11,7 @@ from PIL import Image
 from pydrake.geometry import LightParameter, RenderEngineVtkParams
 from scipy.ndimage import find_objects
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.reports.drawing import Canvas, Label, Rectangle, middle
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.camera import Images, OverheadCamera
@@ -129,7 +129,7 @@ class PictureCamera:
 
     def oblique(self, scene: Scene) -> NDArray[np.uint8]:
         """The tray from the front, at an angle, (720, 960, 3) uint8."""
-        scale = scene.tray_side / _TRAY_SIDE
+        scale = max(scene.support.size) / _TRAY_SIDE
         images = self._oblique.render(scene, look_at(scale * np.array(_EYE), scale * np.array(_TARGET)))
         return _scaled(Image.fromarray(images.color))
 
@@ -185,7 +185,7 @@ class PictureCamera:
     def _from_above(self, scene: Scene) -> Images:
         # One move's picture "after" shows the same scene as the next one's "before".
         if self._latest is None or self._latest[0] is not scene:
-            altitude = _ALTITUDE * scene.tray_side / _TRAY_SIDE
+            altitude = _ALTITUDE * max(scene.support.size) / _TRAY_SIDE
             self._latest = scene, self._overhead.render(scene, Pose((0.0, 0.0, altitude), (0.0, 1.0, 0.0, 0.0)))
         return self._latest[1]
 
@@ -193,14 +193,16 @@ class PictureCamera:
         """Pixels (N, 2) in the picture from above, before it is scaled down, of points (N, 3) m in the tray frame."""
         config = self._overhead.config
         # Nothing reaches the camera, save what a collapse has flung there.
-        distance = np.maximum(_ALTITUDE * scene.tray_side / _TRAY_SIDE - p_T[:, 2:], 0.05)
+        distance = np.maximum(_ALTITUDE * max(scene.support.size) / _TRAY_SIDE - p_T[:, 2:], 0.05)
         centre = (np.array([config.width, config.height]) - 1) / 2
         return np.asarray(centre + config.focal_length * p_T[:, :2] * [1, -1] / distance)
 
 
 def _camera(size: tuple[int, int]) -> OverheadCamera:
     width, height = size
-    return OverheadCamera(CameraConfig(_OVERSAMPLING * width, _OVERSAMPLING * height, _FOV_Y_DEG, _ALTITUDE), ENGINE)
+    return OverheadCamera(
+        Camera.over(_ALTITUDE, width=_OVERSAMPLING * width, height=_OVERSAMPLING * height, fov_y_deg=_FOV_Y_DEG), ENGINE
+    )
 
 
 def _bounds(points: NDArray[np.float64]) -> Rectangle:

@@ -19,8 +19,8 @@ from pydrake.geometry import (
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation, Slerp
 
-from drake_clutter.cell.station import ArmConfig, add_arm, set_joint_angles
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.plant import add_work_cell, set_joint_angles
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import write_text
 from drake_clutter.scenes.interfaces import Frame
 from drake_clutter.scenes.scene import Pose, Scene
@@ -110,23 +110,24 @@ def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     return poses
 
 
-def write_recording(path: Path, scene: Scene, frames: Sequence[Frame]) -> None:
+def write_recording(path: Path, scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> None:
     """Writes one HTML file that shows the frames again and again, without a network.
 
     Args:
         path: the file.
         scene: the objects, and the pose of those that a frame does not name.
         frames: in order of time; a single one is a still scene.
+        cell: whose arm is shown, if the frames know where it was.
     """
     # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
-    write_text(path, _SOURCE_COMMENT.sub("", _animated(scene, frames).StaticHtml()))
+    write_text(path, _SOURCE_COMMENT.sub("", _animated(scene, frames, cell).StaticHtml()))
 
 
-def _animated(scene: Scene, frames: Sequence[Frame]) -> Meshcat:
+def _animated(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> Meshcat:
     known = [frame.arm.q for frame in frames if frame.arm]
     # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
     with drake_silent_below(logging.WARNING):
-        meshcat, paths, arm_poses = _shown(scene, arm=bool(known))
+        meshcat, paths, arm_poses = _shown(scene, cell, arm=bool(known))
     if len(frames) > 1:
         animation = MeshcatAnimation(FRAMES_PER_SECOND)
         animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
@@ -144,24 +145,24 @@ def _animated(scene: Scene, frames: Sequence[Frame]) -> Meshcat:
     return meshcat
 
 
-def serve(scene: Scene, frames: Sequence[Frame] = ()) -> Meshcat:
+def serve(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> Meshcat:
     """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
-    return _animated(scene, frames)
+    return _animated(scene, frames, cell)
 
 
 ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]
 """X_TL of the arm's links by name, from its joint angles."""
 
 
-def _shown(scene: Scene, *, arm: bool = False) -> tuple[Meshcat, dict[str, str], ArmPoses]:
+def _shown(scene: Scene, cell: WorkCell, *, arm: bool = False) -> tuple[Meshcat, dict[str, str], ArmPoses]:
     """A viewer with the scene in it, with or without the arm; the Meshcat path of each object and link by name; `ArmPoses`."""
     builder = DiagramBuilder()
     objects = [(o.name, o.object_class) for o in scene.objects]
-    scene_plant = add_scene_plant(builder, objects, scene.tray_side, 0.01, visuals=True)
+    scene_plant = add_scene_plant(builder, objects, scene.support, 0.01, visuals=True)
     plant = scene_plant.plant
     links, added = {}, None
     if arm:
-        added = add_arm(plant, scene_plant.scene_graph, ArmConfig(), CameraConfig().altitude, compliant=False, visuals=True)
+        added = add_work_cell(plant, scene_plant.scene_graph, cell, compliant=False, visuals=True)
         links = {f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body for body in added.bodies}
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
@@ -174,7 +175,7 @@ def _shown(scene: Scene, *, arm: bool = False) -> tuple[Meshcat, dict[str, str],
     scene_plant.set_poses(plant_context, scene.objects)
     visualizer.ForcedPublish(visualizer.GetMyContextFromRoot(context))
 
-    scale = scene.tray_side / 0.70
+    scale = max(scene.support.size) / 0.70
     meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=_FOV_Y_DEG))
     meshcat.SetCameraPose(scale * np.array(_EYE), scale * np.array(_TARGET))
     for path in ("/Grid", "/Axes"):

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 
 
@@ -220,13 +221,13 @@ class Observation:
         depth: (height, width) m along the camera's axis, inf where nothing is seen.
         detections: V_t, the objects that can be detected now.
         camera: intrinsics and altitude.
-        tray_side: m.
+        support: what the objects stand on.
     """
 
     depth: NDArray[np.float32]
     detections: tuple[Detection, ...]
-    camera: CameraConfig
-    tray_side: float
+    camera: Camera
+    support: Support
 
     def __getitem__(self, name: str) -> Detection:
         """The detection of a name.

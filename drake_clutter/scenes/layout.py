@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Rest
-from drake_clutter.config import LayoutConfig
+from drake_clutter.cell.support import Support
+from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, Orientation, resting_rotation
 from drake_clutter.grammar.graph import DUMMY, END
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -113,9 +114,11 @@ class Stack:
         return made
 
 
-def _place(half_sizes: NDArray[np.float64], config: LayoutConfig, rng: np.random.Generator) -> NDArray[np.float64] | None:
-    """(S, 2) m, centres of S rectangles in the tray's square, gap kept; None if no draw fits. Large ones are drawn first."""
-    reach = config.tray_side / 2 - config.stack_gap - half_sizes
+def _place(
+    half_sizes: NDArray[np.float64], support: Support, config: LayoutConfig, rng: np.random.Generator
+) -> NDArray[np.float64] | None:
+    """(S, 2) m, centres of S rectangles on the support's floor, gap kept; None if no draw fits. Large ones are drawn first."""
+    reach = support.half_size - config.stack_gap - half_sizes
     if (reach < 0).any():
         return None
     order = np.argsort(-half_sizes.prod(axis=1), kind="stable")
@@ -137,7 +140,7 @@ def _place(half_sizes: NDArray[np.float64], config: LayoutConfig, rng: np.random
 def lay_out(
     derivation: Derivation,
     classes: Mapping[str, ObjectClass],
-    config: LayoutConfig,
+    config: ClutterConfig,
     rng: np.random.Generator,
     seed: int | None = None,
 ) -> Scene | LayoutFailure:
@@ -150,20 +153,20 @@ def lay_out(
     Args:
         derivation: a terminal graph and its rules.
         classes: by name.
-        config: sizes and gaps.
+        config: gaps, and the support.
         rng: draws the stacks' places.
         seed: noted in the scene.
     """
     graph = derivation.graph
-    stacks = [Stack(graph, classes, bottom, config) for bottom in graph.stacks()]
+    stacks = [Stack(graph, classes, bottom, config.layout) for bottom in graph.stacks()]
     height = max(float(stack.upper[2]) for stack in stacks)
-    if height > config.max_stack_height:
-        return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.max_stack_height)
+    if height > config.layout.max_stack_height:
+        return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.layout.max_stack_height)
     lower, upper = np.array([stack.lower[:2] for stack in stacks]), np.array([stack.upper[:2] for stack in stacks])
-    centres = _place((upper - lower) / 2, config, rng)
+    centres = _place((upper - lower) / 2, config.cell.support, config.layout, rng)
     if centres is None:
-        return LayoutFailure(LayoutFailureReason.NO_ROOM, float((upper - lower).prod(axis=1).sum()), config.tray_side**2)
+        return LayoutFailure(LayoutFailureReason.NO_ROOM, float((upper - lower).prod(axis=1).sum()), config.cell.support.area)
     objects = [
         o for stack, (x, y) in zip(stacks, centres - (lower + upper) / 2, strict=True) for o in stack.objects(float(x), float(y))
     ]
-    return Scene(tuple(objects), config.tray_side, graph, derivation.rules, seed)
+    return Scene(tuple(objects), config.cell.support, graph, derivation.rules, seed)

@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.support import Support
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.scene import TRAY, Pose
@@ -29,23 +30,31 @@ _YAWS = (0.0, np.pi / 2)
 
 @dataclass(frozen=True)
 class _Grid:
-    """Square cells over the tray.
+    """Square cells over the support's floor.
 
     Attributes:
-        centres: (n,) m, along x and along y.
+        x: Their centers along x [m]. Shape (n,).
+        y: Their centers along y [m]. Shape (m,).
     """
 
-    centres: NDArray[np.float64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
 
     @staticmethod
     @lru_cache(maxsize=16)
-    def over(tray_side: float) -> "_Grid":
-        count = int(tray_side / CELL)
-        return _Grid(np.asarray((np.arange(count) - (count - 1) / 2) * CELL, float))
+    def over(support: Support) -> "_Grid":
+        """Return the grid of a support."""
+        counts = [int(side / CELL) for side in support.size]
+        x, y = (np.asarray((np.arange(count) - (count - 1) / 2) * CELL, float) for count in counts)
+        return _Grid(x, y)
+
+    def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the centers of cells (k, 2) [m]. Shape (k, 2)."""
+        return np.column_stack([self.x[cells[:, 0]], self.y[cells[:, 1]]])
 
     def points(self, height: float) -> NDArray[np.float64]:
-        """(n * n, 3) m, the cells' centres at a height, x varying slowest."""
-        x, y = np.meshgrid(self.centres, self.centres, indexing="ij")
+        """(n * m, 3) m, the cells' centres at a height, x varying slowest."""
+        x, y = np.meshgrid(self.x, self.y, indexing="ij")
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
 
 
@@ -95,44 +104,45 @@ def _turned(object_class: ObjectClass, quaternion: tuple[float, float, float, fl
 
 
 @lru_cache(maxsize=16)
-def _tray_places(tray_side: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _tray_places(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(n, 2) cells of the tray, those furthest from its centre first, and (n,) minus how far, m."""
-    centres = _Grid.over(tray_side).centres
-    cells = np.argwhere(np.ones((len(centres),) * 2, bool))
-    cost = -np.abs(centres[cells]).max(axis=1)
+    grid = _Grid.over(support)
+    cells = np.argwhere(np.ones((len(grid.x), len(grid.y)), bool))
+    cost = -np.abs(grid.at(cells)).max(axis=1)
     order = np.argsort(cost, kind="stable")
     return cells[order], cost[order]
 
 
 def _top_places(observation: Observation, target: Detection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(n, 2) cells well inside what is seen of an object's top, those nearest to its middle first, and (n,) how near, m."""
-    centres = _Grid.over(observation.tray_side).centres
+    grid = _Grid.over(observation.support)
     corners = target.X_TO.apply(target.object_class.corners)
     floor = float(corners[:, 2].max())
     # A cell more all around: a pixel of the top's edge may lie in a cell whose middle is beside it.
-    x0, y0 = np.maximum(np.searchsorted(centres, corners[:, :2].min(axis=0)) - 1, 0)
-    x1, y1 = np.searchsorted(centres, corners[:, :2].max(axis=0)) + 1
-    x, y = np.meshgrid(centres[x0:x1], centres[y0:y1], indexing="ij")
+    axes, lower, upper = (grid.x, grid.y), corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    x0, y0 = (max(int(np.searchsorted(axis, low)) - 1, 0) for axis, low in zip(axes, lower, strict=True))
+    x1, y1 = (int(np.searchsorted(axis, high)) + 1 for axis, high in zip(axes, upper, strict=True))
+    x, y = np.meshgrid(grid.x[x0:x1], grid.y[y0:y1], indexing="ij")
     rows, columns = _pixels(observation, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)]))
     at_top = np.abs(observation.depth[rows, columns] - (observation.camera.altitude - floor)) < _DEPTH_TOLERANCE
     top = (at_top & target.mask[rows, columns]).reshape(x.shape)
     if not top.any():
         return np.empty((0, 2), np.int64), np.empty(0)
     first = np.array([x0, y0])
-    middle = centres[np.argwhere(top) + first].mean(axis=0)
+    middle = grid.at(np.argwhere(top) + first).mean(axis=0)
     inside = distance_transform_edt(np.pad(top, 1))[1:-1, 1:-1] * CELL > _SUPPORT_MARGIN
     cells = np.argwhere(inside) + first
-    cost = np.linalg.norm(centres[cells] - middle, axis=1)
+    cost = np.linalg.norm(grid.at(cells) - middle, axis=1)
     order = np.argsort(cost, kind="stable")
     return cells[order], cost[order]
 
 
 @njit(cache=True)
-def _first_fits(depth, altitude, focal_length, centres, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
+def _first_fits(depth, altitude, focal_length, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
     """The first of the cells over which the footprint is free at all levels (m), and those of the same cost: their positions."""
     height, width = depth.shape
-    n = len(centres)
-    known = np.zeros((n, n), np.int8)  # 1: free, 2: not
+    n, m = len(x), len(y)
+    known = np.zeros((n, m), np.int8)  # 1: free, 2: not
     found = np.empty(len(cells), np.int64)
     count = 0
     for position in range(len(cells)):
@@ -141,15 +151,15 @@ def _first_fits(depth, altitude, focal_length, centres, levels, footprint, cells
         fits = True
         for k in range(len(footprint)):
             i, j = cells[position, 0] + footprint[k, 0], cells[position, 1] + footprint[k, 1]
-            if i < 0 or j < 0 or i >= n or j >= n:
+            if i < 0 or j < 0 or i >= n or j >= m:
                 fits = False
                 break
             if known[i, j] == 0:
                 known[i, j] = 1
                 for level in levels:
                     distance = altitude - level
-                    column = int(np.rint(focal_length * centres[i] / distance + (width / 2 - 1)))
-                    row = int(np.rint(-focal_length * centres[j] / distance + (height / 2 - 1)))
+                    column = int(np.rint(focal_length * x[i] / distance + (width / 2 - 1)))
+                    row = int(np.rint(-focal_length * y[j] / distance + (height / 2 - 1)))
                     if depth[min(max(row, 0), height - 1), min(max(column, 0), width - 1)] < distance:
                         known[i, j] = 2
                         break
@@ -171,7 +181,7 @@ def has_clear_top(observation: Observation, detection: Detection) -> bool:
     """Whether the camera sees through the air right above the object, all over it."""
     corners = detection.X_TO.apply(detection.object_class.corners)
     top = float(corners[:, 2].max())
-    grid = _Grid.over(observation.tray_side)
+    grid = _Grid.over(observation.support)
     points = grid.points(top + _DEPTH_TOLERANCE)
     lines = ConvexHull(corners[:, :2]).equations
     over = (lines[:, :2] @ points[:, :2].T + lines[:, 2:]).max(axis=0) < 0
@@ -198,20 +208,20 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
     """
     picked = observation[move.pick]
     if move.place == TRAY:
-        floor, (cells, cost) = 0.0, _tray_places(observation.tray_side)
+        floor, (cells, cost) = 0.0, _tray_places(observation.support)
     else:
         target = observation[move.place]
         floor, (cells, cost) = top_height(target), _top_places(observation, target)
-    centres = _Grid.over(observation.tray_side).centres
+    grid = _Grid.over(observation.support)
     camera = observation.camera
     for yaw in _YAWS:
         turned = _turned(picked.object_class, picked.X_TO.quaternion, yaw, config.clearance)
         levels = floor + _DEPTH_TOLERANCE + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
-        arguments = (centres, levels, turned.footprint, cells, cost)
+        arguments = (grid.x, grid.y, levels, turned.footprint, cells, cost)
         best = _first_fits(observation.depth, camera.altitude, camera.focal_length, *arguments)
         if len(best):
             # In the order of the cells, so that the draw does not depend on how they were sorted.
             best = best[np.lexsort(cells[best].T[::-1])]
-            x, y = centres[cells[best[rng.integers(len(best))]]]
+            x, y = grid.at(cells[best[rng.integers(len(best))]][None])[0]
             return Pose((float(x), float(y), floor + config.release_height - turned.lowest), turned.quaternion)
     return None

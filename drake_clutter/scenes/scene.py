@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.cell.support import Support
 from drake_clutter.grammar import ClutterGraph
 
 TRAY = "tray"
@@ -96,14 +97,14 @@ class Scene:
 
     Attributes:
         objects: in order; names are unique.
-        tray_side: m, inner side of the square tray.
+        support: what they stand on.
         graph: the terminal graph it was laid out from, or None.
         derivation: the names of the rules that derived the graph.
         seed: of the batch it was drawn in, or None.
     """
 
     objects: tuple[SceneObject, ...]
-    tray_side: float
+    support: Support
     graph: ClutterGraph | None = None
     derivation: tuple[str, ...] = ()
     seed: int | None = None

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from drake_clutter.catalogue import Catalogue
+from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.files import InputError, write_text
 from drake_clutter.grammar import ClutterGraph, Orientation
 from drake_clutter.grammar.graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
@@ -146,12 +147,13 @@ def scene_from_text(text: str, path: str, catalogue: Catalogue) -> SceneFile:
     fields = document.mapping(("version", "objects"), ("tray", "graph", "derivation", "seed", "verdict"))
     if fields["version"].integer() != VERSION:
         raise fields["version"].refuse(str(VERSION))
-    tray_side = 0.70
+    support = default_cell().support
     if "tray" in fields:
         side = fields["tray"].mapping(("side",))["side"]
-        tray_side = side.number()
-        if not 0.1 <= tray_side <= 2.0:
+        length = side.number()
+        if not 0.1 <= length <= 2.0:
             raise side.refuse("0.1 to 2 (m)")
+        support = support.model_copy(update={"size": (length, length)})
     objects = tuple(_object(item, catalogue) for item in fields["objects"].items())
     if not objects:
         raise fields["objects"].refuse("a list of at least one object")
@@ -167,7 +169,7 @@ def scene_from_text(text: str, path: str, catalogue: Catalogue) -> SceneFile:
     graph = _graph(fields["graph"], objects) if fields.get("graph") and fields["graph"].value is not None else None
     derivation = tuple(item.text() for item in fields["derivation"].items()) if "derivation" in fields else ()
     seed = fields["seed"].integer() if "seed" in fields and fields["seed"].value is not None else None
-    scene = Scene(objects, tray_side, graph, derivation, seed)
+    scene = Scene(objects, support, graph, derivation, seed)
     judged = "verdict" in fields and fields["verdict"].value is not None
     return SceneFile(scene, _verdict(fields["verdict"], scene) if judged else None)
 
@@ -252,7 +254,7 @@ def _pose_fields(pose: Pose) -> dict[str, list[float]]:
 
 def scene_fields(scene: Scene, verdict: Verdict | None = None) -> dict[str, Any]:
     """The document of a scene file, as plain lists and mappings."""
-    document: dict[str, Any] = {"version": VERSION, "seed": scene.seed, "tray": {"side": scene.tray_side}, "objects": []}
+    document: dict[str, Any] = {"version": VERSION, "seed": scene.seed, "tray": {"side": scene.support.size[0]}, "objects": []}
     for o in scene.objects:
         entry: dict[str, Any] = {"name": o.name, "class": o.object_class.name, "X_TO": _pose_fields(o.X_TO)}
         if o.node is not None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_clutter.catalogue import Catalogue, ObjectClass
-from drake_clutter.config import LayoutConfig
+from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_text
 from drake_clutter.grammar import Derivation, SceneGrammar
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
@@ -71,7 +71,7 @@ class SceneSet:
         rules = self.scenes[index].rules
         return Derivation(grammar.replay(rules), rules)
 
-    def settled(self, index: int, grammar: SceneGrammar, layout: LayoutConfig) -> Scene:
+    def settled(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
         """A scene of a frozen set, as it came to rest.
 
         Raises:
@@ -82,14 +82,14 @@ class SceneSet:
             raise InputError(
                 f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
             )
-        scene = lay_anew(self.derivation(index, grammar), grammar, layout, np.random.default_rng(index))
+        scene = lay_anew(self.derivation(index, grammar), grammar, config, np.random.default_rng(index))
         return scene.at(dict(zip(scene.names, poses, strict=True)))
 
 
-def lay_anew(derivation: Derivation, grammar: SceneGrammar, layout: LayoutConfig, rng: np.random.Generator) -> Scene:
+def lay_anew(derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator) -> Scene:
     """A graph that has been laid out before, with its stacks in new places."""
     for _ in range(_LAYOUT_TRIES):
-        scene = lay_out(derivation, grammar.classes, layout, rng)
+        scene = lay_out(derivation, grammar.classes, config, rng)
         if not isinstance(scene, LayoutFailure):
             return scene
     raise InputError(

@@ -104,7 +104,8 @@ def _nameless_points(
     z = np.where(measured, z, floor)
     x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
     y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length
-    left = measured & (z < floor - _FLAT) & (np.maximum(np.abs(x), np.abs(y)) < observation.tray_side / 2)
+    half_x, half_y = observation.support.half_size
+    left = measured & (z < floor - _FLAT) & (np.abs(x) < half_x) & (np.abs(y) < half_y)
     height = camera.altitude - z
     for o in known:
         where = np.nonzero(left)

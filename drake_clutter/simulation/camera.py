@@ -24,7 +24,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
 
@@ -70,7 +71,7 @@ class Intrinsics:
     X_TC: RigidTransform
 
     @staticmethod
-    def of(config: CameraConfig) -> "Intrinsics":
+    def of(config: Camera) -> "Intrinsics":
         """Of a config."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
@@ -95,26 +96,26 @@ class OverheadCamera:
     Camera frame C: origin at the config's altitude over the tray's centre, z down along the optical axis, x along the tray's x.
     """
 
-    def __init__(self, config: CameraConfig, engine: RenderEngineVtkParams = ENGINE) -> None:
+    def __init__(self, config: Camera, engine: RenderEngineVtkParams = ENGINE) -> None:
         """Makes a camera; `engine` sets light, background and shadows."""
         self.config = config
         self._engine = engine
         self._counts: Counter[ObjectClass] = Counter()
-        self._tray_side = 0.0
+        self._support: Support | None = None
         eye = Intrinsics.of(config)
         self._color_camera, self._depth_camera, self._label_camera, self._X_TC = eye.color, eye.depth, eye.label, eye.X_TC
         # Behind the camera.
         self._X_T_parked = RigidTransform([0.0, 0.0, config.altitude + 5.0])
 
-    def _build(self, counts: Counter[ObjectClass], tray_side: float) -> None:
+    def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
         builder = DiagramBuilder()
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
-        self._scene_plant: ScenePlant = add_scene_plant(builder, names, tray_side, 0.01, visuals=True)
+        self._scene_plant: ScenePlant = add_scene_plant(builder, names, support, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
         self._scene_plant.scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(self._engine))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._counts, self._tray_side = counts, tray_side
+        self._counts, self._support = counts, support
 
     def _show(self, scene: Scene, shown: Collection[str]) -> dict[int, int]:
         """Puts the named objects of the scene before the camera, and no others.
@@ -123,10 +124,10 @@ class OverheadCamera:
             The index in the scene of each object shown, by its render label.
         """
         needed = Counter(o.object_class for o in scene.objects)
-        if scene.tray_side != self._tray_side or any(needed[c] > self._counts[c] for c in needed):
+        if scene.support != self._support or any(needed[c] > self._counts[c] for c in needed):
             # Half as many again are made, so that scene after scene does not mean engine after engine.
             grown = Counter({c: n + (n + 1) // 2 for c, n in needed.items() if n > self._counts[c]})
-            self._build(self._counts | grown, scene.tray_side)
+            self._build(self._counts | grown, scene.support)
         plant = self._scene_plant.plant
         context = plant.GetMyMutableContextFromRoot(self._context)
         free: dict[ObjectClass, int] = defaultdict(int)
@@ -195,7 +196,7 @@ class OverheadCamera:
 
     def hidden(self, shares: Mapping[str, float]) -> tuple[str, ...]:
         """The names whose visible share is below the config's threshold, in order."""
-        return tuple(name for name, share in shares.items() if share < self.config.hidden_below)
+        return tuple(name for name, share in shares.items() if share < self.config.visibility_threshold)
 
     def _apart_in_image(self, scene: Scene) -> list[list[int]]:
         """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""

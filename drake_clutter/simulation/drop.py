@@ -8,6 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.plant import add_scene_plant
 
@@ -17,12 +18,12 @@ _LEAST_GAP, _MOST_GAP = 0.01, 0.06
 """m, between an object and what it starts above."""
 
 
-def above_tray(classes: Sequence[ObjectClass], tray_side: float, rng: np.random.Generator) -> Scene:
+def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.Generator) -> Scene:
     """Objects of the classes in the air over the tray, turned at random, each above those whose way down it shares."""
     objects = list[SceneObject]()
     for number, object_class in enumerate(classes):
         R_TO = Rotation.random(rng=rng).as_matrix()
-        x, y = rng.uniform(-_WITHIN, _WITHIN, 2) * tray_side
+        x, y = rng.uniform(-_WITHIN, _WITHIN, 2) * support.size
         loose = SceneObject(f"{object_class.name}_{number}", object_class, Pose.of(R_TO, (x, y, 0.0)))
         lower, upper = loose.bounds_T
         below = [
@@ -32,7 +33,7 @@ def above_tray(classes: Sequence[ObjectClass], tray_side: float, rng: np.random.
         ]
         z = max(below, default=0.0) + rng.uniform(_LEAST_GAP, _MOST_GAP) - lower[2]
         objects.append(SceneObject(loose.name, object_class, Pose.of(R_TO, (x, y, z))))
-    return Scene(tuple(objects), tray_side)
+    return Scene(tuple(objects), support)
 
 
 def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Scene]:
@@ -45,7 +46,7 @@ def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Sc
     """
     builder = DiagramBuilder()
     names = [(o.name, o.object_class) for o in scene.objects]
-    scene_plant = add_scene_plant(builder, names, scene.tray_side, time_step, visuals=False)
+    scene_plant = add_scene_plant(builder, names, scene.support, time_step, visuals=False)
     scene_plant.plant.Finalize()
     simulator = Simulator(builder.Build())
     context = scene_plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -55,10 +56,10 @@ def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Sc
     for moment in moments:
         simulator.AdvanceTo(moment)
         fallen = scene.at(scene_plant.poses(context))
-        scenes.append(Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.tray_side)), scene.tray_side))
+        scenes.append(Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.support)), scene.support))
     return scenes
 
 
-def _on_tray(scene_object: SceneObject, tray_side: float) -> bool:
+def _on_tray(scene_object: SceneObject, support: Support) -> bool:
     x, y, z = scene_object.X_TO.translation
-    return max(abs(x), abs(y)) <= tray_side / 2 and z > 0
+    return support.contains(x, y) and z > 0

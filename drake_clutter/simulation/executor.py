@@ -55,14 +55,14 @@ class SettleExecutor:
         for group in _groups(moved, released):
             if touched.isdisjoint(o.name for o in group):
                 continue
-            settled.append(settle(group, scene.tray_side, settle_config, record=True))
+            settled.append(settle(group, scene.support, settle_config, record=True))
             if settled[-1].instability is not None:
                 if not self._follow_falls:
                     after = moved.at(settled[-1].poses)
                     motion = _together(moved.poses, settled)
                     return Outcome(MoveResult.COLLAPSED, after, settled[-1].instability, motion, released=released.X_TO)
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
-                whole = settle(moved.objects, scene.tray_side, coarse, record=True, follow_falls=True)
+                whole = settle(moved.objects, scene.support, coarse, record=True, follow_falls=True)
                 fall = settled[-1].instability
                 return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), fall, whole.motion, released=released.X_TO)
         motion = _together(moved.poses, settled)

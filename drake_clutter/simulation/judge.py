@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.interfaces import Verdict
@@ -28,9 +29,9 @@ class DrakeJudge:
 
     def __init__(self, config: ClutterConfig) -> None:
         self._config = config
-        self._camera = OverheadCamera(config.camera)
+        self._camera = OverheadCamera(config.cell.camera)
         self._fast = FastJudge(config)
-        self._singles: dict[tuple[ObjectClass, float, float, tuple[float, ...]], Settled] = {}
+        self._singles: dict[tuple[ObjectClass, Support, float, tuple[float, ...]], Settled] = {}
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
         """The verdict. See `SceneJudge.judge`."""
@@ -46,16 +47,16 @@ class DrakeJudge:
         config = self._config.settle
         groups = touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN)
         for group in sorted(groups, key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None):
-            alone = len(group) == 1 and _well_inside(group[0], scene.tray_side)
-            yield tuple(group), self._settle_alone(group[0], scene.tray_side) if alone else settle(group, scene.tray_side, config)
+            alone = len(group) == 1 and _well_inside(group[0], scene.support)
+            yield tuple(group), self._settle_alone(group[0], scene.support) if alone else settle(group, scene.support, config)
 
-    def _settle_alone(self, single: SceneObject, tray_side: float) -> Settled:
+    def _settle_alone(self, single: SceneObject, support: Support) -> Settled:
         """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
         x, y, z = single.X_TO.translation
-        key = (single.object_class, tray_side, z, single.X_TO.quaternion)
+        key = (single.object_class, support, z, single.X_TO.quaternion)
         if key not in self._singles:
             centred = replace(single, X_TO=single.X_TO.moved((-x, -y, 0.0)))
-            self._singles[key] = settle([centred], tray_side, self._config.settle)
+            self._singles[key] = settle([centred], support, self._config.settle)
         settled = self._singles[key]
         (pose,) = settled.poses.values()
         instability = replace(settled.instability, object=single.name) if settled.instability else None
@@ -67,7 +68,7 @@ class DrakeJudge:
         return Verdict(None, scene.poses, shares, self._camera.hidden(shares))
 
 
-def _well_inside(scene_object: SceneObject, tray_side: float) -> bool:
+def _well_inside(scene_object: SceneObject, support: Support) -> bool:
     """Whether an object is clear of the rim."""
     lower, upper = scene_object.bounds_T
-    return bool(np.abs([lower[:2], upper[:2]]).max() < tray_side / 2 - TOUCHING_MARGIN)
+    return bool((np.abs([lower[:2], upper[:2]]) < support.half_size - TOUCHING_MARGIN).all())

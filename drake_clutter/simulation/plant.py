@@ -11,9 +11,10 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_clutter.assets.tray import tray_sdf
 from drake_clutter.catalogue import ObjectClass, Rest, Shape
 from drake_clutter.cell.sdf import sdf_text
+from drake_clutter.cell.support import Support
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_STOPS_WITHIN = 0.05
@@ -62,7 +63,7 @@ class ScenePlant:
 def add_scene_plant(
     builder: DiagramBuilder,
     objects: Sequence[tuple[str, ObjectClass]],
-    tray_side: float,
+    support: Support,
     time_step: float,
     *,
     visuals: bool,
@@ -73,7 +74,7 @@ def add_scene_plant(
     Args:
         builder: the diagram's.
         objects: (name, class) of each.
-        tray_side: m, inner side of the tray.
+        support: what the objects stand on.
         time_step: s; hydroelastic contact, lagged approximation, as DRAKE_NOTES found to be the truth.
         visuals: whether the textured meshes are added, for cameras and Meshcat.
         jointed: the name of an object that the caller gives a joint.
@@ -82,20 +83,20 @@ def add_scene_plant(
         time_step=time_step, contact_model="hydroelastic_with_fallback", discrete_contact_approximation="lagged"
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    return populated(plant, scene_graph, objects, tray_side, visuals=visuals, jointed=jointed)
+    return populated(plant, scene_graph, objects, support, visuals=visuals, jointed=jointed)
 
 
 def populated(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     objects: Sequence[tuple[str, ObjectClass]],
-    tray_side: float,
+    support: Support,
     *,
     visuals: bool,
     jointed: str = "",
 ) -> ScenePlant:
     """Adds the tray and the named objects to a plant; arguments as of `add_scene_plant`."""
-    (tray,) = Parser(plant).AddModelsFromString(tray_sdf(tray_side), "sdf")
+    (tray,) = Parser(plant).AddModelsFromString(support_sdf(support), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:

@@ -9,6 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalogue import Shape
+from drake_clutter.cell.support import Support
 from drake_clutter.config import SettleConfig
 from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
@@ -35,12 +36,12 @@ class Settled:
     motion: tuple[Frame, ...]
 
 
-def fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleConfig) -> Instability | None:
+def fallen(before: SceneObject, after: Pose, support: Support, config: SettleConfig) -> Instability | None:
     """How an object has fallen that was before, and is now; None if it stayed within the limits."""
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
     x, y, z = after.translation
-    if max(abs(x), abs(y)) > tray_side / 2 or z < 0:
+    if not support.contains(x, y) or z < 0:
         reason = InstabilityReason.LEFT_TRAY
     elif tilt >= math.radians(config.max_tilt_deg):
         reason = InstabilityReason.TOPPLED
@@ -52,7 +53,7 @@ def fallen(before: SceneObject, after: Pose, tray_side: float, config: SettleCon
 
 
 def settle(
-    objects: Sequence[SceneObject], tray_side: float, config: SettleConfig, *, record: bool = False, follow_falls: bool = False
+    objects: Sequence[SceneObject], support: Support, config: SettleConfig, *, record: bool = False, follow_falls: bool = False
 ) -> Settled:
     """Simulates objects alone on the tray, from rest where they are.
 
@@ -61,15 +62,13 @@ def settle(
 
     Args:
         objects: what to settle.
-        tray_side: m.
+        support: what they stand on.
         config: time step and limits.
         record: whether to keep the motion.
         follow_falls: go on after an object has fallen, until everything is calm or the time is up.
     """
     builder = DiagramBuilder()
-    scene_plant = add_scene_plant(
-        builder, [(o.name, o.object_class) for o in objects], tray_side, config.time_step, visuals=False
-    )
+    scene_plant = add_scene_plant(builder, [(o.name, o.object_class) for o in objects], support, config.time_step, visuals=False)
     scene_plant.plant.Finalize()
     simulator = Simulator(builder.Build())
     context = scene_plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -94,7 +93,7 @@ def settle(
             motion.append(Frame(sample * SAMPLE_PERIOD, poses))
         # Every second time: by then what topples has turned so far that it is not taken for something that slides.
         if instability is None and (sample % 2 == 0 or sample == last):
-            gone = [found for o in objects if (found := fallen(o, poses[o.name], tray_side, config)) is not None]
+            gone = [found for o in objects if (found := fallen(o, poses[o.name], support, config)) is not None]
             instability = max(gone, key=lambda f: f.displacement, default=None)
             if instability is not None and not follow_falls:
                 return Settled(instability, poses, tuple(motion))

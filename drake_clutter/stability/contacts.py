@@ -143,14 +143,14 @@ def touching(posed, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def find_contacts(posed, shapes, p_T, tray_side):  # type: ignore[no-untyped-def]
+def find_contacts(posed, shapes, p_T, half_size):  # type: ignore[no-untyped-def]
     """Who stands on whom.
 
     Args:
         posed: (N,) of `shapes.POSED`.
         shapes: (n,) the objects' rows.
         p_T: (n, 3) m.
-        tray_side: m.
+        half_size: (2,) m, of the floor.
 
     Returns:
         What is wrong (`SOUND` if nothing is), with which object, the pairs (c, 2) of lower (`GROUND`: the tray) and upper
@@ -166,7 +166,7 @@ def find_contacts(posed, shapes, p_T, tray_side):  # type: ignore[no-untyped-def
         if posed[shape].fault != 0:
             return LEANING if posed[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
         for axis in range(2):
-            beyond = max(posed[shape].upper[axis] + p_T[j, axis], -posed[shape].lower[axis] - p_T[j, axis]) - tray_side / 2
+            beyond = max(posed[shape].upper[axis] + p_T[j, axis], -posed[shape].lower[axis] - p_T[j, axis]) - half_size[axis]
             if beyond > DEEPEST:
                 return OUTSIDE, j, pairs[:0], stack
     for j in range(n):

@@ -67,7 +67,7 @@ class FastJudge:
         self._config = config
         self._margin, self._friction = 2 * config.settle.jitter + _ROUNDING if margin is None else margin, friction
         self._shapes = Shapes()
-        self.rays = RayCaster(config.camera, self._shapes)
+        self.rays = RayCaster(config.cell.camera, self._shapes)
         self._known: dict[bytes, tuple[int, int]] = {}  # see `_weakest`
         self._generation = 0
 
@@ -82,7 +82,7 @@ class FastJudge:
         if found is not None:
             return Verdict(found, settled, {}, ())
         shares = dict(zip(settled, self.rays.shares(shapes, moved), strict=True))
-        below = self._config.camera.hidden_below
+        below = self._config.cell.camera.visibility_threshold
         return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < below))
 
     def stability(self, scene: Scene) -> Instability | CannotJudge | None:
@@ -255,7 +255,7 @@ class FastJudge:
 
     def _standing(self, scene: Scene, shapes: Ints, p_T: Floats) -> "_Standing | CannotJudge":
         """Who stands on whom, if all objects are within the model."""
-        fault, culprit, pairs, stack = contacts.find_contacts(self._shapes.table.posed, shapes, p_T, scene.tray_side)
+        fault, culprit, pairs, stack = contacts.find_contacts(self._shapes.table.posed, shapes, p_T, scene.support.half_size)
         if fault != contacts.SOUND:
             return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
         return _Standing(shapes, p_T, pairs, stack)

@@ -1,6 +1,6 @@
 """Which object each of the camera's rays meets first, by compiled loops over the faces of convex objects.
 
-The rays go through the pixels' middles, with the intrinsics of `CameraConfig`. The rays that meet a face fill a convex polygon
+The rays go through the pixels' middles, with the intrinsics of `Camera`. The rays that meet a face fill a convex polygon
 of the image, row by row, and along a face the inverse distance is linear in the pixel: so a ray costs one addition and one
 comparison. Nothing but the floor of the tray is seen beside the objects; its rim stands behind them.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_clutter.config import CameraConfig
+from drake_clutter.cell.camera import Camera
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shapes import Floats, Ints, Shapes
@@ -167,7 +167,7 @@ def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  #
 class RayCaster:
     """Casts the overhead camera's rays at scenes of convex objects."""
 
-    def __init__(self, config: CameraConfig, shapes: Shapes | None = None) -> None:
+    def __init__(self, config: Camera, shapes: Shapes | None = None) -> None:
         """Makes a caster; `shapes` may be shared with a judge."""
         self.config = config
         self._shapes = shapes or Shapes()
@@ -228,6 +228,6 @@ class RayCaster:
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))
-            if share >= self.config.hidden_below and (mask := self._mask(index, rectangle)).any()
+            if share >= self.config.visibility_threshold and (mask := self._mask(index, rectangle)).any()
         )
-        return Observation(depth, detections, self.config, scene.tray_side), dict(zip(scene.names, shares, strict=True))
+        return Observation(depth, detections, self.config, scene.support), dict(zip(scene.names, shares, strict=True))

@@ -11,7 +11,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.support import Support
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
@@ -118,29 +119,26 @@ class ArmSimulation:
 
     def __init__(
         self,
-        config: ArmConfig,
+        cell: WorkCell,
         scene: Scene,
         plan: Plan,
         *,
-        camera_altitude: float,
         time_step: float = TIME_STEP,
         jointed: bool = False,
     ) -> None:
         """Builds the diagram; `jointed`: the cup holds by a joint, see `JointHold`."""
-        self.config, self._objects, self._plan, self._time_step = config, scene.objects, plan, time_step
+        self.cell, self._objects, self._plan, self._time_step = cell.with_support(scene.support), scene.objects, plan, time_step
         builder = DiagramBuilder()
         classes = [(o.name, o.object_class) for o in scene.objects]
         self.station = builder.AddSystem(
             ClutterStation(
-                config,
+                self.cell,
                 classes,
-                tray_side=scene.tray_side,
-                camera_altitude=camera_altitude,
                 time_step=time_step,
                 jointed=plan.pick if jointed else "",
             )
         )
-        self.executor = PickPlaceExecutor.AddToBuilder(builder, config=config)
+        self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
         source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(plan)))
         builder.Connect(source.get_output_port(), self.executor.GetInputPort("plan"))
         builder.Connect(self.executor.GetOutputPort("command"), self.station.GetInputPort("command"))
@@ -162,7 +160,7 @@ class ArmSimulation:
         """Simulates until the arm is home again and all has come to rest."""
         root, station = self.simulator.get_mutable_context(), self.station
         context, command = station.plant_context(root), self.executor.GetOutputPort("command")
-        station.set_scene(root, np.array(self.config.home), self._objects)
+        station.set_scene(root, np.array(self.cell.robot.home), self._objects)
         self.simulator.set_monitor(self.vacuum)
         beside_pick, beside_place = disturbed_by(self._objects, self._plan)
         motion, tracking, freedom = list[Frame](), 0.0, Freedom(station, self.vacuum)
@@ -214,11 +212,10 @@ class ArmExecutor:
         config: ClutterConfig,
         *,
         follow_falls: bool = True,
-        arm: ArmConfig | None = None,
         planner: PlannerConfig | None = None,
     ) -> None:
         """Makes an executor; `follow_falls` changes nothing, falls are part of the simulation."""
-        self._config, self._arm = config, arm or ArmConfig()
+        self._config = config
         self._planner_config = planner or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
@@ -227,12 +224,12 @@ class ArmExecutor:
         X_TO = choose_placement(observation, move, self._config.exploration, rng)
         if X_TO is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
-        return self.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
+        return self.planner(scene.support).plan(scene.objects, move.pick, X_TO)
 
-    def planner(self, tray_side: float) -> PickPlacePlanner:
+    def planner(self, support: Support) -> PickPlacePlanner:
         """For a tray; kept."""
-        if self._planner is None or self._planner.tray_side != tray_side:
-            self._planner = PickPlacePlanner(self._arm, self._planner_config, tray_side, self._config.camera.altitude)
+        if self._planner is None or self._planner.cell.support != support:
+            self._planner = PickPlacePlanner(self._config.cell.with_support(support), self._planner_config)
         return self._planner
 
     def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
@@ -242,7 +239,7 @@ class ArmExecutor:
             no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
             return Outcome(result, scene, detail="" if no_spot else str(plan))
-        simulation = ArmSimulation(self._arm, scene, plan, camera_altitude=self._config.camera.altitude)
+        simulation = ArmSimulation(self._config.cell, scene, plan)
         told = simulation.run(record=True)
         came_off = not told.sealed or not math.isnan(told.dropped)
         X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulation.running.lowered))
@@ -267,7 +264,7 @@ def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: b
         moved = {o.name for o in before.objects if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED} | {pick}
         for group in touching_groups(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):
-                after = after.at(settle(group, before.tray_side, config).poses)
+                after = after.at(settle(group, before.support, config).poses)
         instability = worst_fall(others, after, config)
     result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
@@ -277,5 +274,5 @@ def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: b
 
 def worst_fall(before: Sequence[SceneObject], after: Scene, config: SettleConfig) -> Instability | None:
     """Of the objects that did not stay where they were, the one that went furthest."""
-    found = [fall for o in before if (fall := fallen(o, after[o.name].X_TO, after.tray_side, config))]
+    found = [fall for o in before if (fall := fallen(o, after[o.name].X_TO, after.support, config))]
     return max(found, key=lambda fall: fall.displacement, default=None)

@@ -20,8 +20,9 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.kinematics import JOINTS
-from drake_clutter.cell.station import Arm, ArmConfig, add_arm, joint_numbers
+from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
 from drake_clutter.cell.suction import load_share, surface_under_lip, unevenness
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
@@ -53,11 +54,9 @@ class ClutterStation(Diagram):
 
     def __init__(
         self,
-        config: ArmConfig,
+        cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
         *,
-        tray_side: float,
-        camera_altitude: float,
         time_step: float,
         jointed: str = "",
         visuals: bool = False,
@@ -65,20 +64,19 @@ class ClutterStation(Diagram):
         """Builds it.
 
         Args:
-            config: the arm.
+            cell: what stands around.
             objects: name and class of each.
-            tray_side, camera_altitude: m.
             time_step: s.
             jointed: the name of the one object that the cup can take, by a `JointHold`; none: it takes any, by a `HexapodHold`.
             visuals: whether cameras are to see it.
         """
         super().__init__()
-        self.config, self.classes, self.time_step = config, dict(objects), time_step
+        self.cell, self.classes, self.time_step = cell, dict(objects), time_step
         self._jointed = jointed
         builder = DiagramBuilder()
-        self.scene: ScenePlant = add_scene_plant(builder, objects, tray_side, time_step, visuals=False, jointed=jointed)
+        self.scene: ScenePlant = add_scene_plant(builder, objects, cell.support, time_step, visuals=False, jointed=jointed)
         self.plant = plant = self.scene.plant
-        self.arm = add_arm(plant, self.scene.scene_graph, config, camera_altitude, compliant=True, visuals=False)
+        self.arm = add_work_cell(plant, self.scene.scene_graph, cell, compliant=True, visuals=False)
         for name in JOINTS:
             plant.GetJointActuatorByName(name, self.arm.robot).set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
         self.hold = _hold(plant, self.arm, self.scene.bodies, jointed)
@@ -96,17 +94,15 @@ class ClutterStation(Diagram):
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(plant.get_state_output_port(self.arm.tool), "bellows")
-        self.camera_scene_graph = self._add_camera_geometry(builder, objects, tray_side, camera_altitude) if visuals else None
+        self.camera_scene_graph = self._add_camera_geometry(builder, objects) if visuals else None
         builder.BuildInto(self)
 
-    def _add_camera_geometry(
-        self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]], tray_side: float, camera_altitude: float
-    ) -> SceneGraph:
+    def _add_camera_geometry(self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]]) -> SceneGraph:
         """Adds the geometry that cameras see: of a twin of the plant, which is never simulated, in the plant's state."""
         twin, seen = MultibodyPlant(self.time_step), builder.AddNamedSystem("camera_scene_graph", SceneGraph())
         twin.RegisterAsSourceForSceneGraph(seen)
-        bodies = populated(twin, seen, objects, tray_side, visuals=True, jointed=self._jointed).bodies
-        arm = add_arm(twin, seen, self.config, camera_altitude, compliant=True, visuals=True)
+        bodies = populated(twin, seen, objects, self.cell.support, visuals=True, jointed=self._jointed).bodies
+        arm = add_work_cell(twin, seen, self.cell, compliant=True, visuals=True)
         _hold(twin, arm, bodies, self._jointed)  # with it the states are alike
         twin.Finalize()
         poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True))
@@ -243,7 +239,7 @@ class Vacuum:
         elif self.held and not wanted:
             self._release(context)
         elif self.held:
-            share = float(load_share(*station.hold.load(context), station.config.suction))
+            share = float(load_share(*station.hold.load(context), station.cell.gripper))
             self.largest_share = max(self.largest_share, share)
             self._overloaded = self._overloaded + 1 if share > 1 else 0
             if self._overloaded * LOAD_PERIOD > LETS_GO_AFTER:
@@ -259,7 +255,7 @@ class Vacuum:
 
     def _take(self, context: Context) -> None:
         """Takes the object that is first under the lip, if it is close enough and the lip seals on it."""
-        station, suction = self.station, self.station.config.suction
+        station, suction = self.station, self.station.cell.gripper
         grasps = {name: self._grasp(context, name) for name in station.takeable}
         below = {n: surface_under_lip(station.classes[n], X_OG, suction.cup_diameter).min() for n, X_OG in grasps.items()}
         first = min(below, key=lambda name: below[name])

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
 from drake_clutter.cell.epick import CUP_MASS
-from drake_clutter.cell.station import Arm
+from drake_clutter.cell.plant import Arm
 from drake_clutter.cell.suction import GRAVITY
 
 Floats = NDArray[np.float64]

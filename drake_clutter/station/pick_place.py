@@ -9,7 +9,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.paths import Payload, dynamics_plant, motion, torques
 from drake_clutter.planning.plan import DESCENT_SPEED, Plan
 
@@ -48,11 +48,11 @@ class Schedule:
         return "idle" if time >= self.end else [name for name, start in self.starts if start <= time + 1e-9][-1]
 
 
-def scheduled(plan: Plan, config: ArmConfig, touched: float = math.inf) -> Schedule:
+def scheduled(plan: Plan, cell: WorkCell, touched: float = math.inf) -> Schedule:
     """The plan's phases behind each other, with dwells at the ends of the carry, and the torques that they take.
 
     Args:
-        plan, config: what to carry out.
+        plan, cell: what to carry out, and where.
         touched: s, after which the descent has ended; afterwards the arm rises again as far as it went down.
     """
     approach, carry, retreat = plan.phases
@@ -78,7 +78,7 @@ def scheduled(plan: Plan, config: ArmConfig, touched: float = math.inf) -> Sched
         else:
             q, v, a = np.repeat(parts[-1][-1:, :6], 2, axis=0), at_rest, at_rest
         t_parts.append(time + np.linspace(0.0, duration, len(q)))
-        parts.append(np.column_stack([q, v, torques(dynamics_plant(config, payload), q, v, a)]))
+        parts.append(np.column_stack([q, v, torques(dynamics_plant(cell, payload), q, v, a)]))
         time += duration
     at = dict(starts)
     # Neighbouring parts share a time: the later sample is left a moment later.
@@ -136,12 +136,12 @@ class PickPlaceExecutor(LeafSystem):
         abstract, the phase; finished (2,), how many plans have ended, and how far the latest has lowered its object, m.
     """
 
-    def __init__(self, *, config: ArmConfig) -> None:
+    def __init__(self, *, cell: WorkCell) -> None:
         """Begins at home, with nothing to do."""
         super().__init__()
-        self._config = config
-        home, still = np.array(config.home)[None], np.zeros((1, 6))
-        self._at_home = np.hstack([home, still, torques(dynamics_plant(config, Payload()), home, still, still)]).ravel()
+        self._cell = cell
+        home, still = np.array(cell.robot.home)[None], np.zeros((1, 6))
+        self._at_home = np.hstack([home, still, torques(dynamics_plant(cell, Payload()), home, still, still)]).ravel()
         self._plan_port = self.DeclareAbstractInputPort("plan", AbstractValue.Make(None))
         self._bellows = self.DeclareVectorInputPort("bellows", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(Running()))
@@ -154,9 +154,9 @@ class PickPlaceExecutor(LeafSystem):
         self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(""), self._calc_status, of)
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, *, config: ArmConfig) -> "PickPlaceExecutor":
+    def AddToBuilder(builder: DiagramBuilder, *, cell: WorkCell) -> "PickPlaceExecutor":
         """Adds one."""
-        system: PickPlaceExecutor = builder.AddSystem(PickPlaceExecutor(config=config))
+        system: PickPlaceExecutor = builder.AddSystem(PickPlaceExecutor(cell=cell))
         system.set_name("pick_place_executor")
         return system
 
@@ -166,7 +166,7 @@ class PickPlaceExecutor(LeafSystem):
         plan = self._plan_port.Eval(context) if self._plan_port.HasValue(context) else None
         over = now.schedule is None or context.get_time() >= now.begun + now.schedule.end
         if plan is not None and plan is not now.plan and over:
-            after = Running(plan, scheduled(plan, self._config), context.get_time(), now.count + 1)
+            after = Running(plan, scheduled(plan, self._cell), context.get_time(), now.count + 1)
         if after is not now:
             state.get_mutable_abstract_state(int(self._state)).set_value(after)
         return EventStatus.Succeeded()
@@ -183,7 +183,7 @@ class PickPlaceExecutor(LeafSystem):
         hung = pulled if math.isnan(now.hung) else now.hung
         if pulled > max(hung - PRESSED, HANGS):
             return replace(now, hung=hung)
-        return replace(now, hung=hung, touched=descended, schedule=scheduled(now.plan, self._config, descended))
+        return replace(now, hung=hung, touched=descended, schedule=scheduled(now.plan, self._cell, descended))
 
     def running(self, context: Context) -> Running:
         """What is being carried out, or was last."""

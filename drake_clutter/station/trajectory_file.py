@@ -1,6 +1,6 @@
 """Recorded arm motions as HDF5, for a researcher's own analysis and for `drake-clutter replay`.
 
-Attributes of the file: `version`, `scene` (a scene file's text: how everything lay at first), `arm` (an `ArmConfig` as YAML).
+Attributes of the file: `version`, `scene` (a scene file's text: how everything lay at first), `cell` (a `WorkCell` as YAML).
 A group `move_0001`, ... for each move that the arm carried out; its attributes are `pick`, `place`, `result` and `detail`, its
 datasets, over n moments:
 
@@ -12,37 +12,39 @@ datasets, over n moments:
     X_TO     (n, objects, 7)  qw, qx, qy, qz, x, y, z (m), in the order of the scene file's objects
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import Catalogue
-from drake_clutter.cell.station import ArmConfig
-from drake_clutter.config import config_yaml
+from drake_clutter.cell.work_cell import WorkCell, default_cell
+from drake_clutter.config import upgrade_cell
 from drake_clutter.files import InputError, replacing
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import scene_from_text, scene_text
+from drake_clutter.validation import config_yaml, override, parse_yaml
 
 VERSION = 1
 _ARM = ("q", "v", "torque")
 
 
-def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], arm: ArmConfig) -> int:
+def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell) -> int:
     """Writes the moves of which there is an arm's motion, in one step; returns how many there are.
 
     Args:
         path: the file.
         start: the scene before the first move.
         moves: and what they led to.
-        arm: that carried them out.
+        cell: in which they were carried out.
     """
     count = 0
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update({"version": VERSION, "scene": scene_text(start), "arm": config_yaml(arm)})
+        file.attrs.update({"version": VERSION, "scene": scene_text(start), "cell": config_yaml(cell)})
         for move, outcome in moves:
             states = [frame.arm for frame in outcome.motion if frame.arm]
             if not states:
@@ -60,8 +62,8 @@ def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Out
     return count
 
 
-def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, list[tuple[Move, tuple[Frame, ...]]]]:
-    """The scene at first, and the motion of each move.
+def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[Frame, ...]]]]:
+    """Return the scene at first, the cell, and the motion of each move.
 
     Raises:
         InputError: the file, the field and what is allowed, for whatever cannot be such a file.
@@ -74,7 +76,15 @@ def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, list[tup
         if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
             raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
         scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
-        return scene, [_move(path, name, file[name], scene) for name in sorted(file)]
+        cell = _cell(path, file.attrs)
+        return scene, cell, [_move(path, name, file[name], scene) for name in sorted(file)]
+
+
+def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
+    """Return the cell of a file; files of drake_clutter 0.1 hold the arm alone."""
+    field = "cell" if "cell" in attributes else "arm"
+    given = parse_yaml(str(attributes.get(field, "{}")), f"{path}:{field}")
+    return override(default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}")
 
 
 def _move(path: Path, name: str, group: h5py.Group, scene: Scene) -> tuple[Move, tuple[Frame, ...]]:

@@ -12,7 +12,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
 
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import PlannerConfig
@@ -82,7 +81,6 @@ class ClosedLoop:
         max_moves: int,
         seed: int,
         world: ClutterConfig,
-        arm: ArmConfig | None = None,
     ) -> None:
         """Builds the diagram around a scene at rest.
 
@@ -92,17 +90,16 @@ class ClosedLoop:
             perceive: what sees; None: the perfect detector.
             max_moves: after which the episode ends.
             seed: of all chances.
-            world, arm: configs.
+            world: config.
         """
-        self._arm, self._start = arm or ArmConfig(), scene
+        self._start = scene
+        world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else for_who_sees(world)
-        builder, camera, eye = DiagramBuilder(), world.camera, Intrinsics.of(world.camera)
+        builder, camera, eye = DiagramBuilder(), world.cell.camera, Intrinsics.of(world.cell.camera)
         self.station: ClutterStation = builder.AddSystem(
             ClutterStation(
-                self._arm,
+                world.cell,
                 [(o.name, o.object_class) for o in scene.objects],
-                tray_side=scene.tray_side,
-                camera_altitude=camera.altitude,
                 time_step=TIME_STEP,
                 visuals=True,
             )
@@ -117,7 +114,7 @@ class ClosedLoop:
         perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
         self._tracks = perceive is not None
         ways = GUARDED if self._tracks else PlannerConfig()
-        self._ways = PickPlacePlanner(self._arm, ways, scene.tray_side, camera.altitude)
+        self._ways = PickPlacePlanner(world.cell, ways)
         self.agent = ExplorationAgent.AddToBuilder(
             builder,
             choose=choose,
@@ -127,7 +124,7 @@ class ClosedLoop:
             hopeless=self._hopeless,
         )
         self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed, latency=LATENCY)
-        self.executor = PickPlaceExecutor.AddToBuilder(builder, config=self._arm)
+        self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=world.cell)
         for source, target, ports in (
             (self.station, sensor, {"query": "geometry_query"}),
             (sensor, perception, {"depth_image_32f": "depth_image", "color_image": "color_image"}),
@@ -154,7 +151,7 @@ class ClosedLoop:
         """(height, width) m, the depth of the cell as it is without objects: they are below the floor, where nobody sees them."""
         root = self.diagram.CreateDefaultContext()
         below = [replace(o, X_TO=o.X_TO.moved((0.0, 0.0, -10.0))) for o in self._start.objects]
-        self.station.set_scene(root, np.array(self._arm.home), below)
+        self.station.set_scene(root, np.array(self._world.cell.robot.home), below)
         image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root))
         return np.asarray(image.data[..., 0].copy())
 
@@ -189,7 +186,7 @@ class ClosedLoop:
         """Simulates until all is found, the pile has collapsed, or the agent has ended; `report` is called after each move."""
         begun_at = time.perf_counter()
         root = self.simulator.get_mutable_context()
-        self.station.set_scene(root, np.array(self._arm.home), self._start.objects)
+        self.station.set_scene(root, np.array(self._world.cell.robot.home), self._start.objects)
         self.simulator.set_monitor(self.vacuum)
         freedom = Freedom(self.station, self.vacuum)
         freedom.begin(root)

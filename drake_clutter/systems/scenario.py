@@ -1,19 +1,21 @@
 """Scenarios: everything that decides an episode of the closed loop, in one typed file."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
+from typing import Annotated
 
 from drake_clutter.agents.exploration import BASELINES, make_explorers
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.cell.station import ArmConfig
+from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.systems.exploration_agent import Choose
 from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
+from drake_clutter.validation import Between, config_class
 
 
-@dataclass
+@config_class
 class Scenario:
     """An episode of the closed loop.
 
@@ -27,21 +29,20 @@ class Scenario:
         camera_noise: whether what a trained network is given has a depth camera's noise.
         max_moves: after which it ends.
         seed: of everything that is left to chance.
-        world, arm: configs.
+        world: config.
     """
 
     scene: str = ""
     catalogue: str = ""
     generator: str = "sg-star"
     objects: str = "ycb7"
-    nodes: int = 25
+    nodes: Annotated[int, Between(3, 1000)] = 25
     agent: str = "student"
     perception: str = "labels"
     camera_noise: bool = True
-    max_moves: int = 20
-    seed: int = 0
+    max_moves: Annotated[int, Between(1)] = 20
+    seed: Annotated[int, Between(0)] = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)
-    arm: ArmConfig = field(default_factory=ArmConfig)
 
 
 DETECTORS = {
@@ -51,7 +52,7 @@ DETECTORS = {
 """The shipped detectors, by name."""
 
 
-def perception_of(scenario: Scenario, tray_side: float) -> Perceive | None:
+def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     """What a scenario sees with; None: the perfect detector.
 
     Raises:
@@ -67,7 +68,7 @@ def perception_of(scenario: Scenario, tray_side: float) -> Perceive | None:
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
     classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(scenario.objects)
-    detector = LearnedDetector(SegmentationNetwork.load(path), classes, scenario.world.camera, tray_side)
+    detector = LearnedDetector(SegmentationNetwork.load(path), classes, scenario.world.cell.camera, support)
     return LearnedPerception(detector.detect, noise=scenario.camera_noise, seed=scenario.seed)
 
 

@@ -84,7 +84,7 @@ class LabelPerception:
 
     def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
         """For the objects of a scene."""
-        self._scene, self._detector = scene, LabelDetector(world.camera)
+        self._scene, self._detector = scene, LabelDetector(world.cell.camera)
         self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
 
     def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
@@ -93,4 +93,4 @@ class LabelPerception:
         told = self._detector.look(self._scene.at(poses)).observation
         unobstructed = depth > told.depth - 0.01  # the arm may be in the way
         in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
-        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.tray_side)
+        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.support)

@@ -35,8 +35,8 @@ def explore_images(
     Arguments: as of `ClosedLoop`.
     """
     world = for_who_sees(world)
-    executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.camera)
-    task = ExplorationTask(scene, executor, LabelDetector(world.camera), world.exploration, max_moves)
+    executor, camera = SettleExecutor(world, follow_falls=False), OverheadCamera(world.cell.camera)
+    task = ExplorationTask(scene, executor, LabelDetector(world.cell.camera), world.exploration, max_moves)
     empty = camera.render(replace(scene, objects=())).depth
 
     def not_worth_trying(known: Sequence[SceneObject], observation: Observation) -> list[Move]:

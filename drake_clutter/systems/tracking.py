@@ -96,7 +96,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
             continue
         e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
         for_it = np.count_nonzero(e.seen)
-        if for_it >= max(1, observation.camera.hidden_below * e.alone) and for_it >= STILL * (for_it + e.past):
+        if for_it >= max(1, observation.camera.visibility_threshold * e.alone) and for_it >= STILL * (for_it + e.past):
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
 
@@ -141,4 +141,4 @@ def _gone(known: SceneObject, observation: Observation) -> bool:
     for detection in observation.detections:
         others |= detection.mask
     taken = np.count_nonzero(e.seen & others[e.window])
-    return bool(taken > TAKEN * as_expected and as_expected >= observation.camera.hidden_below * e.alone)
+    return bool(taken > TAKEN * as_expected and as_expected >= observation.camera.visibility_threshold * e.alone)

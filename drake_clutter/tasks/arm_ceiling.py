@@ -1,6 +1,5 @@
 """What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
 
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.planner import PickPlacePlanner
@@ -13,14 +12,14 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 class ArmCeiling:
     """Knows everything of a scene, and what the cup holds."""
 
-    def __init__(self, world: ClutterConfig, arm: ArmConfig) -> None:
-        """For scenes in a world, with an arm."""
-        self._world, self._arm, self._judge = world, arm, FastJudge(world)
+    def __init__(self, world: ClutterConfig) -> None:
+        """For scenes in a world."""
+        self._world, self._judge = world, FastJudge(world)
         self._search = FullKnowledgeSearch(world, self._judge)
 
     def never_found(self, scene: Scene) -> tuple[str, ...]:
         """What stays hidden behind what no cup holds, and behind what carries that; the scene is at rest."""
-        planner = PickPlacePlanner(self._arm, PlannerConfig(), scene.tray_side, self._world.camera.altitude)
+        planner = PickPlacePlanner(self._world.cell.with_support(scene.support), PlannerConfig())
         fixed = {o.name for o in scene.objects if not planner.holds(o)}
         supports = self._judge.supports(scene)
         if not isinstance(supports, CannotJudge):

@@ -69,7 +69,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         if fidelity not in EXECUTORS:
             raise InputError(f"fidelity: {fidelity!r}; allowed are {', '.join(EXECUTORS)}")
         self._executor = EXECUTORS[fidelity](self._config, follow_falls=False)
-        self._detector = DETECTORS[fidelity](self._config.camera)
+        self._detector = DETECTORS[fidelity](self._config.cell.camera)
         self._judge = FastJudge(self._config)
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
@@ -91,13 +91,13 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             return self._begin_anew(), {}
         if not 0 <= number < len(self.scenes.scenes):
             raise InputError(f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them")
-        return self.begin(self.scenes.settled(number, self.grammar, self._config.layout)), {}
+        return self.begin(self.scenes.settled(number, self.grammar, self._config)), {}
 
     def _begin_anew(self) -> GraphObservation:
         """With a scene that stands and hides something where its stacks are put now."""
         for _ in range(_TRIES):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
-            scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config.layout, self.np_random)
+            scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config, self.np_random)
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
                 observation = self.begin(scene)
                 if self.task.end is None:

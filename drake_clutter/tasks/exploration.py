@@ -8,7 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from drake_clutter.config import CameraConfig, ClutterConfig, ExplorationConfig
+from drake_clutter.cell.camera import Camera
+from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector, Look
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.interfaces import Move, MoveExecutor, MoveResult, Observation, Outcome
@@ -47,7 +48,7 @@ class Detector(Protocol):
         """What the camera shows of a scene."""
 
 
-DETECTORS: dict[str, Callable[[CameraConfig], Detector]] = {
+DETECTORS: dict[str, Callable[[Camera], Detector]] = {
     "equilibrium": RayDetector,
     "fast": RayDetector,
     "settle": LabelDetector,

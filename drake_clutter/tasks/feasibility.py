@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import Shape
 from drake_clutter.cell.kinematics import forward_kinematics, manipulability
-from drake_clutter.cell.station import ArmConfig
 from drake_clutter.cell.suction import unevenness
+from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import PlannerConfig, inverse, matrix
@@ -100,10 +100,10 @@ class NoiseRow:
 class FeasibilityStudy:
     """Asks an arm about every legal move of scenes; the same answers for the same seed, but for the times."""
 
-    def __init__(self, setup: str, arm: ArmConfig, world: ClutterConfig, planner: PlannerConfig, seed: int) -> None:
+    def __init__(self, setup: str, world: ClutterConfig, planner: PlannerConfig, seed: int) -> None:
         """Of one arm, called `setup`."""
-        self._setup, self._arm, self._world, self._config, self._seed = setup, arm, world, planner, seed
-        self._detector = LabelDetector(world.camera)
+        self._setup, self._world, self._config, self._seed = setup, world, planner, seed
+        self._detector = LabelDetector(world.cell.camera)
         self._planner: PickPlacePlanner | None = None
 
     def moves(self, name: str, number: int, scene: Scene) -> list[MoveRow]:
@@ -123,10 +123,10 @@ class FeasibilityStudy:
     def _rng(self, *path: int) -> np.random.Generator:
         return item_rng(self._seed, *path)
 
-    def planner(self, tray_side: float) -> PickPlacePlanner:
+    def planner(self, support: Support) -> PickPlacePlanner:
         """For a tray; kept."""
-        if self._planner is None or self._planner.tray_side != tray_side:
-            self._planner = PickPlacePlanner(self._arm, self._config, tray_side, self._world.camera.altitude)
+        if self._planner is None or self._planner.cell.support != support:
+            self._planner = PickPlacePlanner(self._world.cell.with_support(support), self._config)
         return self._planner
 
     def _row(self, name: str, scene: Scene, move: Move, X_TO: Pose | None) -> MoveRow:
@@ -149,7 +149,7 @@ class FeasibilityStudy:
             return replace(row, about=move.place)
         px, py, pz = (round(v, 6) for v in X_TO.translation)
         row = replace(row, place_x=px, place_y=py, place_z=pz)
-        found = self.planner(scene.tray_side).plan(scene.objects, move.pick, X_TO)
+        found = self.planner(scene.support).plan(scene.objects, move.pick, X_TO)
         row = replace(row, planning_s=round(found.seconds, 4))
         if isinstance(found, NoPlan):
             return replace(row, result=found.reason.value, about=found.about, number=found.number)
@@ -168,7 +168,7 @@ class FeasibilityStudy:
     def noise(self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]) -> list[NoiseRow]:
         """Some of the planned moves, planned from wrong poses: do the plans hold where the objects really are?"""
         planned = [row for row in rows if row.result == PLANNED]
-        rng, planner, found = self._rng(number, 1_000_000), self.planner(scene.tray_side), list[NoiseRow]()
+        rng, planner, found = self._rng(number, 1_000_000), self.planner(scene.support), list[NoiseRow]()
         for k in sorted(rng.permutation(len(planned))[:NOISY_MOVES].tolist()):
             row = planned[k]
             for error in NOISE:
@@ -183,10 +183,11 @@ class FeasibilityStudy:
     def _holds(self, plan: Plan, scene: Scene, planner: PickPlacePlanner, error: float) -> str:
         """Whether a plan that was made for other poses works with the right ones; else what goes wrong."""
         q = plan.phases[1].trajectory.value(0.0).ravel()
-        X_TG = self._arm.X_TB @ forward_kinematics(q) @ self._arm.X_FG
+        X_TB, gripper = self._world.cell.robot.X_TB, self._world.cell.gripper
+        X_TG = X_TB.GetAsMatrix4() @ forward_kinematics(q) @ gripper.X_FG.GetAsMatrix4()
         picked = scene[plan.pick]
         X_OG = inverse(matrix(picked.X_TO)) @ X_TG
-        if unevenness(picked.object_class, X_OG, self._arm.suction.cup_diameter) > self._arm.suction.unevenness:
+        if unevenness(picked.object_class, X_OG, gripper.cup_diameter) > gripper.unevenness:
             return PlanFailure.NO_SEAL.value
         around = planner.clearance_scene(scene.objects)
         for phase in plan.phases:

@@ -101,7 +101,7 @@ class FullKnowledgeSearch:
         self._judge = judge or FastJudge(config)
         self._rays = self._judge.rays
         self._executor = FastExecutor(config, self._judge)
-        self._hidden_below = config.camera.hidden_below
+        self._hidden_below = config.cell.camera.visibility_threshold
 
     def solve(
         self,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, SupportsFloat
+from typing import Annotated, Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -17,6 +17,7 @@ from drake_clutter.scenes.interfaces import CannotJudge, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.validation import Between, NonNegative, config_class
 
 MOST_IN_A_STACK = 0.6
 """Of a balanced scene's objects."""
@@ -24,7 +25,7 @@ MOST_IN_A_STACK = 0.6
 GraphObservation = dict[str, NDArray[Any]]
 
 
-@dataclass
+@config_class
 class GenerationTask:
     """What is asked of a generated scene.
 
@@ -37,12 +38,12 @@ class GenerationTask:
         margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
     """
 
-    nodes: int = 25
-    hidden_reward: float = 0.5
-    balance_reward: float = 0.5
-    instability_reward: float = -1.0
+    nodes: Annotated[int, Between(3, 1000)] = 25
+    hidden_reward: NonNegative = 0.5
+    balance_reward: NonNegative = 0.5
+    instability_reward: Annotated[float, Between(-1e300, 0.0)] = -1.0
     must_come_apart: bool = True
-    margin: float = 0.003
+    margin: NonNegative = 0.003
 
 
 class StackFault(Enum):
@@ -135,7 +136,7 @@ class PartialScene:
 
     def _judge_stack(self, stack: Stack) -> None:
         self.origins |= dict(zip(stack.nodes, stack.p_T, strict=True))
-        scene = Scene(tuple(stack.objects()), self._config.layout.tray_side)
+        scene = Scene(tuple(stack.objects()), self._config.cell.support)
         if stack.upper[2] > self._config.layout.max_stack_height:
             self.fault = StackFault.TOO_HIGH
         elif isinstance(found := self._judge.stability(scene), CannotJudge):
@@ -146,7 +147,7 @@ class PartialScene:
             self.fault = StackFault.HELD_DOWN
         else:
             shares = self._judge.rays.visible_shares(scene.objects).values()
-            self.hidden += sum(share < self._config.camera.hidden_below for share in shares)
+            self.hidden += sum(share < self._config.cell.camera.visibility_threshold for share in shares)
 
     def worth(self, hidden: int) -> float:
         """Of the derived graph, if its scene is stable and hides that many objects."""
@@ -156,7 +157,7 @@ class PartialScene:
     def scene(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:
         """The finished scene with its stacks in places drawn at random, judged; None if it cannot stand on the tray."""
         derivation = Derivation(self.graph, tuple(self.rules))
-        scene = lay_out(derivation, self._grammar.classes, self._config.layout, rng)
+        scene = lay_out(derivation, self._grammar.classes, self._config, rng)
         if isinstance(scene, LayoutFailure):
             return None
         verdict = self._judge.judge(scene, rng)
@@ -233,7 +234,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
         self.vocabulary = GraphVocabulary.of(self.grammar)
         self._judge = FastJudge(self._config, margin=self.task.margin)
         n, e = self.task.nodes, most_edges(self.task.nodes)
-        far = max(self._config.layout.tray_side, self._config.layout.max_stack_height)
+        far = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
         box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.vocabulary.node_kinds), (n,), np.int8),

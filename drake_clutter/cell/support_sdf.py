@@ -1,0 +1,58 @@
+"""The support as a model. Frame T, the link `tray`: origin at the center of the floor's upper surface, z up."""
+
+from drake_clutter.assets.contact import proximity_properties
+from drake_clutter.cell.support import Support
+
+_FLOOR_COLOR, _WALL_COLOR = "0.72 0.60 0.46 1", "0.55 0.42 0.30 1"
+_WALL_NAMES = {"+x": "rim_front", "-x": "rim_back", "+y": "rim_left", "-y": "rim_right"}
+
+_Vector = tuple[float, float, float]
+
+
+def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
+    box = f"""<pose>{" ".join(f"{v:.6g}" for v in p_TG)} 0 0 0</pose>
+        <geometry>
+          <box><size>{" ".join(f"{v:.6g}" for v in size)}</size></box>
+        </geometry>"""
+    return f"""
+      <visual name="{name}">
+        {box}
+        <material>
+          <diffuse>{color}</diffuse>
+        </material>
+      </visual>
+      <collision name="{name}">
+        {box}
+{proximity_properties(1.0, compliant=False)}
+      </collision>"""
+
+
+def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
+    """Return name, size [m] and center p_TG [m] of the floor and of each wall."""
+    (x, y), thickness = support.size, support.wall_thickness
+    height = support.wall_height + support.floor_thickness
+    middle = (support.wall_height - support.floor_thickness) / 2
+    walls: dict[str, tuple[_Vector, _Vector]] = {
+        "+x": ((thickness, y + 2 * thickness, height), ((x + thickness) / 2, 0, middle)),
+        "-x": ((thickness, y + 2 * thickness, height), (-(x + thickness) / 2, 0, middle)),
+        "+y": ((x, thickness, height), (0, (y + thickness) / 2, middle)),
+        "-y": ((x, thickness, height), (0, -(y + thickness) / 2, middle)),
+    }
+    floor = ("floor", (x, y, support.floor_thickness), (0.0, 0.0, -support.floor_thickness / 2))
+    return [floor, *((_WALL_NAMES[side], *walls[side]) for side in _WALL_NAMES if side in support.walls)]
+
+
+def support_sdf(support: Support) -> str:
+    """Return the SDF model of a support."""
+    boxes = [
+        _box(name, size, p_TG, _FLOOR_COLOR if name == "floor" else _WALL_COLOR) for name, size, p_TG in support_boxes(support)
+    ]
+    return f"""<?xml version="1.0"?>
+<!-- Written by drake_clutter.cell.support_sdf. Frame T: origin at the centre of the floor's upper surface, z up. -->
+<sdf version="1.10" xmlns:drake="drake.mit.edu">
+  <model name="tray">
+    <link name="tray">{"".join(boxes)}
+    </link>
+  </model>
+</sdf>
+"""
