@@ -1,6 +1,6 @@
 """What the package does with a case, told line by line: one function for each backend.
 
-All that `behavior_hashes.py` asks of the package is here: when interfaces change, this file follows.
+All that `behavior_hashes.py` asks of the package is here; when interfaces change, this follows.
 """
 
 import hashlib

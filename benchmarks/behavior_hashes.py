@@ -5,8 +5,8 @@
     python benchmarks/behavior_hashes.py --write         # records; where behavior is to change
 
 Without --write it plays again what is recorded, tells of each episode whether it went the same way,
-and if not with which move it first went another; then the exit code is 1. Of a move count its result
-and texts, what it found, all poses afterwards to a nanometer, and the arm's joint angles; no times.
+and if not with which move it first went another; then the exit code is 1. Of a move count its
+result and texts, what it found, all poses afterwards to a nanometer, and the arm's joint angles.
 """
 
 import os
