@@ -1,0 +1,252 @@
+"""What the package does with a case, told line by line: one function for each backend.
+
+All that `behavior_hashes.py` asks of the package is here; when interfaces change, this follows.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.config import ClutterConfig
+from drake_clutter.fast.judge import FastJudge
+from drake_clutter.resources import shipped_path
+from drake_clutter.runner import item_rng
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.scenes.seams import CannotJudge, MoveExecutor, Verdict
+from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
+from drake_clutter.systems.teleported_loop import explore_images
+from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
+
+WORLD, MAX_MOVES, OBJECTS = ClutterConfig(), 10, "ycb7"
+NODES = 25
+"""Of generated scenes."""
+DRAKE_EVERY = 10
+"""Of a generator's scenes, one in so many is judged by Drake, too."""
+DECIMALS = 9
+"""To which numbers are compared."""
+
+Part = str | Sequence[float]
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is played or made.
+
+    Attributes:
+        scenes: name of a frozen set; of a generated scene, of its generator.
+        number: of the scene in the set or batch; it seeds all chances.
+        agent: the explorer, or "".
+    """
+
+    scenes: str
+    number: int
+    agent: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.scenes} {self.number} {self.agent}".strip()
+
+
+@dataclass(frozen=True)
+class Line:
+    """One move, or what else is told of an episode or scene.
+
+    Attributes:
+        words: readable.
+        parts: what is too long for that, by name: texts, or numbers to be compared to `DECIMALS`.
+    """
+
+    words: str
+    parts: Mapping[str, Part] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        hashes = (f"{name} {hash_of(part)[:12]}" for name, part in self.parts.items())
+        return " | ".join([self.words, *hashes])
+
+
+def hash_of(part: Part) -> str:
+    """Of a text, or of rounded numbers."""
+    if isinstance(part, str):
+        return hashlib.sha256(part.encode()).hexdigest()
+    rounded = np.round(np.asarray(part, np.float64), DECIMALS) + 0.0  # -0.0 + 0.0 is 0.0
+    return hashlib.sha256(rounded.tobytes()).hexdigest()
+
+
+@cache
+def _scene_set(name: str) -> SceneSet:
+    return load_scene_set(shipped_path(f"training/scenes/{name}.json"), load_catalogue())
+
+
+def _scene(case: Case) -> Scene:
+    """The scene of a case, at rest."""
+    held = _scene_set(case.scenes)
+    return held.settled(case.number, held.grammar, WORLD.layout)
+
+
+@cache
+def _explorers(agent: str) -> ExplorerMaker:
+    return make_explorers(agent, WORLD)
+
+
+@cache
+def _executor(fidelity: str) -> MoveExecutor:
+    return EXECUTORS[fidelity](WORLD)
+
+
+def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
+    executor, detector = _executor(fidelity), DETECTORS[fidelity](WORLD.camera)
+    task = ExplorationTask(_scene(case), executor, detector, WORLD.exploration, MAX_MOVES)
+    play(task, _explorers(case.agent)(task), item_rng(case.number))
+    return _episode(task)
+
+
+def static(case: Case) -> list[Line]:
+    """Moves by teleport, judged by the static judge alone."""
+    return _at_fidelity(case, "equilibrium")
+
+
+def settle(case: Case) -> list[Line]:
+    """Moves by teleport, settled in Drake."""
+    return _at_fidelity(case, "settle")
+
+
+def arm(case: Case) -> list[Line]:
+    """Moves by the arm, with perfect detections."""
+    return _at_fidelity(case, "arm")
+
+
+def _scenario(case: Case, perception: str) -> Scenario:
+    return Scenario(
+        agent=case.agent,
+        perception=perception,
+        objects=OBJECTS,
+        max_moves=MAX_MOVES,
+        seed=case.number,
+        world=WORLD,
+    )
+
+
+def _closed_loop(case: Case, perception: str) -> list[Line]:
+    scenario, scene = _scenario(case, perception), _scene(case)
+    loop = ClosedLoop(
+        scene,
+        policy_of(scenario.agent, scenario.world),
+        perceive=perception_of(scenario, scene.tray_side),
+        max_moves=scenario.max_moves,
+        seed=scenario.seed,
+        world=scenario.world,
+        arm=scenario.arm,
+    )
+    timing = loop.run(record=True)
+    return _episode(loop.task, loop.known, timing.end)
+
+
+def closed_loop_labels(case: Case) -> list[Line]:
+    """The closed loop with the perfect detector."""
+    return _closed_loop(case, "labels")
+
+
+def closed_loop_depth(case: Case) -> list[Line]:
+    """The closed loop that sees depth images."""
+    return _closed_loop(case, "depth")
+
+
+def images(case: Case) -> list[Line]:
+    """The loop without an arm, which sees depth images."""
+    scenario, scene = _scenario(case, "depth"), _scene(case)
+    perceive = perception_of(scenario, scene.tray_side)
+    assert perceive is not None
+    task, known = explore_images(
+        scene,
+        policy_of(scenario.agent, scenario.world),
+        perceive,
+        max_moves=scenario.max_moves,
+        seed=scenario.seed,
+        world=scenario.world,
+    )
+    return _episode(task, known)
+
+
+@cache
+def _generator(agent: str) -> tuple[SceneGenerator, FastJudge, DrakeJudge]:
+    job = GenerationJob(agent, OBJECTS, None, NODES, 0, WORLD)
+    return SceneGenerator(job), FastJudge(WORLD), DrakeJudge(WORLD)
+
+
+def generation(case: Case) -> list[Line]:
+    """A scene by a generator, with its graph and layout, and judged."""
+    generator, fast, drake = _generator(case.scenes)
+    rng = item_rng(0, case.number)
+    scene, failures = generator.lay_out(rng)
+    assert scene.graph is not None
+    graph = scene.graph.nx
+    nodes = [f"{node} {kind}" for node, kind in graph.nodes(data="kind")]
+    # An orientation has a name, other kinds of edges are one.
+    edges = [f"{a} {b} {getattr(kind, 'name', kind)}" for a, b, kind in graph.edges(data="kind")]
+    words = f"{len(nodes)} nodes, layout failures before: {failures.total()}"
+    parts = {"graph": "\n".join([*nodes, *edges]), "rules": "\n".join(scene.derivation)}
+    names, poses = "\n".join(scene.names), _numbers(scene.poses.values())
+    laid_out = Line(f"{len(scene.objects)} objects", {"names": names, "poses": poses})
+    lines = [Line(words, parts), laid_out]
+    lines.append(_verdict("static", fast.judge(scene, deepcopy(rng))))
+    if case.number % DRAKE_EVERY == 0:
+        lines.append(_verdict("Drake", drake.judge(scene, deepcopy(rng))))
+    return lines
+
+
+def _verdict(judge: str, verdict: Verdict | CannotJudge) -> Line:
+    if isinstance(verdict, CannotJudge):
+        return Line(f"{judge}: cannot be judged, {verdict}")
+    words = str(verdict.instability or f"stable, hidden {_named(verdict.hidden)}")
+    poses, shares = _numbers(verdict.settled.values()), [*verdict.visible_share.values()]
+    return Line(f"{judge}: {words}", {"poses": poses, "shares": shares})
+
+
+def _episode(task: ExplorationTask, known: Sequence[SceneObject] = (), end: str = "") -> list[Line]:
+    """An episode.
+
+    Args:
+        task: the episode's book.
+        known: K_t at the end, of an agent that keeps it.
+        end: why the agent ended by itself, or "".
+    """
+    ended = task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value
+    belief: dict[str, Part] = {}
+    if known:
+        names = "\n".join(f"{o.name} {o.object_class.name}" for o in known)
+        belief = {"known": names, "at": _numbers(o.X_TO for o in known)}
+    poses = _numbers(task.start.poses.values())
+    start = Line(f"hidden {_named(task.hidden_at_start)}", {"poses": poses})
+    return [start, *(_move(step) for step in task.steps), Line(ended, belief)]
+
+
+def _move(step: Step) -> Line:
+    outcome = step.outcome
+    told = [outcome.result.value, outcome.detail, outcome.instability, outcome.cannot_judge]
+    words = f"{step.move}: {'; '.join(str(text) for text in told if text)}"
+    words += f"; found {_named(step.newly_found)}"
+    parts = {"poses": _numbers(outcome.scene.poses.values())}
+    if outcome.released is not None:
+        parts["released"] = _numbers([outcome.released])
+    arms = [frame.arm for frame in outcome.motion if frame.arm is not None]
+    if arms:
+        parts |= {"q_middle": [*arms[len(arms) // 2].q], "q_last": [*arms[-1].q]}
+    return Line(words, parts)
+
+
+def _numbers(poses: Iterable[Pose]) -> list[float]:
+    """Translations and rotation matrices: a quaternion's sign says nothing."""
+    return [float(v) for X in poses for v in (*X.translation, *X.rotation.ravel())]
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names) or "nothing"
