@@ -15,13 +15,13 @@ from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.fast.judge import FastJudge
 from drake_clutter.resources import shipped_path
-from drake_clutter.runner import item_rng
+from drake_clutter.scenes.interfaces import CannotJudge, MoveExecutor, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.scenes.seams import CannotJudge, MoveExecutor, Verdict
+from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.stability.judge import FastJudge
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.systems.teleported_loop import explore_images
@@ -89,7 +89,7 @@ def _scene_set(name: str) -> SceneSet:
 def _scene(case: Case) -> Scene:
     """The scene of a case, at rest."""
     held = _scene_set(case.scenes)
-    return held.settled(case.number, held.grammar, WORLD.layout)
+    return held.settled(case.number, held.grammar, WORLD)
 
 
 @cache
@@ -103,7 +103,7 @@ def _executor(fidelity: str) -> MoveExecutor:
 
 
 def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
-    executor, detector = _executor(fidelity), DETECTORS[fidelity](WORLD.camera)
+    executor, detector = _executor(fidelity), DETECTORS[fidelity](WORLD.cell.camera)
     task = ExplorationTask(_scene(case), executor, detector, WORLD.exploration, MAX_MOVES)
     play(task, _explorers(case.agent)(task), item_rng(case.number))
     return _episode(task)
@@ -140,11 +140,10 @@ def _closed_loop(case: Case, perception: str) -> list[Line]:
     loop = ClosedLoop(
         scene,
         policy_of(scenario.agent, scenario.world),
-        perceive=perception_of(scenario, scene.tray_side),
+        perceive=perception_of(scenario, scene.support),
         max_moves=scenario.max_moves,
         seed=scenario.seed,
         world=scenario.world,
-        arm=scenario.arm,
     )
     timing = loop.run(record=True)
     return _episode(loop.task, loop.known, timing.end)
@@ -163,7 +162,7 @@ def closed_loop_depth(case: Case) -> list[Line]:
 def images(case: Case) -> list[Line]:
     """The loop without an arm, which sees depth images."""
     scenario, scene = _scenario(case, "depth"), _scene(case)
-    perceive = perception_of(scenario, scene.tray_side)
+    perceive = perception_of(scenario, scene.support)
     assert perceive is not None
     task, known = explore_images(
         scene,

@@ -37,7 +37,7 @@ from behavior_backends import Case, Line, hash_of
 
 from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.resources import git_commit
-from drake_clutter.runner import map_ordered
+from drake_clutter.workers.mapping import map_ordered
 
 RECORD = Path(__file__).parent / "results" / "behavior_hashes.json"
 EXPLORERS, GENERATORS = ("student", "largest-clear"), ("random", "sg-star")
