@@ -1,0 +1,108 @@
+"""Compare two installations of Drake: verdicts of the same scenes, and what a settle, a step and an episode cost.
+
+Each installation writes its own file, with the interpreter of its environment; it needs no PyTorch. Then the files are
+compared:
+
+    python benchmarks/drake_versions.py measure --out benchmarks/results/drake_versions/1.51.json
+    python benchmarks/drake_versions.py compare benchmarks/results/drake_versions/*.json
+
+Scenes are laid out by the random generator under a fixed seed, 25 nodes each: about half of them are stable.
+"""
+
+import json
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.commands.explore import explore
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.judge import DrakeJudge
+
+SEED, NODES = 3200, 25
+"""Of the generated scenes."""
+EPISODES = ("sg_star_15", (1, 3, 5), "largest-clear")
+"""Frozen set, scenes in it, and the explorer of the timed episodes, which the arm carries out."""
+
+app = typer.Typer(no_args_is_help=True)
+
+
+def _frozen(number: int, config: ClutterConfig) -> Scene:
+    held = load_scene_set(shipped_path(f"training/scenes/{EPISODES[0]}.json"), load_catalogue())
+    return held.settled(number, held.grammar, config)
+
+
+@app.command()
+def measure(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="JSON to write.")],
+    count: Annotated[int, typer.Option(min=1, help="Scenes to judge.")] = 300,
+) -> None:
+    """Judge scenes and time settles and arm episodes with the Drake of this interpreter."""
+    config = ClutterConfig()
+    generator = SceneGenerator(GenerationJob("random", "ycb7", None, NODES, SEED, config))
+    judge = DrakeJudge(config)
+    verdicts, seconds = list[dict[str, Any]](), list[float]()
+    for index in track(range(count), "verdicts", console=Console(stderr=True)):
+        rng = item_rng(SEED, index)
+        scene, _ = generator.lay_out(rng)
+        start = time.perf_counter()
+        verdict = judge.judge(scene, rng)
+        seconds.append(time.perf_counter() - start)
+        why = verdict.instability.reason.value if verdict.instability else ""
+        verdicts.append({"stable": verdict.stable, "reason": why, "hidden": list(verdict.hidden)})
+    episodes = list[dict[str, Any]]()
+    for number in track(EPISODES[1], "episodes", console=Console(stderr=True)):
+        start = time.perf_counter()
+        task = explore(_frozen(number, config), EPISODES[2], "arm", 20, number, config, lambda _: None)
+        episodes.append({"scene": number, "moves": len(task.steps), "seconds": time.perf_counter() - start})
+    write_json(
+        out,
+        {
+            "python": platform.python_version(),
+            "drake": version("drake"),
+            "numpy": version("numpy"),
+            "seed": SEED,
+            "nodes": NODES,
+            "count": count,
+            "settle_seconds": {"median": float(np.median(seconds)), "mean": float(np.mean(seconds))},
+            "episodes": episodes,
+            "episode_seconds_per_move": sum(e["seconds"] for e in episodes) / sum(e["moves"] for e in episodes),
+            "verdicts": verdicts,
+        },
+    )
+
+
+@app.command()
+def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measure` wrote; the first is the reference.")]) -> None:
+    """Print how often verdicts agree with those of the first file, and what things cost."""
+    reference, *others = found = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+    table = Table("Drake", "Python", "stable", "same stable", "same hidden", "settle, median s", "arm, s per move")
+    for one in found:
+        pairs = list(zip(reference["verdicts"], one["verdicts"], strict=True))
+        same = np.mean([a["stable"] == b["stable"] for a, b in pairs])
+        both = [(a, b) for a, b in pairs if a["stable"] and b["stable"]]
+        hidden = np.mean([a["hidden"] == b["hidden"] for a, b in both])
+        stable = np.mean([verdict["stable"] for verdict in one["verdicts"]])
+        numbers = (f"{stable:.3f}", f"{same:.4f}", f"{hidden:.4f}")
+        costs = (f"{one['settle_seconds']['median']:.3f}", f"{one['episode_seconds_per_move']:.2f}")
+        table.add_row(one["drake"], one["python"], *numbers, *costs)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    with told_in_one_line():
+        app()
