@@ -1,6 +1,7 @@
 """A robot's model file, SDF or URDF: where it is, whether it is whole, and its limits of torque."""
 
 import math
+import re
 from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,6 +15,8 @@ from drake_clutter.resources import shipped_path
 
 PACKAGE = "drake_clutter_models"
 """Name of the package whose files ship as `models/`."""
+_DRAKE = "drake.mit.edu"
+"""Namespace of Drake's own elements and attributes."""
 
 
 def model_path(model: str) -> Path:
@@ -26,7 +29,8 @@ def model_path(model: str) -> Path:
         InputError: There is no such file, or it is neither SDF nor URDF.
     """
     prefix = f"package://{PACKAGE}/"
-    path = shipped_path("models") / model.removeprefix(prefix) if model.startswith(prefix) else Path(model)
+    shipped, inside = model.startswith(prefix), model.removeprefix(prefix)
+    path = shipped_path("models") / inside if shipped else Path(model)
     if not path.is_file() or path.suffix not in (".sdf", ".urdf"):
         raise InputError(f"robot.model: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
     return path
@@ -40,9 +44,11 @@ def package_map(path: Path) -> PackageMap:
     """
     packages = PackageMap()
     packages.PopulateFromRosPackagePath()
-    above = [folder / "package.xml" for folder in path.parents if (folder / "package.xml").is_file()]
-    for package in (*above[:1], shipped_path("models/package.xml")):
-        packages.AddPackageXml(str(package))
+    above = (folder / "package.xml" for folder in path.parents)
+    found = next((package for package in above if package.is_file()), None)
+    for package in (found, shipped_path("models/package.xml")):
+        if package is not None:
+            packages.AddPackageXml(str(package))
     return packages
 
 
@@ -59,11 +65,7 @@ def model_text(path: Path, *, visuals: bool) -> str:
     Raises:
         InputError: The file is not XML, or a mesh that it names is missing.
     """
-    ElementTree.register_namespace("drake", "drake.mit.edu")  # else the prefix is renamed, and Drake no longer knows it
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: is not XML ({error}); allowed is an SDF or URDF model") from error
+    root = _root(path)
     for link in root.iter("link"):
         for visual in () if visuals else link.findall("visual"):
             link.remove(visual)
@@ -74,6 +76,17 @@ def model_text(path: Path, *, visuals: bool) -> str:
         elif filename := mesh.get("filename"):
             mesh.set("filename", _mesh_file(path, filename, packages).as_uri())
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _root(path: Path) -> ElementTree.Element:
+    ElementTree.register_namespace("drake", _DRAKE)  # else the prefix is renamed
+    try:
+        text = path.read_text(encoding="utf-8")
+        if "drake:" in text and _DRAKE not in text:  # as in many a URDF, which Drake accepts
+            text = re.sub(r"<(robot|sdf)\b", rf'<\1 xmlns:drake="{_DRAKE}"', text, count=1)
+        return ElementTree.fromstring(text)
+    except (OSError, ValueError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: is not XML ({error}); allowed is an SDF or URDF") from error
 
 
 def _mesh_file(path: Path, uri: str, packages: PackageMap) -> Path:
@@ -99,7 +112,8 @@ def parse_model(plant: MultibodyPlant, model: str, *, visuals: bool) -> ModelIns
     try:
         instances = Parser(plant).AddModelsFromString(text, path.suffix.removeprefix("."))
     except RuntimeError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}; allowed is a model that Drake can read") from error
+        words = " ".join(str(error).split())
+        raise InputError(f"{path}: {words}; allowed is a model that Drake reads") from error
     if len(instances) != 1:
         raise InputError(f"{path}: holds {len(instances)} models; allowed is one")
     return instances[0]
@@ -113,7 +127,7 @@ def torque_limits(path: Path) -> dict[str, float]:
     a value, or with 0, is missing here.
     """
     found = {}
-    for joint in ElementTree.parse(path).getroot().iter("joint"):
+    for joint in _root(path).iter("joint"):
         limit = joint.find("limit") if joint.find("limit") is not None else joint.find("axis/limit")
         text = None if limit is None else limit.get("effort") or limit.findtext("effort")
         if text is not None and 0 < float(text) < math.inf:

@@ -6,25 +6,16 @@ Frames: T the support; B the robot's base; F its flange, z out of the arm.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-)
+from pydrake.math import RigidTransform
 
 from drake_clutter.cell import kinematics
 from drake_clutter.cell.inverse_kinematics import InverseKinematics, UrInverseKinematics
 from drake_clutter.cell.joint_range import JointRange
-from drake_clutter.cell.model_file import model_path, parse_model, torque_limits
 from drake_clutter.cell.numerical_ik import NumericalInverseKinematics
+from drake_clutter.cell.parsed_arm import ParsedArm, parse_arm
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.serial_chain import SerialChain
 from drake_clutter.cell.ur_fit import UrFit, fit_ur
@@ -102,7 +93,9 @@ class RobotModel:
 
     def manipulability(self, q: Floats) -> Floats:
         """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985); 0 if singular."""
-        return self.chain.manipulability(q) if self.ur is None else kinematics.manipulability(q, self.ur.parameters)
+        if self.ur is None:
+            return self.chain.manipulability(q)
+        return kinematics.manipulability(q, self.ur.parameters)
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
         """Return the equivalents of q nearest to a reference, (..., n), see `JointRange`."""
@@ -116,145 +109,90 @@ def load_robot(spec: RobotSpec) -> RobotModel:
     Raises:
         InputError: The model is not whole or does not fit the specification, or a limit is missing.
     """
-    path = model_path(spec.model)
-    plant = MultibodyPlant(0.0)
-    instance = parse_model(plant, spec.model, visuals=False)
-    moving = _weld_and_order(plant, instance, spec, path)
-    plant.Finalize()
-    count = len(moving)
-    joints = JointRange(_positions(spec, moving), np.array([isinstance(j, RevoluteJoint) for j in moving]))
-    home = np.array(spec.home)
-    if len(home) != count:
-        raise InputError(f"robot.home: {len(home)} values; allowed is {count}, one for each joint of {path.name}")
-    for joint, q, (lower, upper) in zip(moving, home, joints.limits, strict=True):
-        if not lower <= q <= upper:
-            raise InputError(f"robot.home: {q:g} for {joint.name()}; allowed is from {lower:g} to {upper:g}")
-    torques = torque_limits(path)
-    chain = _chain(plant, instance, moving, spec)
-    fit = _fitted(spec, chain, path) if spec.ik == "ur" else None
-    ik: InverseKinematics = NumericalInverseKinematics(chain, joints, home)
+    arm = parse_arm(spec)
+    joints = JointRange(_position_limits(spec, arm), arm.revolute)
+    home = _home(spec, arm, joints)
+    unlimited, jerk = [np.inf] * len(arm.joints), spec.limits.jerk
+    fit = _fitted(arm) if spec.ik == "ur" else None
+    ik: InverseKinematics = NumericalInverseKinematics(arm.chain, joints, home)
     if fit is not None:
         ik = UrInverseKinematics(fit.parameters, joints, _inverse(fit.X_B0), _inverse(fit.X_6F))
     return RobotModel(
         spec,
-        tuple(joint.name() for joint in moving),
+        tuple(joint.name() for joint in arm.joints),
         joints,
-        _limits(spec, moving, "velocity", [float(joint.velocity_upper_limits()[0]) for joint in moving]),
-        _limits(spec, moving, "acceleration", [np.inf] * count),
-        _limits(spec, moving, "jerk", [np.inf] * count) if spec.limits.jerk else np.full(count, np.inf),
-        _limits(spec, moving, "torque", [torques.get(joint.name(), np.inf) for joint in moving]),
+        _limits("velocity", spec.limits.velocity, arm, arm.limits["velocity"]),
+        _limits("acceleration", spec.limits.acceleration, arm, unlimited),
+        np.array(unlimited) if jerk is None else _limits("jerk", jerk, arm, unlimited),
+        _limits("torque", spec.limits.torque, arm, arm.limits["torque"]),
         home,
-        _moved_by(plant, instance, moving),
-        chain,
+        arm.links,
+        arm.chain,
         fit,
         ik,
         _UR_VERTICAL if fit is not None and _upright(spec, fit) else None,
     )
 
 
-def _weld_and_order(plant: MultibodyPlant, instance: ModelInstanceIndex, spec: RobotSpec, path: Path) -> list[Joint]:
-    """Weld the base to the world, and return the joints from base to flange."""
-    bodies = {plant.get_body(index).name(): plant.get_body(index) for index in plant.GetBodyIndices(instance)}
-    above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
-    roots = [name for name in bodies if name not in above]
-    if spec.base_link not in roots:
-        names = ", ".join(roots) or "a link that no joint fixes to the world"
-        raise InputError(f"robot.base_link: {spec.base_link!r} in {path.name}; allowed is {names}")
-    if not plant.HasFrameNamed(spec.tool_frame, instance):
-        names = ", ".join(plant.get_frame(index).name() for index in plant.GetFrameIndices(instance))
-        raise InputError(f"robot.tool_frame: {spec.tool_frame!r} in {path.name}; allowed are {names}")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(spec.base_link, instance), spec.X_TB)
-    chain = _up_to_base(plant.GetFrameByName(spec.tool_frame, instance).body(), above)[::-1]
-    moving = [joint for joint in chain if joint.num_positions()]
-    for joint in _joints(plant, instance):
-        if joint.num_positions() and joint not in moving:
-            raise InputError(
-                f"{path}: joint {joint.name()!r} does not move the tool frame; allowed is an arm without other joints"
-            )
-        if joint.num_positions() and not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
-            raise InputError(f"{path}: joint {joint.name()!r} is {joint.type_name()}; allowed are revolute and prismatic joints")
-    if not moving:
-        raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is a frame that joints move")
-    return moving
+def _home(spec: RobotSpec, arm: ParsedArm, joints: JointRange) -> Floats:
+    home = np.array(spec.home)
+    _check_length("home", len(home), arm)
+    for joint, q, (lower, upper) in zip(arm.joints, home, joints.limits, strict=True):
+        if not lower <= q <= upper:
+            bounds = f"from {lower:g} to {upper:g}"
+            raise InputError(f"robot.home: {q:g} for joint {joint.name()!r}; allowed is {bounds}")
+    return home
 
 
-def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
-    return [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
-
-
-def _up_to_base(body: RigidBody, above: Mapping[str, Joint]) -> list[Joint]:
-    found = []
-    while (joint := above.get(body.name())) is not None:
-        found.append(joint)
-        body = joint.parent_body()
+def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
+    """Return the limits of position (n, 2), the cell's over the model's."""
+    found = np.column_stack([arm.limits["lower"], arm.limits["upper"]])
+    if spec.limits.position is not None:
+        _check_length("limits.position", len(spec.limits.position), arm)
+        found = np.array(spec.limits.position)
+    for joint, (lower, upper) in zip(arm.joints, found, strict=True):
+        if not np.isfinite([lower, upper]).all():
+            raise _missing("position", joint.name())
+        if not lower < upper:
+            given = f"robot.limits.position: {lower:g}, {upper:g} for joint {joint.name()!r}"
+            raise InputError(f"{given}; allowed is the least, then the greatest")
     return found
 
 
-def _positions(spec: RobotSpec, moving: list[Joint]) -> Floats:
-    """Return the limits of position (n, 2), the cell's over the model's."""
-    given = [[float(j.position_lower_limits()[0]), float(j.position_upper_limits()[0])] for j in moving]
-    if spec.limits.position is not None:
-        _check_length("position", spec.limits.position, moving)
-        given = [list(pair) for pair in spec.limits.position]
-    for joint, (lower, upper) in zip(moving, given, strict=True):
-        if not np.isfinite([lower, upper]).all():
-            raise _without(joint, "position")
-        if not lower < upper:
-            raise InputError(f"robot.limits.position: {lower:g} to {upper:g} for {joint.name()}; allowed is the least first")
-    return np.array(given)
-
-
-def _limits(spec: RobotSpec, moving: list[Joint], kind: str, of_the_model: list[float]) -> Floats:
+def _limits(
+    kind: str,
+    given: tuple[float, ...] | None,
+    arm: ParsedArm,
+    of_model: list[float],
+) -> Floats:
     """Return limits (n,), the cell's over the model's."""
-    given = getattr(spec.limits, kind)
     if given is not None:
-        _check_length(kind, given, moving)
+        _check_length(f"limits.{kind}", len(given), arm)
         return np.array(given)
-    for joint, limit in zip(moving, of_the_model, strict=True):
+    for joint, limit in zip(arm.joints, of_model, strict=True):
         if not 0 < limit < np.inf:
-            raise _without(joint, kind)
-    return np.array(of_the_model)
+            raise _missing(kind, joint.name())
+    return np.array(of_model)
 
 
-def _check_length(kind: str, given: tuple[object, ...], moving: list[Joint]) -> None:
-    if len(given) != len(moving):
-        names = ", ".join(joint.name() for joint in moving)
-        raise InputError(f"robot.limits.{kind}: {len(given)} values; allowed is {len(moving)} values, for {names}")
+def _check_length(field: str, length: int, arm: ParsedArm) -> None:
+    if length != len(arm.joints):
+        names = ", ".join(joint.name() for joint in arm.joints)
+        allowed = f"{len(arm.joints)} values, for {names}"
+        raise InputError(f"robot.{field}: {length} values; allowed is {allowed}")
 
 
-def _without(joint: Joint, kind: str) -> InputError:
-    missing = f"robot.limits.{kind}: is missing for joint {joint.name()!r}"
-    return InputError(f"{missing}; allowed is a value for each joint, here or in the model file")
+def _missing(kind: str, joint: str) -> InputError:
+    allowed = "a value for each joint, here or in the model file"
+    return InputError(f"robot.limits.{kind}: is missing for joint {joint!r}; allowed is {allowed}")
 
 
-def _chain(plant: MultibodyPlant, instance: ModelInstanceIndex, moving: list[Joint], spec: RobotSpec) -> SerialChain:
-    """Return the transforms between the joints' axes, each turned so that its axis is z."""
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, np.zeros(plant.num_positions()))
-    fixed, before, X_from = [], plant.GetFrameByName(spec.base_link, instance), RigidTransform()
-    for joint in moving:
-        turning = isinstance(joint, RevoluteJoint)
-        axis = joint.revolute_axis() if turning else joint.translation_axis()
-        R = RotationMatrix() if axis[2] == 1.0 else RotationMatrix.MakeFromOneVector(axis, 2)
-        X = plant.CalcRelativeTransform(context, before, joint.frame_on_parent())
-        fixed.append((X_from.inverse() @ X @ RigidTransform(R)).GetAsMatrix4())
-        before, X_from = joint.frame_on_child(), RigidTransform(R)
-    X = plant.CalcRelativeTransform(context, before, plant.GetFrameByName(spec.tool_frame, instance))
-    fixed.append((X_from.inverse() @ X).GetAsMatrix4())
-    return SerialChain(np.array(fixed), np.array([isinstance(joint, RevoluteJoint) for joint in moving]))
-
-
-def _moved_by(plant: MultibodyPlant, instance: ModelInstanceIndex, moving: list[Joint]) -> dict[str, int]:
-    above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
-    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
-    return {body.name(): sum(joint in moving for joint in _up_to_base(body, above)) for body in bodies}
-
-
-def _fitted(spec: RobotSpec, chain: SerialChain, path: Path) -> UrFit:
-    fit = fit_ur(chain) if chain.num_joints == 6 and chain.revolute.all() else None
+def _fitted(arm: ParsedArm) -> UrFit:
+    fit = fit_ur(arm.chain) if len(arm.joints) == 6 and arm.revolute.all() else None
     if fit is None or not fit.error < _FITS:
-        off = f"{chain.num_joints} joints" if fit is None else f"off by {fit.error:.2g} m"
-        raise InputError(f"robot.ik: 'ur', but {path.name} is no arm of the UR family ({off}); allowed is 'numerical'")
+        off = f"{len(arm.joints)} joints" if fit is None else f"off by {fit.error:.2g} m"
+        what = f"{arm.path.name} is no arm of the UR family: {off}"
+        raise InputError(f"robot.ik: 'ur' ({what}); allowed is 'numerical'")
     return fit
 
 
@@ -264,6 +202,7 @@ def _inverse(X: Floats | None) -> Floats | None:
 
 def _upright(spec: RobotSpec, fit: UrFit) -> bool:
     """Whether the first axis is vertical and the tool's axis that of the last joint."""
-    X_T0 = spec.X_TB.GetAsMatrix4() if fit.X_B0 is None else spec.X_TB.GetAsMatrix4() @ fit.X_B0
-    along = np.eye(4) if fit.X_6F is None else fit.X_6F
-    return bool(abs(X_T0[2, 2]) > 1 - 1e-12 and abs(along[2, 2]) > 1 - 1e-12)
+    X_TB = spec.X_TB.GetAsMatrix4()
+    X_T0 = X_TB if fit.X_B0 is None else X_TB @ fit.X_B0
+    along = 1.0 if fit.X_6F is None else fit.X_6F[2, 2]
+    return bool(min(abs(X_T0[2, 2]), abs(along)) > 1 - 1e-12)

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.cell.model_file import parse_model
@@ -47,17 +47,27 @@ def add_robot(plant: MultibodyPlant, robot: RobotModel, *, visuals: bool) -> Mod
     return instance
 
 
-def filter_collisions(plant: MultibodyPlant, scene_graph: SceneGraph, robot: RobotModel, instance: ModelInstanceIndex) -> None:
+def filter_collisions(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    robot: RobotModel,
+    instance: ModelInstanceIndex,
+) -> None:
     """Leave out what cannot collide, once everything that stands in the cell is registered.
 
     That is `unmeeting_links`, and what the first joint turns in place against the surroundings.
     """
-    of = {name: GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, instance))) for name in robot.links}
-    world = GeometrySet(plant.GetCollisionGeometriesForBody(plant.world_body()))
-    excluded = [(of[first], of[second]) for first, second in unmeeting_links(robot)]
-    excluded += [(of[name], world) for name, moved_by in robot.links.items() if moved_by <= 1]
+
+    def shapes(body: RigidBody) -> GeometrySet:
+        return GeometrySet(plant.GetCollisionGeometriesForBody(body))
+
+    bodies = {name: plant.GetBodyByName(name, instance) for name in robot.links}
+    on_base = [bodies[name] for name, moved_by in robot.links.items() if moved_by <= 1]
+    excluded = [(plant.world_body(), body) for body in on_base]
+    excluded += [(bodies[first], bodies[second]) for first, second in unmeeting_links(robot)]
+    filters = scene_graph.collision_filter_manager()
     for first, second in excluded:
-        scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeBetween(first, second))
+        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(shapes(first), shapes(second)))
 
 
 @lru_cache(maxsize=32)
@@ -65,7 +75,7 @@ def unmeeting_links(robot: RobotModel) -> tuple[tuple[str, str], ...]:
     """Return pairs of links that are not checked for collision with each other.
 
     Those are neighbors, and links two joints apart of which the outlines overlap in most of all
-    configurations, or in none (the classes "default" and "never" of MoveIt's self-collision matrix).
+    configurations, or in none (classes "default" and "never" of MoveIt's self-collision matrix).
     """
     pairs = list(combinations(robot.links, 2))
     between = {pair: abs(robot.links[pair[0]] - robot.links[pair[1]]) for pair in pairs}
@@ -99,7 +109,7 @@ def _overlaps(robot: RobotModel) -> Counter[frozenset[str]]:
         query = plant.get_geometry_query_input_port().Eval(context)
         touching = set()
         for pair in query.ComputePointPairPenetration():
-            bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in (pair.id_A, pair.id_B)]
-            touching.add(frozenset(body.name() for body in bodies))
+            frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
+            touching.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
         found.update(touching)
     return found

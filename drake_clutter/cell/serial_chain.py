@@ -32,11 +32,12 @@ class SerialChain:
     def forward_kinematics(self, q: Floats) -> Floats:
         """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
         q = np.asarray(q, float)
-        poses = _poses(self.fixed, self.revolute, np.ascontiguousarray(q).reshape(-1, self.num_joints))
+        rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
+        poses = _poses(self.fixed, self.revolute, rows)
         return np.asarray(poses.reshape(*q.shape[:-1], 4, 4))
 
     def joint_frames(self, q: Floats) -> Floats:
-        """Return the joints' frames in B, z along their axes, and X_BF, (n + 1, 4, 4), at q (n,)."""
+        """Return the joints' frames in B, z along the axes, and X_BF, (n + 1, 4, 4), at q (n,)."""
         frames = np.empty((self.num_joints + 1, 4, 4))
         chain_frames(self.fixed, self.revolute, np.ascontiguousarray(q, float), frames)
         return frames
@@ -50,7 +51,8 @@ class SerialChain:
     def manipulability(self, q: Floats) -> Floats:
         """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985)."""
         q = np.asarray(q, float)
-        worth = _manipulability(self.fixed, self.revolute, np.ascontiguousarray(q).reshape(-1, self.num_joints))
+        rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
+        worth = _manipulability(self.fixed, self.revolute, rows)
         return np.asarray(worth.reshape(q.shape[:-1]))
 
 

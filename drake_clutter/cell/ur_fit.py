@@ -58,7 +58,8 @@ def fit_ur(chain: SerialChain) -> UrFit:
     parameters = DenavitHartenberg((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), alpha)
     X_6F = np.linalg.inv(X_B0 @ forward_kinematics(np.zeros(6), parameters)) @ frames[6]
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, 6))
-    error = np.abs(X_B0 @ forward_kinematics(q, parameters) @ X_6F - chain.forward_kinematics(q)).max()
+    closed = X_B0 @ forward_kinematics(q, parameters) @ X_6F
+    error = np.abs(closed - chain.forward_kinematics(q)).max()
     usable = min(abs(a2), abs(a3), abs(d6)) > 1e-3
     return UrFit(
         parameters,
