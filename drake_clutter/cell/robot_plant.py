@@ -3,7 +3,7 @@
 Frames: T the support, which is the world; B the robot's base.
 """
 
-from collections import Counter
+from collections import defaultdict
 from functools import lru_cache
 from itertools import combinations
 
@@ -18,6 +18,8 @@ from drake_clutter.cell.robot_model import RobotModel
 
 _SAMPLES = 200
 """Configurations at which links two joints apart are looked at."""
+_NEXT = 0.01
+"""Outlines that are no further apart are next to each other [m]."""
 
 
 def add_robot(plant: MultibodyPlant, robot: RobotModel, *, visuals: bool) -> ModelInstanceIndex:
@@ -74,23 +76,23 @@ def filter_collisions(
 def unmeeting_links(robot: RobotModel) -> tuple[tuple[str, str], ...]:
     """Return pairs of links that are not checked for collision with each other.
 
-    Those are neighbors, and links two joints apart of which the outlines overlap in most of all
-    configurations, or in none (classes "default" and "never" of MoveIt's self-collision matrix).
+    Those are neighbors, and links two joints apart of which the outlines overlap in no configuration,
+    or are next to each other in most: the capsules meet there, and the links do not (classes "never"
+    and "default" of MoveIt's self-collision matrix).
     """
     pairs = list(combinations(robot.links, 2))
     between = {pair: abs(robot.links[pair[0]] - robot.links[pair[1]]) for pair in pairs}
-    overlaps = _overlaps(robot)
+    distances = _distances(robot)
     found = [pair for pair in pairs if between[pair] <= 1]
     for pair in pairs:
-        if between[pair] == 2:
-            share = overlaps[frozenset(pair)] / _SAMPLES
-            if share == 0 or share > 0.5:
-                found.append(pair)
+        near = np.array(distances[frozenset(pair)])
+        if between[pair] == 2 and (not (near < 0).any() or len(near) > _SAMPLES / 2):
+            found.append(pair)
     return tuple(found)
 
 
-def _overlaps(robot: RobotModel) -> Counter[frozenset[str]]:
-    """Return in how many random configurations the outlines of two links overlap."""
+def _distances(robot: RobotModel) -> dict[frozenset[str], list[float]]:
+    """Return distances of two links, where less than `_NEXT`, in random configurations."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     instance = add_robot(plant, robot, visuals=False)
@@ -101,15 +103,17 @@ def _overlaps(robot: RobotModel) -> Counter[frozenset[str]]:
     inspector = scene_graph.model_inspector()
     joints = [plant.GetJointByName(name, instance) for name in robot.joint_names]
     lower, upper = robot.position_limits.T
-    found: Counter[frozenset[str]] = Counter()
+    found = defaultdict[frozenset[str], list[float]](list)
     for q in np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, robot.num_joints)):
         positions = np.zeros(robot.num_joints)
         positions[[joint.position_start() for joint in joints]] = q
         plant.SetPositions(context, positions)
         query = plant.get_geometry_query_input_port().Eval(context)
-        touching = set()
-        for pair in query.ComputePointPairPenetration():
+        least = defaultdict[frozenset[str], float](lambda: _NEXT)
+        for pair in query.ComputeSignedDistancePairwiseClosestPoints(_NEXT):
             frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
-            touching.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
-        found.update(touching)
+            names = frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames)
+            least[names] = min(least[names], pair.distance)
+        for names, distance in least.items():
+            found[names].append(distance)
     return found
