@@ -10,6 +10,7 @@ from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
+from drake_clutter.cell.stl import stl_as_obj
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 
@@ -98,7 +99,8 @@ def _mesh_file(path: Path, uri: str, packages: PackageMap) -> Path:
         file = Path(rest) if scheme == "file" else path.parent / uri
     if not file.is_file():
         raise InputError(f"{path}: mesh: {uri!r} is missing; allowed is a file")
-    return file.resolve()
+    file = file.resolve()
+    return stl_as_obj(file) if file.suffix.lower() == ".stl" else file
 
 
 def parse_model(plant: MultibodyPlant, model: str, *, visuals: bool) -> ModelInstanceIndex:

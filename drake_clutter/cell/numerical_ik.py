@@ -97,11 +97,28 @@ class NumericalInverseKinematics:
         return self.chain.fixed, self.chain.revolute, self.joints.limits, self.home
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
-        """Return the rows of q_to nearest to those of q_from, see `InverseKinematics`."""
-        near = self.joints.unwrap(q_to[..., None, :, :], q_from[..., :, None, :])
-        apart = np.abs(near - q_from[..., :, None, :]).max(axis=-1)
-        nearest = np.where(np.isnan(apart), np.inf, apart).argmin(axis=-1)
-        return np.asarray(np.take_along_axis(q_to, nearest[..., None], axis=-2))
+        """Return solutions near to q_from at the poses of q_to, see `InverseKinematics`.
+
+        Each is what iterations that start at a row of q_from lead to, or a row of q_to if that is
+        nearer; so a redundant arm need not change its posture from pose to pose.
+        """
+        start, given = np.broadcast_arrays(q_from, q_to)
+        rows = start.shape[-2:]
+        start, given = start.reshape(-1, *rows), given.reshape(-1, *rows)
+        there = np.isfinite(given[..., 0]).any(axis=-1)
+        found = np.full(start.shape, np.nan)
+        which = np.isfinite(given[..., 0]).argmax(axis=-1)
+        X_BF = self.chain.forward_kinematics(given[np.arange(len(given)), which])
+        for k in np.flatnonzero(there):
+            near = _from_starts(*self._arm, X_BF[k], np.ascontiguousarray(start[k]))
+            for row in np.flatnonzero(np.isfinite(start[k, :, 0])):
+                choice = np.vstack([near[row], given[k]])
+                found[k, row] = self._nearest(choice, start[k, row])
+        return found.reshape(np.broadcast_shapes(q_from.shape, q_to.shape))
+
+    def _nearest(self, choice: Floats, q: Floats) -> Floats:
+        apart = np.abs(self.joints.unwrap(choice, q) - q).max(axis=-1)
+        return np.asarray(choice[np.nanargmin(apart)])
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
         """Return the path that goes on from q_start step by step, see `InverseKinematics`."""
@@ -111,10 +128,12 @@ class NumericalInverseKinematics:
         return path if on_the_way else None
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
-        """Return the solution that is nearest to q, see `InverseKinematics`."""
-        found = self.joints.unwrap(self.solve(X_BF), q)
-        apart = np.abs(found - q).max(axis=-1)
-        return None if np.isnan(apart).all() else np.asarray(found[np.nanargmin(apart)])
+        """Return a solution near to q, see `InverseKinematics`."""
+        near = _from_starts(*self._arm, np.ascontiguousarray(X_BF, float), q[None].copy())
+        choice = np.vstack([near, self.solve(X_BF)])
+        if np.isnan(choice).all():
+            return None
+        return self.joints.unwrap(self._nearest(choice, q), q)
 
 
 @njit(cache=True)
@@ -224,6 +243,16 @@ def _solutions(fixed, revolute, limits, home, X, starts):  # type: ignore[no-unt
                 count += 1
                 if count == SOLUTIONS:
                     break
+    return found
+
+
+@njit(cache=True)
+def _from_starts(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
+    """Return where iterations from starts (K, n) lead; NaN where they do not reach X (4, 4)."""
+    found = starts.copy()
+    for k in range(len(starts)):
+        if not _reached(fixed, revolute, limits, home, X, found[k], 0):
+            found[k] = np.nan
     return found
 
 

@@ -85,7 +85,7 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
         InputError: The file is not whole, has no such base or flange, or is not a serial arm.
     """
     path, plant = model_path(spec.model), MultibodyPlant(0.0)
-    instance = parse_model(plant, spec.model, visuals=False)
+    instance = parse_model(plant, spec.model, visuals=True)  # so that each mesh is looked for
     above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
     roots = [body.name() for body in bodies if body.name() not in above]
