@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.joint_range import JointRange
-from drake_clutter.cell.kinematics import DenavitHartenberg, branches, forward_kinematics
+from drake_clutter.cell.kinematics import DenavitHartenberg, branch_of, branches
 
 Floats = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class UrInverseKinematics:
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
         """Return the branch of q_start along poses, see `InverseKinematics`."""
-        q = self.solve(X_BF)[:, self._branch(q_start)]
+        q = self.solve(X_BF)[:, branch_of(q_start, self.parameters)]
         if not np.isfinite(q).all():
             return None
         q[0] = q_start
@@ -116,10 +116,6 @@ class UrInverseKinematics:
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
         """Return the branch of q at a pose, see `InverseKinematics`."""
-        found = self.joints.unwrap(self.solve(X_BF)[self._branch(q)], q)
+        q_branch = self.solve(X_BF)[branch_of(q, self.parameters)]
+        found = self.joints.unwrap(q_branch, q)
         return found if np.isfinite(found).all() else None
-
-    def _branch(self, q: Floats) -> int:
-        X_06 = forward_kinematics(q, self.parameters)
-        apart = (branches(X_06, float(q[5]), self.parameters) - q + np.pi) % (2 * np.pi) - np.pi
-        return int(np.nanargmin(np.abs(apart).max(axis=1)))

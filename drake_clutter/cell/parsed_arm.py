@@ -23,6 +23,9 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.serial_chain import SerialChain
 from drake_clutter.files import InputError
 
+_OF_DRAKE = ("__model__", "_parent", "_child")
+"""Ends of the names of frames that Drake's parser adds."""
+
 
 @dataclass(frozen=True, eq=False)
 class ParsedArm:
@@ -94,15 +97,15 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
         raise InputError(f"robot.base_link: {spec.base_link!r}; allowed in {path.name} is {known}")
     if not plant.HasFrameNamed(spec.tool_frame, instance):
         frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
-        known = ", ".join(name for name in frames if name)
+        known = ", ".join(name for name in frames if not name.endswith(_OF_DRAKE))
         given = f"robot.tool_frame: {spec.tool_frame!r}"
         raise InputError(f"{given}; allowed in {path.name} are {known}")
     base = plant.GetFrameByName(spec.base_link, instance)
     flange = plant.GetFrameByName(spec.tool_frame, instance)
     moving = _moving(_up_to_base(flange.body(), above))
-    _check_serial(path, _joints(plant, instance), moving)
     if not moving:
         raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is one that joints move")
+    _check_serial(path, _joints(plant, instance), moving)
     plant.WeldFrames(plant.world_frame(), base)
     plant.Finalize()
     links = {body.name(): len(_moving(_up_to_base(body, above))) for body in bodies}
