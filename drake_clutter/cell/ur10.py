@@ -14,6 +14,7 @@ import math
 from drake_clutter.cell.kinematics import UR10
 from drake_clutter.cell.rods import Rod
 from drake_clutter.cell.ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
+from drake_clutter.cell.ur_family import JOINT_RANGE as JOINT_RANGE
 
 _SHOULDER_SPEED, _SPEED = math.radians(120), math.radians(180)
 LINKS = (
