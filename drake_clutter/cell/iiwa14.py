@@ -3,9 +3,9 @@
 Frames: B the base, z up; L1 to L7 the links, z the axis of the joint before each, placed as in the
 URDF of the Bullet project (`kuka_iiwa/model.urdf` in `pybullet_data`, BSD).
 
-Sources: lengths, ranges, speeds and torques, KUKA, "LBR iiwa 7 R800, LBR iiwa 14 R820,
-Specification"; masses and centers of mass, that URDF, whose meshes the capsules cover. KUKA
-publishes no masses of the links.
+Sources: lengths, ranges and speeds, ROS-Industrial's `lbr_iiwa_14_r820.urdf`, after KUKA's
+specification; torques, from memory of that specification; masses and centers of mass, Bullet's
+URDF, whose meshes the capsules cover. KUKA publishes no masses of the links.
 """
 
 import math
