@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics of the UR10 in closed form, all eight branches at once.
+"""Forward and inverse kinematics of the UR family in closed form, all eight branches at once.
 
 Frames: B the robot's base as its controller has it (z up; the ROS description's is turned by 180 degrees about z), 1 to 6 the
 frames of the Denavit-Hartenberg convention, frame 6 being the tool flange, z out of it.
@@ -80,9 +80,21 @@ def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
     The reach of the wrist in the arm's plane, times the elbow's and the wrist's bend: the determinant of an arm of the UR family.
     """
     _, a2, a3 = parameters.a[:3]
+    return np.asarray(np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * _reach(q, parameters)))
+
+
+def _reach(q: Floats, parameters: DenavitHartenberg) -> Floats:
+    """Return the wrist's coordinate along the arm's plane, (...), at joint angles (..., 6) [m]."""
+    _, a2, a3 = parameters.a[:3]
     in_plane = np.cumsum(q[..., 1:4], axis=-1)
-    reach = a2 * np.cos(in_plane[..., 0]) + a3 * np.cos(in_plane[..., 1]) + parameters.d[4] * np.sin(in_plane[..., 2])
-    return np.asarray(np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * reach))
+    bars = a2 * np.cos(in_plane[..., 0]) + a3 * np.cos(in_plane[..., 1])
+    return np.asarray(bars + parameters.d[4] * np.sin(in_plane[..., 2]))
+
+
+def branch_of(q: Floats, parameters: DenavitHartenberg) -> int:
+    """Return the number of the branch, see `branches`, on which joint angles (6,) are [rad]."""
+    turned_back = _reach(q, parameters) > 0, np.sin(q[4]) < 0, np.sin(q[2]) < 0
+    return int(np.dot(turned_back, (4, 2, 1)))
 
 
 def inverse_kinematics(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:

@@ -1,47 +1,21 @@
-"""The UR10 as a model: masses, limits, outlines. `models/ur10.sdf` is what `ur10_sdf` writes.
+"""The UR10 of the CB series as a model: `models/ur10.sdf` is what `ur_sdf(UR10_ARM)` writes.
 
-Frames: B the base, z up, as in `kinematics`; L1 to L6 the links, L(i) being frame i - 1 of the convention turned by q(i): its z
-is the joint's axis.
+Frames: see `ur_family`.
 
-Sources: masses, centres of mass and torques, Universal Robots, "DH parameters for calculations of kinematics and dynamics" and
-"Max. joint torques"; speeds and ranges, the UR10 data sheet (120 deg/s for the two shoulder joints, 180 deg/s for the others, all
-turn by 360 deg both ways). The outlines' radii and lengths were measured on the collision meshes of ROS-Industrial's
-`ur_description` (BSD), which the capsules cover.
+Sources: masses, centers of mass and torques, Universal Robots, "DH parameters for calculations of
+kinematics and dynamics" and "Max. joint torques"; speeds, the UR10 data sheet (120 deg/s for the
+two shoulder joints, 180 deg/s for the others). The outlines' radii and lengths were measured on the
+collision meshes of ROS-Industrial's `ur_description` (BSD), which the capsules cover. The base's
+mass is assumed.
 """
 
 import math
-from dataclasses import dataclass
 
-import numpy as np
-from scipy.spatial.transform import Rotation
+from drake_clutter.cell.kinematics import UR10
+from drake_clutter.cell.rods import Rod
+from drake_clutter.cell.ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
+from drake_clutter.cell.ur_family import JOINT_RANGE as JOINT_RANGE
 
-from drake_clutter.cell.kinematics import JOINTS, UR10, after_joint
-from drake_clutter.cell.rods import Point, Rod, sdf_link, sdf_pose
-
-
-@dataclass(frozen=True)
-class Link:
-    """A moving link.
-
-    Attributes:
-        name: as in the model.
-        mass: kg.
-        p_DhCm: (3,) m, centre of mass in the frame of the convention that moves with the link.
-        torque: N m, of the joint before it; speed: rad/s.
-        outline: capsules that cover it.
-        looks: cylinders that it is drawn with.
-    """
-
-    name: str
-    mass: float
-    p_DhCm: Point
-    torque: float
-    speed: float
-    outline: tuple[Rod, ...]
-    looks: tuple[Rod, ...]
-
-
-TUBE, JOINT, CAP = "0.75 0.76 0.78 1", "0.58 0.60 0.63 1", "0.36 0.55 0.74 1"
 _SHOULDER_SPEED, _SPEED = math.radians(120), math.radians(180)
 LINKS = (
     Link(
@@ -131,42 +105,11 @@ LINKS = (
         (Rod((0.0, 0.0, 0.0620), (0.0, 0.0, 0.0920), 0.0450, TUBE),),
     ),
 )
-BASE_MASS = 4.0
 BASE_OUTLINE = (Rod((0.0, -0.0247, 0.0091), (0.0, 0.0245, 0.0083), 0.0825),)
 BASE_LOOKS = (Rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.0380), 0.0750, JOINT),)
-JOINT_RANGE = 2 * math.pi
-"""rad, either way."""
+UR10_ARM = UrArm("ur10", UR10, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "drake_clutter.cell.ur10")
 
 
 def ur10_sdf() -> str:
-    """The SDF model, as text. Link `base` is B; frame `flange` is frame 6 of the convention."""
-    parts = [sdf_link("base", "", BASE_MASS, np.array([0.0, 0.0, 0.019]), BASE_OUTLINE, BASE_LOOKS)]
-    parent, X_PL = "base", np.eye(4)
-    for number, (joint, link) in enumerate(zip(JOINTS, LINKS, strict=True)):
-        X_LDh = after_joint(UR10, number)
-        p_LCm = X_LDh[:3, :3] @ np.array(link.p_DhCm) + X_LDh[:3, 3]
-        pose = "\n      " + sdf_pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]), parent)
-        parts.append(sdf_link(link.name, pose, link.mass, p_LCm, link.outline, link.looks))
-        parts.append(f"""
-    <joint name="{joint}" type="revolute">
-      <parent>{parent}</parent>
-      <child>{link.name}</child>
-      <axis>
-        <xyz>0 0 1</xyz>
-        <limit>
-          <lower>{-JOINT_RANGE:.12g}</lower><upper>{JOINT_RANGE:.12g}</upper>
-          <effort>{link.torque:g}</effort><velocity>{link.speed:.6g}</velocity>
-        </limit>
-      </axis>
-    </joint>""")
-        parent, X_PL = link.name, X_LDh
-    return f"""<?xml version="1.0"?>
-<!-- Written by drake_clutter.cell.ur10, which names the sources. -->
-<sdf version="1.10">
-  <model name="ur10">{"".join(parts)}
-    <frame name="flange" attached_to="{parent}">
-      {sdf_pose(X_PL[:3, 3], Rotation.from_matrix(X_PL[:3, :3]))}
-    </frame>
-  </model>
-</sdf>
-"""
+    """Return the SDF model of the UR10, as text."""
+    return ur_sdf(UR10_ARM)

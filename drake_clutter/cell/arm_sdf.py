@@ -1,0 +1,86 @@
+"""A serial arm as an SDF model: base, links on revolute joints, and the frame of the flange."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.cell.rods import Rod, sdf_link, sdf_pose
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmLink:
+    """A link, and for all but the base the joint that moves it about its z.
+
+    Attributes:
+        name: As in the model.
+        mass: [kg].
+        p_LCm: Center of mass in the link's frame [m]. Shape (3,).
+        outline: Capsules that cover it.
+        looks: Cylinders that it is drawn with.
+        joint: Name of the joint before it; "" for the base.
+        X_PL: Pose in the frame of the link before, when the joint is at 0. Shape (4, 4).
+        limit: Greatest angle of the joint either way [rad].
+        torque: Greatest torque of the joint [N m].
+        speed: Greatest speed of the joint [rad/s].
+    """
+
+    name: str
+    mass: float
+    p_LCm: Floats
+    outline: tuple[Rod, ...]
+    looks: tuple[Rod, ...]
+    joint: str = ""
+    X_PL: Floats | None = None
+    limit: float = 0.0
+    torque: float = 0.0
+    speed: float = 0.0
+
+
+def arm_sdf(name: str, written_by: str, links: Sequence[ArmLink], X_LF: Floats) -> str:
+    """Return an arm as SDF text.
+
+    Args:
+        name: Of the model.
+        written_by: Module that has the numbers and names their sources.
+        links: Base first.
+        X_LF: Pose of the frame `flange` in that of the last link. Shape (4, 4).
+    """
+    parts, parent = list[str](), ""
+    for link in links:
+        X, pose = link.X_PL, ""
+        if X is not None:
+            pose = "\n      " + sdf_pose(X[:3, 3], Rotation.from_matrix(X[:3, :3]), parent)
+        parts.append(sdf_link(link.name, pose, link.mass, link.p_LCm, link.outline, link.looks))
+        if link.joint:
+            parts.append(_joint(link, parent))
+        parent = link.name
+    return f"""<?xml version="1.0"?>
+<!-- Written by {written_by}, which names the sources. -->
+<sdf version="1.10">
+  <model name="{name}">{"".join(parts)}
+    <frame name="flange" attached_to="{parent}">
+      {sdf_pose(X_LF[:3, 3], Rotation.from_matrix(X_LF[:3, :3]))}
+    </frame>
+  </model>
+</sdf>
+"""
+
+
+def _joint(link: ArmLink, parent: str) -> str:
+    return f"""
+    <joint name="{link.joint}" type="revolute">
+      <parent>{parent}</parent>
+      <child>{link.name}</child>
+      <axis>
+        <xyz>0 0 1</xyz>
+        <limit>
+          <lower>{-link.limit:.12g}</lower><upper>{link.limit:.12g}</upper>
+          <effort>{link.torque:g}</effort><velocity>{link.speed:.6g}</velocity>
+        </limit>
+      </axis>
+    </joint>"""

@@ -1,0 +1,138 @@
+"""The arm of a model file: its joints from base to flange, its links, and the chain they make."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    Frame,
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+)
+
+from drake_clutter.cell.model_file import model_path, parse_model, torque_limits
+from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.serial_chain import SerialChain
+from drake_clutter.files import InputError
+
+_OF_DRAKE = ("__model__", "_parent", "_child")
+"""Ends of the names of frames that Drake's parser adds."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParsedArm:
+    """An arm alone in a finalized plant, its base in the world's origin.
+
+    Attributes:
+        plant: Of the arm, without geometry.
+        path: The model file.
+        base: Frame B.
+        flange: Frame F.
+        joints: Those that move the flange, from the base on.
+        links: How many of the joints, from the base on, move a link.
+    """
+
+    plant: MultibodyPlant
+    path: Path
+    base: Frame
+    flange: Frame
+    joints: tuple[Joint, ...]
+    links: Mapping[str, int]
+
+    @property
+    def revolute(self) -> NDArray[np.bool_]:
+        """Which joints turn. Shape (n,)."""
+        return np.array([isinstance(joint, RevoluteJoint) for joint in self.joints])
+
+    @property
+    def limits(self) -> Mapping[str, list[float]]:
+        """Limits by kind, in the order of the joints; infinite where there is none."""
+        torques = torque_limits(self.path)
+        return {
+            "lower": [float(joint.position_lower_limits()[0]) for joint in self.joints],
+            "upper": [float(joint.position_upper_limits()[0]) for joint in self.joints],
+            "velocity": [float(joint.velocity_upper_limits()[0]) for joint in self.joints],
+            "torque": [torques.get(joint.name(), np.inf) for joint in self.joints],
+        }
+
+    @cached_property
+    def chain(self) -> SerialChain:
+        """The transforms between the joints' axes, each turned so that its axis is z."""
+        context = self.plant.CreateDefaultContext()
+        self.plant.SetPositions(context, np.zeros(self.plant.num_positions()))
+        fixed, before, X_before = [], self.base, RigidTransform()
+        for joint in self.joints:
+            turns = isinstance(joint, RevoluteJoint)
+            axis = joint.revolute_axis() if turns else joint.translation_axis()
+            R = RotationMatrix() if axis[2] == 1.0 else RotationMatrix.MakeFromOneVector(axis, 2)
+            X = self.plant.CalcRelativeTransform(context, before, joint.frame_on_parent())
+            fixed.append((X_before.inverse() @ X @ RigidTransform(R)).GetAsMatrix4())
+            before, X_before = joint.frame_on_child(), RigidTransform(R)
+        X = self.plant.CalcRelativeTransform(context, before, self.flange)
+        fixed.append((X_before.inverse() @ X).GetAsMatrix4())
+        return SerialChain(np.array(fixed), self.revolute)
+
+
+def parse_arm(spec: RobotSpec) -> ParsedArm:
+    """Read the arm of a model file.
+
+    Raises:
+        InputError: The file is not whole, has no such base or flange, or is not a serial arm.
+    """
+    path, plant = model_path(spec.model), MultibodyPlant(0.0)
+    instance = parse_model(plant, spec.model, visuals=True)  # so that each mesh is looked for
+    above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
+    roots = [body.name() for body in bodies if body.name() not in above]
+    if spec.base_link not in roots:
+        known = ", ".join(roots) or "a link that is not fixed to the world"
+        raise InputError(f"robot.base_link: {spec.base_link!r}; allowed in {path.name} is {known}")
+    if not plant.HasFrameNamed(spec.tool_frame, instance):
+        frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
+        known = ", ".join(name for name in frames if not name.endswith(_OF_DRAKE))
+        given = f"robot.tool_frame: {spec.tool_frame!r}"
+        raise InputError(f"{given}; allowed in {path.name} are {known}")
+    base = plant.GetFrameByName(spec.base_link, instance)
+    flange = plant.GetFrameByName(spec.tool_frame, instance)
+    moving = _moving(_up_to_base(flange.body(), above))
+    if not moving:
+        raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is one that joints move")
+    _check_serial(path, _joints(plant, instance), moving)
+    plant.WeldFrames(plant.world_frame(), base)
+    plant.Finalize()
+    links = {body.name(): len(_moving(_up_to_base(body, above))) for body in bodies}
+    return ParsedArm(plant, path, base, flange, tuple(moving), links)
+
+
+def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
+    return [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+
+
+def _up_to_base(body: RigidBody, above: Mapping[str, Joint]) -> list[Joint]:
+    found = []
+    while (joint := above.get(body.name())) is not None:
+        found.append(joint)
+        body = joint.parent_body()
+    return found[::-1]
+
+
+def _moving(joints: list[Joint]) -> list[Joint]:
+    return [joint for joint in joints if joint.num_positions()]
+
+
+def _check_serial(path: Path, joints: list[Joint], moving: list[Joint]) -> None:
+    for joint in _moving(joints):
+        what = f"{path}: joint {joint.name()!r}"
+        if joint not in moving:
+            raise InputError(f"{what} does not move the tool frame; allowed is an arm alone")
+        if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+            kinds = "revolute, continuous and prismatic joints"
+            raise InputError(f"{what} is of type {joint.type_name()}; allowed are {kinds}")

@@ -1,0 +1,124 @@
+"""Kinematics of any serial arm: fixed transforms between revolute and prismatic joints, compiled.
+
+Frames: B the base; F the flange, z out of the arm.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SerialChain:
+    """An arm as a product of transforms: X_BF = fixed[0] J_1(q_1) fixed[1] ... J_n(q_n) fixed[n].
+
+    Attributes:
+        fixed: Transforms between joints, whose axes are z. Shape (n + 1, 4, 4).
+        revolute: Whether a joint turns about its z; else it moves along it. Shape (n,).
+    """
+
+    fixed: Floats
+    revolute: NDArray[np.bool_]
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, n."""
+        return len(self.revolute)
+
+    def forward_kinematics(self, q: Floats) -> Floats:
+        """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
+        q = np.asarray(q, float)
+        rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
+        poses = _poses(self.fixed, self.revolute, rows)
+        return np.asarray(poses.reshape(*q.shape[:-1], 4, 4))
+
+    def joint_frames(self, q: Floats) -> Floats:
+        """Return the joints' frames in B, z along the axes, and X_BF, (n + 1, 4, 4), at q (n,)."""
+        frames = np.empty((self.num_joints + 1, 4, 4))
+        chain_frames(self.fixed, self.revolute, np.ascontiguousarray(q, float), frames)
+        return frames
+
+    def jacobian(self, q: Floats) -> Floats:
+        """Return w_BF [rad/s] over v_BF [m/s] in B per joint velocity, (6, n), at q (n,)."""
+        J = np.empty((6, self.num_joints))
+        chain_jacobian(self.joint_frames(q), self.revolute, J)
+        return J
+
+    def manipulability(self, q: Floats) -> Floats:
+        """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985)."""
+        q = np.asarray(q, float)
+        rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
+        worth = _manipulability(self.fixed, self.revolute, rows)
+        return np.asarray(worth.reshape(q.shape[:-1]))
+
+
+@njit(cache=True)
+def _times(A, B, C):  # type: ignore[no-untyped-def]
+    """Write the product of two rigid transforms into C, which is neither."""
+    for i in range(3):
+        for j in range(4):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+        C[i, 3] += A[i, 3]
+    C[3, 0] = C[3, 1] = C[3, 2] = 0.0
+    C[3, 3] = 1.0
+
+
+@njit(cache=True)
+def chain_frames(fixed, revolute, q, frames):  # type: ignore[no-untyped-def]
+    """Write the joints' frames, before the joints move, and X_BF into frames (n + 1, 4, 4)."""
+    n = len(revolute)
+    moved = np.empty((4, 4))
+    frames[0] = fixed[0]
+    for k in range(n):
+        moved[:] = frames[k]
+        if revolute[k]:
+            c, s = np.cos(q[k]), np.sin(q[k])
+            for i in range(3):
+                moved[i, 0] = frames[k, i, 0] * c + frames[k, i, 1] * s
+                moved[i, 1] = frames[k, i, 1] * c - frames[k, i, 0] * s
+        else:
+            for i in range(3):
+                moved[i, 3] += frames[k, i, 2] * q[k]
+        _times(moved, fixed[k + 1], frames[k + 1])
+
+
+@njit(cache=True)
+def chain_jacobian(frames, revolute, J):  # type: ignore[no-untyped-def]
+    """Write the Jacobian (6, n) of the last frame, turning first, from the joints' frames."""
+    n = len(revolute)
+    for k in range(n):
+        z0, z1, z2 = frames[k, 0, 2], frames[k, 1, 2], frames[k, 2, 2]
+        if revolute[k]:
+            x = frames[n, 0, 3] - frames[k, 0, 3]
+            y = frames[n, 1, 3] - frames[k, 1, 3]
+            z = frames[n, 2, 3] - frames[k, 2, 3]
+            J[0, k], J[1, k], J[2, k] = z0, z1, z2
+            J[3, k], J[4, k], J[5, k] = z1 * z - z2 * y, z2 * x - z0 * z, z0 * y - z1 * x
+        else:
+            J[0, k] = J[1, k] = J[2, k] = 0.0
+            J[3, k], J[4, k], J[5, k] = z0, z1, z2
+
+
+@njit(cache=True)
+def _poses(fixed, revolute, q):  # type: ignore[no-untyped-def]
+    n = len(revolute)
+    found, frames = np.empty((len(q), 4, 4)), np.empty((n + 1, 4, 4))
+    for k in range(len(q)):
+        chain_frames(fixed, revolute, q[k], frames)
+        found[k] = frames[n]
+    return found
+
+
+@njit(cache=True)
+def _manipulability(fixed, revolute, q):  # type: ignore[no-untyped-def]
+    n = len(revolute)
+    found, frames, J = np.empty(len(q)), np.empty((n + 1, 4, 4)), np.empty((6, n))
+    for k in range(len(q)):
+        chain_frames(fixed, revolute, q[k], frames)
+        chain_jacobian(frames, revolute, J)
+        found[k] = np.sqrt(max(np.linalg.det(J @ J.T), 0.0)) if np.isfinite(q[k]).all() else np.nan
+    return found

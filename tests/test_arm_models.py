@@ -1,0 +1,80 @@
+"""The shipped models of arms: as their modules write them, physical, and covered by capsules."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_clutter.cell import iiwa14
+from drake_clutter.cell.rods import Rod
+from drake_clutter.cell.ur_e_series import E_SERIES, UR3E, UR5E
+from drake_clutter.cell.ur_family import UrArm, ur_sdf
+from drake_clutter.resources import shipped_path
+
+DATA = Path(__file__).parent / "data"
+MODELS = {**{arm.name: ur_sdf(arm) for arm in E_SERIES}, "iiwa14": iiwa14.iiwa14_sdf()}
+
+
+def outlines(arm: UrArm) -> tuple[tuple[Rod, ...], ...]:
+    return arm.base_outline, *(link.outline for link in arm.links)
+
+
+OUTLINES = {"ur3e": outlines(UR3E), "ur5e": outlines(UR5E), "iiwa14": iiwa14.OUTLINES}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_file_is_what_the_module_writes(name: str) -> None:
+    assert shipped_path(f"models/robots/{name}.sdf").read_text() == MODELS[name]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_inertia_is_physical(name: str) -> None:
+    plant = MultibodyPlant(0.0)
+    (instance,) = Parser(plant).AddModels(str(shipped_path(f"models/robots/{name}.sdf")))
+    for index in plant.GetBodyIndices(instance):
+        assert plant.get_body(index).default_spatial_inertia().IsPhysicallyValid()
+
+
+@pytest.mark.parametrize(
+    ("name", "moving", "torques", "speeds_deg"),
+    [
+        ("ur3e", 8.7985, [56, 56, 28, 12, 12, 12], [180, 180, 180, 360, 360, 360]),
+        ("ur5e", 17.7, [150, 150, 150, 28, 28, 28], [180] * 6),
+        ("ur10e", 29.104, [330, 330, 150, 56, 56, 56], [120, 120, 180, 180, 180, 180]),
+        ("ur16e", 27.26, [330, 330, 150, 54, 54, 54], [120, 120, 180, 180, 180, 180]),
+        ("iiwa14", 17.5, [320, 320, 176, 176, 110, 40, 40], [85, 85, 100, 75, 130, 135, 135]),
+    ],
+)
+def test_masses_and_limits_are_the_published_ones(
+    name: str, moving: float, torques: list[float], speeds_deg: list[float]
+) -> None:
+    """Masses of the moving links [kg], torques [N m] and speeds [deg/s] of the joints."""
+    plant = MultibodyPlant(0.0)
+    (instance,) = Parser(plant).AddModels(str(shipped_path(f"models/robots/{name}.sdf")))
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
+    assert sum(body.default_mass() for body in bodies[1:]) == pytest.approx(moving)
+    plant.WeldFrames(plant.world_frame(), bodies[0].body_frame())
+    plant.Finalize()
+    assert plant.GetEffortUpperLimits().tolist() == torques
+    assert np.degrees(plant.GetVelocityUpperLimits()) == pytest.approx(speeds_deg, abs=1e-3)
+
+
+def outside(points: NDArray[np.float64], rod: Rod) -> float:
+    """Return by how much the outermost of some points is outside of a rod [m]."""
+    start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
+    along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
+    away = np.linalg.norm(points - start - along[:, None] * axis, axis=1)
+    return float(away.max() - rod.radius)
+
+
+@pytest.mark.parametrize("name", OUTLINES)
+def test_the_capsules_cover_the_real_links(name: str) -> None:
+    """Each capsule holds the corners of the convex hull of its part, and is not 3 mm too thick."""
+    with np.load(DATA / f"{name}_outline.npz") as corners:
+        for number, rods in enumerate(OUTLINES[name]):
+            for part, rod in enumerate(rods):
+                excess = outside(corners[f"{number}.{part}"] * 1e-5, rod)
+                assert -0.003 < excess <= 0, f"link {number}, capsule {part}"

@@ -1,0 +1,147 @@
+"""What of a robot cannot be used is said in one line: field, value, and what is allowed."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
+
+from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.robot_model import load_robot
+from drake_clutter.files import InputError
+
+JOINTS = ", ".join(robot("ur5e").joint_names)
+SHIPPED = "package://drake_clutter_models/FILE"
+ORDER = "the least, then the greatest"
+PLACES = "a value for each joint, here or in the model file"
+
+
+def changed(spec: RobotSpec, **fields: Any) -> RobotSpec:
+    """The specification with other fields; those of its limits begin with `limits_`."""
+    limits = {k.removeprefix("limits_"): v for k, v in fields.items() if k.startswith("limits_")}
+    others = {k: v for k, v in fields.items() if not k.startswith("limits_")}
+    return spec.model_copy(update={**others, "limits": spec.limits.model_copy(update=limits)})
+
+
+def message(spec: RobotSpec) -> str:
+    with pytest.raises(InputError) as raised:
+        load_robot(spec)
+    text = str(raised.value)
+    assert "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        (
+            {"model": "ur6.sdf"},
+            f"robot.model: 'ur6.sdf'; allowed is an SDF or URDF file, or {SHIPPED}",
+        ),
+        ({"base_link": "foot"}, "robot.base_link: 'foot'; allowed in ur5e.sdf is base"),
+        (
+            {"tool_frame": "hand"},
+            "robot.tool_frame: 'hand'; allowed in ur5e.sdf are base, shoulder, upper_arm, "
+            "forearm, wrist_1, wrist_2, wrist_3, flange",
+        ),
+        ({"tool_frame": "base"}, "robot.tool_frame: 'base'; allowed is one that joints move"),
+        ({"home": (0.0,) * 5}, f"robot.home: 5 values; allowed is 6 values, for {JOINTS}"),
+        (
+            {"home": (0.0, 0.0, 7.0, 0.0, 0.0, 0.0)},
+            "robot.home: 7 for joint 'elbow_joint'; allowed is from -6.28319 to 6.28319",
+        ),
+        (
+            {"limits_velocity": (1.0,) * 7},
+            f"robot.limits.velocity: 7 values; allowed is 6 values, for {JOINTS}",
+        ),
+        (
+            {"limits_jerk": (1.0,)},
+            f"robot.limits.jerk: 1 values; allowed is 6 values, for {JOINTS}",
+        ),
+        (
+            {"limits_position": ((1.0, -1.0),) * 6},
+            f"robot.limits.position: 1, -1 for joint 'shoulder_pan_joint'; allowed is {ORDER}",
+        ),
+    ],
+)
+def test_a_specification_that_does_not_fit_its_model(fields: dict[str, Any], expected: str) -> None:
+    assert message(changed(robot("ur5e").spec, **fields)) == expected
+
+
+def test_a_frame_below_the_last_moving_joint_only(tmp_path: Path) -> None:
+    """The arm ends at the wrist: then the last joint moves something else."""
+    spec = changed(robot("ur5e").spec, tool_frame="wrist_2")
+    allowed = "does not move the tool frame; allowed is an arm alone"
+    assert message(spec).endswith(f"ur5e.sdf: joint 'wrist_3_joint' {allowed}")
+
+
+@pytest.mark.parametrize(
+    ("taken_out", "kind"),
+    [
+        ('lower="-6.2" upper="6.2"', "position"),
+        ('velocity="3"', "velocity"),
+        ('effort="150"', "torque"),
+    ],
+)
+def test_a_joint_without_a_limit(tmp_path: Path, taken_out: str, kind: str) -> None:
+    before, after = ros_urdf().split('<joint name="elbow_joint"')
+    text = before + '<joint name="elbow_joint"' + after.replace(taken_out, "", 1)
+    if kind == "position":
+        text = text.replace('elbow_joint" type="revolute"', 'elbow_joint" type="continuous"')
+    spec = ros_spec(tmp_path, text)
+    assert message(spec) == (f"robot.limits.{kind}: is missing for joint 'elbow_joint'; allowed is {PLACES}")
+    given: Any = ((-3.0, 3.0),) * 6 if kind == "position" else (2.0,) * 6
+    arm = load_robot(changed(spec, **{f"limits_{kind}": given}))
+    assert arm.joint_names[2] == "elbow_joint"
+
+
+def test_an_inverse_that_does_not_fit(tmp_path: Path) -> None:
+    """A seventh joint; and an elbow whose axis is not parallel to that of the shoulder."""
+    spec = changed(robot("iiwa14").spec, ik="ur")
+    expected = "robot.ik: 'ur' (iiwa14.sdf is no arm of the UR family: 7 joints)"
+    assert message(spec) == f"{expected}; allowed is 'numerical'"
+    skew = ros_spec(tmp_path, ros_urdf(offset=0.01))
+    text = message(skew)
+    assert text.startswith("robot.ik: 'ur' (ur5e.urdf is no arm of the UR family: off by 0.0")
+    assert text.endswith("; allowed is 'numerical'")
+    assert load_robot(changed(skew, ik="numerical")).ur is None
+
+
+@pytest.mark.parametrize("kind", ["visual", "collision"])
+def test_a_mesh_that_is_missing(tmp_path: Path, kind: str) -> None:
+    mesh = f'<{kind}><geometry><mesh filename="package://arms/tool.obj"/></geometry></{kind}>'
+    text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
+    spec = ros_spec(tmp_path, text)
+    expected = f"{spec.model}: mesh: 'package://arms/tool.obj' is missing; allowed is a file"
+    assert message(spec) == expected
+    (tmp_path / "package.xml").write_text("<package><name>arms</name></package>")
+    (tmp_path / "tool.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    assert load_robot(changed(spec, payload=4.0)).num_joints == 6
+
+
+def test_files_that_are_no_models(tmp_path: Path) -> None:
+    spec = ros_spec(tmp_path, "<robot")
+    text = message(spec)
+    assert text.startswith(f"{spec.model}: is not XML (")
+    assert text.endswith("; allowed is an SDF or URDF")
+    spec = ros_spec(tmp_path, '<robot name="empty"></robot>')
+    assert message(changed(spec, payload=3.0)).startswith(("robot.base_link:", f"{spec.model}:"))
+
+
+def test_an_stl_that_is_none(tmp_path: Path) -> None:
+    mesh = '<visual><geometry><mesh filename="tool.stl"/></geometry></visual>'
+    text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
+    spec = ros_spec(tmp_path, text)
+    (tmp_path / "tool.stl").write_bytes(b"solid nothing")
+    allowed = "is no STL mesh; allowed are OBJ, glTF, VTK and STL"
+    assert message(spec) == f"{tmp_path / 'tool.stl'}: {allowed}"
+    corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    (tmp_path / "tool.stl").write_text(f"solid one\nfacet\nouter loop\n{corner}")
+    assert load_robot(changed(spec, payload=2.0)).num_joints == 6
+
+
+def test_a_gripper_in_the_arms_file() -> None:
+    spec = bullet_iiwa()
+    assert message(changed(spec, tool_frame="lbr_iiwa_link_5")).endswith(
+        "model.urdf: joint 'lbr_iiwa_joint_6' does not move the tool frame; allowed is an arm alone"
+    )
