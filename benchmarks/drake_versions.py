@@ -89,10 +89,10 @@ def measure(
 @app.command()
 def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measure` wrote; the first is the reference.")]) -> None:
     """Print how often verdicts agree with those of the first file, and what things cost."""
-    reference, *others = found = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+    found = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     table = Table("Drake", "Python", "stable", "same stable", "same hidden", "settle, median s", "arm, s per move")
     for one in found:
-        pairs = list(zip(reference["verdicts"], one["verdicts"], strict=True))
+        pairs = list(zip(found[0]["verdicts"], one["verdicts"], strict=True))
         same = np.mean([a["stable"] == b["stable"] for a, b in pairs])
         both = [(a, b) for a, b in pairs if a["stable"] and b["stable"]]
         hidden = np.mean([a["hidden"] == b["hidden"] for a, b in both])
