@@ -136,7 +136,7 @@ def test_an_stl_that_is_none(tmp_path: Path) -> None:
     allowed = "is no STL mesh; allowed are OBJ, glTF, VTK and STL"
     assert message(spec) == f"{tmp_path / 'tool.stl'}: {allowed}"
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-    (tmp_path / "tool.stl").write_text(f"solid one\nfacet\nouter loop\n{corner}")
+    (tmp_path / "tool.stl").write_text(f"solid one\nfacet normal 0 0 1\nouter loop\n{corner}endloop\nendfacet\nendsolid one\n")
     assert load_robot(changed(spec, payload=2.0)).num_joints == 6
 
 

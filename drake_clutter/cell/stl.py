@@ -21,10 +21,11 @@ def stl_as_obj(path: Path) -> Path:
         return made
     try:
         mesh = trimesh.load_mesh(path, file_type="stl")
-    except Exception as error:  # trimesh raises many kinds for damaged files
-        raise InputError(f"{path}: is no STL mesh ({error}); allowed are OBJ, glTF, VTK and STL") from error
-    if not len(getattr(mesh, "faces", ())):
-        raise InputError(f"{path}: holds no triangles; allowed are OBJ, glTF, VTK and STL")
+        empty = not len(mesh.faces)
+    except Exception:  # trimesh raises many kinds for damaged files
+        empty = True
+    if empty:
+        raise InputError(f"{path}: is no STL mesh; allowed are OBJ, glTF, VTK and STL")
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(made) as temporary:
         mesh.export(temporary, file_type="obj")
