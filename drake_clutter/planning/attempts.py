@@ -19,7 +19,7 @@ from drake_clutter.planning.paths import SPACING, Payload, least_time, nearest_t
 from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.shorten import Wall, Way, shortened
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import Between, Flag, NonNegative, config_class
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class PlannerConfig:
     time_limit: NonNegative = 600.0
     descent: NonNegative = 0.0
     above: NonNegative = 0.0
-    optimise: bool = True
+    optimise: Flag = True
 
 
 REPORTED = 0.03
