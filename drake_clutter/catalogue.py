@@ -17,7 +17,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from drake_clutter.files import InputError, refusal, shown
 from drake_clutter.resources import shipped_path
@@ -131,8 +131,8 @@ class CatalogueFile(Model):
         object_sets: Named lists of classes; a user's catalogue may name shipped classes too.
     """
 
-    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = {}
-    object_sets: dict[str, tuple[str, ...]] = {}
+    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = Field(default_factory=dict)
+    object_sets: dict[str, tuple[str, ...]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +274,7 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     shipped = shipped_path("sdf_assets")
     folders = (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
     classes: dict[str, ObjectClass] = {}
-    object_sets: dict[str, tuple[str, ...]] = {}
+    object_sets: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     for asset_folder in folders:
         path = asset_folder / CATALOGUE_FILE
         if not path.is_file():

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform
 
@@ -114,12 +114,12 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,))
 
 
-@lru_cache(maxsize=None)
+@cache
 def _adapter(schema: Any) -> TypeAdapter[Any]:
     return TypeAdapter(schema)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _json_schema(schema: Any) -> dict[str, Any]:
     return _adapter(schema).json_schema()
 
@@ -171,11 +171,13 @@ def _allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
     if kind in ("literal_error", "enum"):
         values = [str(value) for value in node.get("enum", [node.get("const")])]
         return values[0] if len(values) == 1 else f"one of {', '.join(values)}"
-    if kind in ("list_type", "tuple_type", "too_long", "too_short"):
-        return _list(node)
     if kind in ("dict_type", "model_type", "dataclass_type", "model_attributes_type"):
         names = ", ".join(node.get("required") or node.get("properties", ()))
         return f"a mapping with {names}" if names else "a mapping"
+    if kind == "too_short" and node.get("type") == "object":
+        return "a mapping of at least one entry"
+    if kind in ("list_type", "tuple_type", "too_long", "too_short"):
+        return _list(node)
     return _KINDS.get(kind.split("_")[0], error["msg"])
 
 
@@ -216,10 +218,8 @@ def _joined(field: str, part: int | str) -> str:
 
 def _resolved(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
     while isinstance(node, dict) and ("$ref" in node or "anyOf" in node):
-        if "$ref" in node:
-            node = document["$defs"][node["$ref"].rsplit("/", 1)[-1]]
-        else:
-            node = node["anyOf"][0]
+        reference = node.get("$ref", "").rsplit("/", 1)[-1]
+        node = document["$defs"][reference] if reference else node["anyOf"][0]
     return node if isinstance(node, dict) else {}
 
 

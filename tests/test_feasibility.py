@@ -120,9 +120,9 @@ def test_the_map_agrees_with_the_poses() -> None:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    save_scene(folder / "pile.yaml", SCENE, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
+    save_scene(folder / "pile.yaml", SCENE, DEFAULT_CELL, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
     leaning = scene_of(resting("gelatin_box"), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0), 0.028))
-    save_scene(folder / "falls.yaml", leaning)
+    save_scene(folder / "falls.yaml", leaning, DEFAULT_CELL)
     return folder
 
 
@@ -207,10 +207,16 @@ def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]", "not 3 numbers"),
-        ("[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]", "quaternion is zero"),
-        ("{name: a}", "allowed is a YAML list"),
-        ("[{translation: [0, 0, 0]}]", "allowed is a YAML list"),
+        (
+            "[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]",
+            r"\[0\]\.translation: \[0, 0\]; allowed",
+        ),
+        (
+            "[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]",
+            "allowed is w, x, y, z that are not all zero",
+        ),
+        ("{name: a}", "{'name': 'a'}; allowed is a list"),
+        ("[{translation: [0, 0, 0]}]", r"\[0\]\.name: is missing; needed are name, translation, quaternion"),
     ],
 )
 def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
@@ -225,7 +231,7 @@ def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
     [
         ("{suction: {cup_diameter: 1.0}}", "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
         ("{base: [0, 0]}", "base: is unknown"),
-        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg.2: 'north'; allowed is a finite number"),
+        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg\\[2\\]: 'north'; allowed is a finite number"),
         ("{reach: 3}", "reach: is unknown"),
     ],
 )
