@@ -274,7 +274,7 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     shipped = shipped_path("sdf_assets")
     folders = (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
     classes: dict[str, ObjectClass] = {}
-    object_sets: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    object_sets: dict[str, tuple[str, ...]] = {}
     for asset_folder in folders:
         path = asset_folder / CATALOGUE_FILE
         if not path.is_file():

@@ -6,7 +6,7 @@ models or pydantic dataclasses.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -136,7 +136,7 @@ def validate(schema: type[Schema], given: Any, source: str) -> Schema:
         InputError: The first field that cannot be used, in one line.
     """
     try:
-        validated: Schema = _adapter(schema).validate_python(given)
+        validated: Schema = _adapter(cast(Hashable, schema)).validate_python(given)
     except ValidationError as error:
         raise refusal(source, _message(schema, error.errors(include_url=False)[0])) from None
     return validated
@@ -225,7 +225,7 @@ def _resolved(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
 
 def to_plain(value: Any) -> Any:
     """Return a config as mappings, lists, numbers and texts."""
-    return _adapter(type(value)).dump_python(value, mode="json", by_alias=True)
+    return _adapter(cast(Hashable, type(value))).dump_python(value, mode="json", by_alias=True)
 
 
 def config_yaml(config: Any) -> str:

@@ -35,7 +35,7 @@ class _Loader(yaml.CSafeLoader):
         return self.construct_mapping(node, deep=True)
 
     def construct_whole_sequence(self, node: yaml.SequenceNode) -> list[Any]:
-        return self.construct_sequence(node, deep=True)
+        return list(self.construct_sequence(node, deep=True))
 
 
 class _Dumper(yaml.CSafeDumper):

@@ -258,7 +258,9 @@ def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
         if missing := sorted(set(scene.names) - named[field]):
             found = f"verdict.{field}: {missing[0]} is missing"
             raise refusal(path, f"{found}; allowed is an entry for every object")
-    instability = why and Instability(why.reason, why.object, why.displacement, why.tilt)
+    instability = None
+    if why is not None:
+        instability = Instability(why.reason, why.object, why.displacement, why.tilt)
     settled = {name: pose.pose for name, pose in entry.settled.items()}
     return Verdict(instability, settled, entry.visible_share, entry.hidden)
 
