@@ -27,6 +27,7 @@ from drake_clutter.yaml_text import read_yaml
 CATALOGUE_FILE = "catalogue.yaml"
 _CYLINDER_SIDES = 32
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
+_NONE: Any = Field(default_factory=dict)
 _Size = Annotated[float, Between(3, 1000)]
 _GRAMMAR_WORDS = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
 
@@ -131,8 +132,8 @@ class CatalogueFile(Model):
         object_sets: Named lists of classes; a user's catalogue may name shipped classes too.
     """
 
-    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = Field(default_factory=dict)
-    object_sets: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = _NONE
+    object_sets: dict[str, tuple[str, ...]] = _NONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +279,8 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     for asset_folder in folders:
         path = asset_folder / CATALOGUE_FILE
         if not path.is_file():
-            raise InputError(f"{path}: no such file; a catalogue is a folder that holds {CATALOGUE_FILE}")
+            what = f"no such file; a catalogue is a folder that holds {CATALOGUE_FILE}"
+            raise refusal(str(path), what)
         read = validate(CatalogueFile, read_yaml(path, "a catalogue"), str(path))
         for name, entry in read.classes.items():
             if name in classes:
@@ -287,8 +289,8 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
         for set_name, members in read.object_sets.items():
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
-                allowed_are = f"a list, without repeats, of {', '.join(classes)}"
-                value = shown(unknown or list(members))
-                raise refusal(str(path), f"object_sets.{set_name}: {value}; allowed is {allowed_are}")
+                what = f"a list, without repeats, of {', '.join(classes)}"
+                found = f"object_sets.{set_name}: {shown(unknown or list(members))}"
+                raise refusal(str(path), f"{found}; allowed is {what}")
             object_sets[set_name] = members
     return Catalogue(classes, object_sets, folders)

@@ -105,7 +105,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Clutt
 
 
 def upgrade(given: Any) -> Any:
-    """Return a document with what version 0.1 called camera, layout.tray_side and arm in its cell."""
+    """Return a document with the camera, tray and arm of version 0.1 in its cell."""
     if not isinstance(given, dict):
         return given
     made = {key: value if key == "cell" else upgrade(value) for key, value in given.items()}

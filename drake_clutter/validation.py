@@ -1,7 +1,7 @@
 """Reads typed data from files and options.
 
-Misuse is one line that names the file, the field, the value and what is allowed. Schemas are pydantic
-models or pydantic dataclasses.
+Misuse is one line that names the file, the field, the value and what is allowed. Schemas are
+pydantic models or pydantic dataclasses.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class Between:
-    """Annotation of an int or float: finite, between two values, and not converted from another type.
+    """Annotation of an int or float: finite, between two values, and of that type.
 
     Attributes:
         low: Least value.
@@ -262,7 +262,7 @@ def load_typed(
 
 
 def _parse_setting(setting: str, config: Any) -> Any:
-    """Return FIELD=VALUE as nested mappings, with the rest of the lists and collections it is in."""
+    """Return FIELD=VALUE as nested mappings, with the rest of a list or collection."""
     name, equals, text = setting.partition("=")
     if not equals or not name:
         raise refusal(f"--set {setting}", "allowed is FIELD=VALUE, such as layout.stack_gap=0.02")

@@ -6,9 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import pydantic
 import pytest
-import yaml
 from pydantic import Field
 
 import drake_clutter
@@ -274,9 +272,3 @@ def test_yaml_is_read_in_one_place() -> None:
     files = [*root.rglob("*.py"), *(root.parent / "training").glob("*.py")]
     users = {path.name for path in files if "yaml.safe_load" in path.read_text() or "yaml.load(" in path.read_text()}
     assert users == {"yaml_text.py"}
-
-
-def test_versions() -> None:
-    """The lower bounds of what this was tested with."""
-    assert pydantic.VERSION >= "2"
-    assert yaml.__with_libyaml__

@@ -42,7 +42,7 @@ class WorkCell(Model):
 
     @field_validator("fixtures")
     @classmethod
-    def _names_differ(cls, fixtures: tuple[Fixture, ...], info: ValidationInfo) -> tuple[Fixture, ...]:
+    def _names_differ(cls, fixtures: tuple[Fixture, ...], info: ValidationInfo) -> Any:
         taken = [*_RESERVED, *info.data.get("cameras", ())]
         for fixture in fixtures:
             if fixture.name in taken:
