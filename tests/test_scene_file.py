@@ -46,7 +46,8 @@ def loads_or_is_refused(path: Path) -> bool:
         message = str(refusal)
     else:
         return True
-    assert message.startswith(str(path))
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
     return False
 
 
