@@ -126,7 +126,7 @@ class _TrayEntry(Model):
 
 
 class _Document(Model):
-    """A scene file; version 1 had the tray's side and no cell, as a file by hand may have."""
+    """A scene file; one of version 1 has a tray and no cell."""
 
     version: Annotated[int, Between(1, VERSION)]
     objects: Annotated[tuple[_ObjectEntry, ...], Field(min_length=1)]
