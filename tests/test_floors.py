@@ -19,7 +19,7 @@ FLOORS = {
     6: {"tasks"},
     7: {"agents"},
     8: {"systems"},
-    9: {"cli", "cli_arm", "cli_options", "commands", "doctor", "reports"},
+    9: {"cli", "commands", "doctor", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts)

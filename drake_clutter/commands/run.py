@@ -67,16 +67,17 @@ def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
     return write(out, scenario, task, timing, f"{scenario.agent} and the arm search {Path(scenario.scene).name or 'a scene'}")
 
 
-def demo(seed: int, nodes: int, out: Path, report: Report) -> dict[str, Any]:
+def demo(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
     """SG* makes scenes, and the arm searches them by depth images alone, until everything is found in one; see `write`.
 
     Scenes in which no arm finds everything are passed over.
     """
-    scenario, index = Scenario(nodes=nodes, seed=seed, perception="depth"), -1
-    ceiling = ArmCeiling(scenario.world)
+    ceiling, index = ArmCeiling(scenario.world), -1
     for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
         scene, index = scene_of(scenario, index + 1, lambda scene: not ceiling.never_found(scene))
         task, timing = play(scenario, scene, report)
         if task.end is EpisodeEnd.ALL_FOUND:
             break
-    return write(out, scenario, task, timing, f"SG* hides, the arm searches: seed {seed}, scene {index}", scenes_tried=tried)
+    return write(
+        out, scenario, task, timing, f"SG* hides, the arm searches: seed {scenario.seed}, scene {index}", scenes_tried=tried
+    )

@@ -1,4 +1,4 @@
-"""The command line's part about the arm."""
+"""`drake-clutter feasibility`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -6,38 +6,10 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_clutter.cli_options import (
-    CatalogueOption,
-    ConfigOption,
-    HtmlOption,
-    JsonOption,
-    SeedOption,
-    WorkersOption,
-    out_console,
-    show,
-    tracked,
-    watch,
-)
+from drake_clutter.cli.options import CatalogueOption, ConfigOption, JsonOption, SeedOption, SetOption, WorkersOption
+from drake_clutter.cli.output import progress_bar, show
+from drake_clutter.cli.world import load_world
 from drake_clutter.files import InputError
-
-
-def replay(
-    file: Annotated[Path, typer.Argument(metavar="FILE.h5", help="Recorded motions, as `--fidelity arm` writes them.")],
-    html: HtmlOption = None,
-    catalogue: CatalogueOption = None,
-) -> None:
-    """Show the arm's recorded motions in the browser (Meshcat), or write them to one HTML file."""
-    from drake_clutter.catalogue import load_catalogue
-    from drake_clutter.reports.recording import joined
-    from drake_clutter.station.trajectory_file import read_trajectories
-
-    scene, cell, moves = read_trajectories(file, load_catalogue(catalogue))
-    if not moves:
-        raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
-    for number, (move, motion) in enumerate(moves, start=1):
-        out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
-    watch(file, scene, joined([motion for _, motion in moves]), cell, html)
-
 
 PLACE = "X,Y,Z,YAW"
 
@@ -55,12 +27,16 @@ def _numbers(option: str, text: str) -> list[float]:
 def feasibility(
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENES...", help="Scene files, or folders of them.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; one of the same study is taken up.")],
+    cell: Annotated[
+        list[Path] | None, typer.Option("--cell", metavar="FILE", help="Work cell to study; may be repeated.")
+    ] = None,
+    settings: SetOption = None,
     base: Annotated[list[str] | None, typer.Option(metavar=PLACE, help="Place of the arm's base in T; may be repeated.")] = None,
     tray: Annotated[
         list[str] | None, typer.Option(metavar=PLACE, help="Instead: the tray's place, seen from the base; may be repeated.")
     ] = None,
     arm: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="YAML with fields of ArmConfig (tool, payload...); may be repeated.")
+        list[Path] | None, typer.Option(metavar="FILE", help="YAML with single fields of the cell; may be repeated.")
     ] = None,
     targets: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML list of {name, translation, quaternion}: cup poses to ask about.")
@@ -73,25 +49,23 @@ def feasibility(
 ) -> None:
     """Ask an arm about every legal move of scenes: tables, pictures and a report. A study that was stopped goes on."""
     from drake_clutter.commands import feasibility as command
-    from drake_clutter.config import load_config
 
-    world = load_config(config)
+    world = load_world(config, None, settings)
+    cells = {path.stem: load_world(config, path, settings).cell for path in cell or []}
+    setups = command.setups(
+        [_numbers("--base", text) for text in base or []],
+        [_numbers("--tray", text) for text in tray or []],
+        arm or [],
+        next(iter(cells.values()), world.cell),
+    )
+    if cells:
+        setups = cells | {name: other for name, other in setups.items() if name != "default"}
     job = command.FeasibilityJob(
-        command.scene_files(scenes),
-        command.setups(
-            [_numbers("--base", text) for text in base or []],
-            [_numbers("--tray", text) for text in tray or []],
-            arm or [],
-            world.cell,
-        ),
-        command.read_targets(targets) if targets else (),
-        seed,
-        world,
-        catalogue,
+        command.scene_files(scenes), setups, command.read_targets(targets) if targets else (), seed, world, catalogue
     )
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-        return tracked("parts", made, done, total)
+        return progress_bar("parts", made, done, total)
 
     summary = command.feasibility(job, out, workers, progress)
     words = {

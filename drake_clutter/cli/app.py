@@ -1,0 +1,33 @@
+"""The application. Drake is imported by the commands that need it, so that `doctor` runs where Drake is broken."""
+
+import typer
+
+from drake_clutter.cli.assets import assets_app
+from drake_clutter.cli.doctor import doctor
+from drake_clutter.cli.evaluate import evaluate
+from drake_clutter.cli.explore import explore
+from drake_clutter.cli.export import export
+from drake_clutter.cli.feasibility import feasibility
+from drake_clutter.cli.generate import generate
+from drake_clutter.cli.move import move
+from drake_clutter.cli.render import render
+from drake_clutter.cli.replay import replay
+from drake_clutter.cli.run import demo, run
+from drake_clutter.cli.solve import solve
+from drake_clutter.cli.view import view
+from drake_clutter.files import told_in_one_line
+
+app = typer.Typer(
+    help="Clutter that is generated, judged, looked at and searched, on Drake.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+for command in (generate, explore, evaluate, move, solve, run, demo, feasibility, replay, view, render, export, doctor):
+    app.command()(command)
+app.add_typer(assets_app, name="assets")
+
+
+def main() -> None:
+    """Run the console script: a misuse is one line and exit code 2."""
+    with told_in_one_line():
+        app()

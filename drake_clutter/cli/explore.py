@@ -1,0 +1,43 @@
+"""`drake-clutter explore`."""
+
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    CellOption,
+    ConfigOption,
+    ExplorerOption,
+    Fidelity,
+    FidelityOption,
+    JsonOption,
+    MaxMovesOption,
+    OutOption,
+    SceneArgument,
+    SeedOption,
+    SetOption,
+)
+from drake_clutter.cli.output import report_step, show_episode
+from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.files import output_directory
+
+
+def explore(
+    scene: SceneArgument,
+    out: OutOption,
+    agent: ExplorerOption = "largest-clear",
+    fidelity: FidelityOption = Fidelity.SETTLE,
+    max_moves: MaxMovesOption = None,
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    cell: CellOption = None,
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Search a scene for what it hides; writes episode.json and a page, index.html."""
+    from drake_clutter.commands import explore as command
+
+    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    output_directory(out)
+    limit = max_moves or world.exploration.max_moves
+    task = command.explore(command.at_rest(file.scene, world, seed), agent, fidelity.value, limit, seed, world, report_step)
+    title = f"{agent} explores {scene.name}"
+    show_episode(command.write_episode(out, task, title, agent, fidelity.value, seed, world), as_json, out)

@@ -1,0 +1,36 @@
+"""`drake-clutter export`."""
+
+from enum import Enum
+from typing import Annotated
+
+import typer
+
+from drake_clutter.cli.options import CatalogueOption, LaidOutOption, OutOption, SceneArgument
+from drake_clutter.cli.output import out_console
+from drake_clutter.files import output_directory
+
+
+class Format(Enum):
+    """Formats that a scene can be exported to."""
+
+    DMD = "dmd"
+    SDF = "sdf"
+    MJCF = "mjcf"
+    GLB = "glb"
+
+
+def export(
+    scene: SceneArgument,
+    out: OutOption,
+    format: Annotated[Format, typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer.")],
+    laid_out: LaidOutOption = False,
+    catalogue: CatalogueOption = None,
+) -> None:
+    """Export a scene to a self-contained folder."""
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.export import ExportFormat, export_scene
+    from drake_clutter.scenes.scene_file import load_scene
+
+    file = load_scene(scene, load_catalogue(catalogue))
+    output_directory(out)
+    out_console.print(f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}")

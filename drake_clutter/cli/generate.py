@@ -1,0 +1,54 @@
+"""`drake-clutter generate`."""
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import typer
+
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    CellOption,
+    ConfigOption,
+    JsonOption,
+    NodesOption,
+    ObjectsOption,
+    OutOption,
+    RayOption,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+)
+from drake_clutter.cli.output import progress_bar, show
+from drake_clutter.cli.world import load_world
+
+
+def generate(
+    out: OutOption,
+    agent: Annotated[str, typer.Option(help="random, hill-climbing, or the file of a checkpoint that you trained.")] = "random",
+    temperature: Annotated[
+        float | None, typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds.")
+    ] = None,
+    objects: ObjectsOption = "ycb7",
+    nodes: NodesOption = 25,
+    count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    cell: CellOption = None,
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Generate scenes, settle them in Drake and say which are stable and what they hide. A run that was stopped goes on."""
+    from drake_clutter.agents.generation import GenerationJob
+    from drake_clutter.commands import generate as command
+
+    job = GenerationJob(agent, objects, catalogue, nodes, seed, load_world(config, cell, settings), temperature)
+
+    def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
+        return progress_bar("scenes", made, done, total)
+
+    summary = command.generate(job, count, out, workers, progress, ray)
+    shown = {key: value for key, value in summary.items() if key != "config"}
+    show(summary if as_json else shown, as_json, f"{out}")

@@ -1,0 +1,60 @@
+"""`drake-clutter move`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    CellOption,
+    ConfigOption,
+    Fidelity,
+    FidelityOption,
+    JsonOption,
+    OutOption,
+    SceneArgument,
+    SeedOption,
+    SetOption,
+)
+from drake_clutter.cli.output import report_step, show, show_episode
+from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.files import InputError, output_directory
+
+
+def move(
+    scene: SceneArgument,
+    out: OutOption,
+    pick: Annotated[str | None, typer.Option(help="Name of the object to pick.")] = None,
+    place: Annotated[str | None, typer.Option(help="Name of the object to put it on, or tray.")] = None,
+    moves: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}.")] = None,
+    fidelity: FidelityOption = Fidelity.SETTLE,
+    plan_only: Annotated[
+        bool, typer.Option("--plan-only", help="With --fidelity arm: write how the arm would move (plan.json), move nothing.")
+    ] = False,
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    cell: CellOption = None,
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
+    from drake_clutter.commands import explore as command
+    from drake_clutter.scenes.interfaces import Move
+
+    if (moves is None) == (pick is None) or (pick is None) != (place is None):
+        raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
+    if plan_only and fidelity is not Fidelity.ARM:
+        raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
+    chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
+    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    output_directory(out)
+    start = command.at_rest(file.scene, world, seed)
+    if plan_only:
+        plans = command.plan_only(start, chosen, seed, world, out)
+        show({"plans": plans} if as_json else command.plans_in_words(plans), as_json, f"{out}")
+        return
+    task = command.carry_out(start, chosen, seed, world, report_step, fidelity.value)
+    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world)
+    show_episode(fields, as_json, out)

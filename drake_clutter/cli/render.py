@@ -1,0 +1,23 @@
+"""`drake-clutter render`."""
+
+from drake_clutter.cli.options import CatalogueOption, CellOption, ConfigOption, OutOption, SceneArgument, SetOption
+from drake_clutter.cli.output import show
+from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.files import output_directory
+
+
+def render(
+    scene: SceneArgument,
+    out: OutOption,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    cell: CellOption = None,
+    settings: SetOption = None,
+) -> None:
+    """Render what the cameras see: color.png, depth.png (16 bit, 0.1 mm), label.png, visible.json, picture.png."""
+    from drake_clutter.commands.render import render_scene
+
+    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    output_directory(out)
+    shares = render_scene(file.settled_scene, world, out)
+    show({name: round(share, 3) for name, share in shares.items()}, False, "visible share")

@@ -1,0 +1,28 @@
+"""`drake-clutter replay`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_clutter.cli.options import CatalogueOption, HtmlOption
+from drake_clutter.cli.output import out_console, watch
+from drake_clutter.files import InputError
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(metavar="FILE.h5", help="Recorded motions, as `--fidelity arm` writes them.")],
+    html: HtmlOption = None,
+    catalogue: CatalogueOption = None,
+) -> None:
+    """Show the arm's recorded motions in the browser (Meshcat), or write them to one HTML file."""
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.reports.recording import joined
+    from drake_clutter.station.trajectory_file import read_trajectories
+
+    scene, cell, moves = read_trajectories(file, load_catalogue(catalogue))
+    if not moves:
+        raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
+    for number, (move, motion) in enumerate(moves, start=1):
+        out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
+    watch(file, scene, joined([motion for _, motion in moves]), cell, html)

@@ -1,0 +1,78 @@
+"""`drake-clutter run` and `demo`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drake_clutter.cli.options import CellOption, JsonOption, NodesOption, OutOption, SeedOption, SetOption
+from drake_clutter.cli.output import report_step, show_episode
+from drake_clutter.cli.world import in_world
+from drake_clutter.files import output_directory
+
+if TYPE_CHECKING:
+    from drake_clutter.systems.scenario import Scenario
+
+_WORLD_FIELDS = frozenset({"layout", "settle", "exploration", "cell", "camera"})
+
+
+def _in_scenario(setting: str) -> str:
+    name = in_world(setting)
+    return f"world.{name}" if name.split("=")[0].split(".")[0] in _WORLD_FIELDS else name
+
+
+def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "Scenario":
+    """Return a scenario; its cell is that of --cell, else of its scene file, under the fields that are named."""
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.cell.work_cell import load_cell
+    from drake_clutter.config import upgrade
+    from drake_clutter.scenes.scene_file import load_scene
+    from drake_clutter.systems.scenario import Scenario
+    from drake_clutter.validation import load_typed
+
+    names = [_in_scenario(setting) for setting in settings or ()]
+    which_scene = [name for name in names if name.startswith(("scene=", "catalogue="))]
+    base, named = Scenario(), load_typed(Scenario(), file, which_scene, upgrade)
+    if named.scene:
+        catalogue = load_catalogue(Path(named.catalogue) if named.catalogue else None)
+        base = replace(base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell))
+    scenario = load_typed(base, file, convert=upgrade)
+    if cell is not None:
+        scenario = replace(scenario, world=replace(scenario.world, cell=load_cell(cell)))
+    return load_typed(scenario, settings=names, convert=upgrade)
+
+
+def run(
+    scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of Scenario.")] = None,
+    cell: CellOption = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="FIELD=VALUE", help="A field of Scenario, of its world or cell; may be repeated."),
+    ] = None,
+    out: OutOption = Path("out/run"),
+    as_json: JsonOption = False,
+) -> None:
+    """Play the closed loop: camera images in, arm motion out, until nothing is hidden; writes episode.json and a page."""
+    from drake_clutter.commands import run as command
+
+    given = _load_scenario(scenario, cell, settings)
+    output_directory(out)
+    show_episode(command.run(given, out, report_step), as_json, out)
+
+
+def demo(
+    out: OutOption,
+    seed: SeedOption = 0,
+    nodes: NodesOption = 25,
+    cell: CellOption = None,
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """SG* makes a scene, and the arm searches it until everything is found; write a page to watch."""
+    from drake_clutter.commands import run as command
+
+    given = replace(_load_scenario(None, cell, settings), seed=seed, nodes=nodes, perception="depth")
+    output_directory(out)
+    show_episode(command.demo(given, out, report_step), as_json, out)

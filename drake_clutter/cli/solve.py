@@ -1,0 +1,39 @@
+"""`drake-clutter solve`."""
+
+from typing import Annotated
+
+import typer
+
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    CellOption,
+    ConfigOption,
+    JsonOption,
+    OutOption,
+    SceneArgument,
+    SeedOption,
+    SetOption,
+)
+from drake_clutter.cli.output import report_step, show
+from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.files import output_directory
+
+
+def solve(
+    scene: SceneArgument,
+    out: OutOption,
+    budget: Annotated[int, typer.Option(min=1, help="Moves that the search may try before it gives up.")] = 5000,
+    seed: SeedOption = 0,
+    catalogue: CatalogueOption = None,
+    config: ConfigOption = None,
+    cell: CellOption = None,
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the fewest moves that reveal everything, with full knowledge of the scene; Drake confirms the plan."""
+    from drake_clutter.commands import explore, solve
+
+    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    output_directory(out)
+    fields = solve.solve(explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step)
+    show(fields, as_json, f"{out}")

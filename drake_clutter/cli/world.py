@@ -1,0 +1,51 @@
+"""Scenes and worlds from a command's options."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drake_clutter.config import ClutterConfig
+    from drake_clutter.scenes.scene_file import SceneFile
+
+CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures"})
+"""Fields of the work cell, which settings name without its own name."""
+
+
+def in_world(setting: str) -> str:
+    """Return FIELD=VALUE with the field's full name in the world."""
+    return f"cell.{setting}" if setting.split("=")[0].split(".")[0] in CELL_FIELDS else setting
+
+
+def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "ClutterConfig":
+    """Return the world: the defaults, over them the config's fields, the cell, and single fields."""
+    from drake_clutter.cell.work_cell import load_cell
+    from drake_clutter.config import load_config, upgrade
+    from drake_clutter.validation import load_typed
+
+    world = load_config(config)
+    if cell is not None:
+        world = replace(world, cell=load_cell(cell))
+    return load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+
+
+def load_scene_and_world(
+    scene: Path, catalogue: Path | None, config: Path | None, cell: Path | None, settings: Sequence[str] | None
+) -> tuple["SceneFile", "ClutterConfig"]:
+    """Return a scene file and the world for it.
+
+    The cell is that of --cell, else the one that the scene was made with; its support is the scene's, as the objects stand
+    on it. Fields of --config and --set go over it.
+    """
+    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.cell.work_cell import load_cell
+    from drake_clutter.config import ClutterConfig, upgrade
+    from drake_clutter.scenes.scene_file import load_scene
+    from drake_clutter.validation import load_typed
+
+    file = load_scene(scene, load_catalogue(catalogue))
+    of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
+    world = load_typed(replace(ClutterConfig(), cell=of_scene), config, convert=upgrade)
+    world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    return replace(file, scene=replace(file.scene, support=world.cell.support)), world
