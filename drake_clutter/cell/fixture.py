@@ -1,9 +1,11 @@
 """What stands in the cell beside robot and support, and counts as an obstacle."""
 
-from typing import Annotated
+from typing import Annotated, Self
+
+from pydantic import model_validator
 
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Model
+from drake_clutter.validation import Between, Model, allowed
 
 Extent = Annotated[float, Between(0.001, 10.0)]
 
@@ -24,3 +26,9 @@ class Fixture(Model):
     box: tuple[Extent, Extent, Extent] | None = None
     model: str = ""
     color: tuple[float, float, float, float] | None = None
+
+    @model_validator(mode="after")
+    def _box_or_model(self) -> Self:
+        if (self.box is None) == (self.model == ""):
+            raise allowed("either a box or a model")
+        return self
