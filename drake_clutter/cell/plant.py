@@ -15,7 +15,6 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.epick import epick_sdf
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.model_file import parse_model
 from drake_clutter.cell.robot_model import load_robot
@@ -66,7 +65,7 @@ def add_work_cell(
         plant: What to add to.
         scene_graph: Its geometry.
         cell: What to add.
-        compliant: Whether the gripper's cup gives way, see `epick_sdf`.
+        compliant: Whether the gripper's cup gives way, see `Gripper`.
         visuals: Whether cameras are to see it, see `add_scene_plant`.
 
     Raises:
@@ -74,7 +73,7 @@ def add_work_cell(
     """
     model = load_robot(cell.robot)
     robot = add_robot(plant, model, visuals=visuals)
-    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(cell.gripper, compliant=compliant), "sdf")
+    (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=compliant), "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
     fixed = [plant.world_body()]

@@ -17,6 +17,9 @@ from drake_clutter.cell.support import Support
 from drake_clutter.resources import shipped_path
 from drake_clutter.validation import Model, allowed, load_typed, read_yaml, validate
 
+GripperSpec = SuctionGripper
+"""Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
+`Annotated[SuctionGripper | Other, Field(discriminator="kind")]`; each satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
 
 
@@ -32,7 +35,7 @@ class WorkCell(Model):
     """
 
     robot: RobotSpec
-    gripper: SuctionGripper
+    gripper: GripperSpec
     support: Support
     cameras: dict[str, Camera]
     fixtures: tuple[Fixture, ...] = ()
