@@ -1,11 +1,11 @@
 """How far the arm, and what it holds, is from everything else."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, CollisionFilterDeclaration, GeometrySet, SignedDistancePair
+from pydrake.geometry import Box, CollisionFilterDeclaration, GeometryId, GeometrySet, SignedDistancePair
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
@@ -41,6 +41,7 @@ class ClearanceScene:
 
     Attributes:
         arm_names: of the bodies of arm and tool.
+        fixture_tops: Heights of the highest points of the cell's fixtures [m].
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class ClearanceScene:
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
+        self.fixture_tops = self._tops({fixture.name for fixture in cell.fixtures})
         self._held: tuple[str, Floats] | None = None
         self._transient: list[object] = []
 
@@ -83,8 +85,8 @@ class ClearanceScene:
             found.Add(self.plant.GetCollisionGeometriesForBody(body))
         return found
 
-    def _name_geometries(self) -> dict[object, str]:
-        names = {}
+    def _name_geometries(self) -> dict[GeometryId, str]:
+        names = dict[GeometryId, str]()
         owners = {body.index(): name for name, body in self._bodies.items()}
         fixtures = {body.index(): body.model_instance() for body in self._arm.fixed[1:]}
         inspector = self._scene_graph.model_inspector()
@@ -98,6 +100,16 @@ class ClearanceScene:
                 of_its_own = inspector.GetName(geometry).split("::")[-1]
                 names[geometry] = of_its_own if index in shapes else name
         return names
+
+    def _tops(self, names: Collection[str]) -> tuple[float, ...]:
+        query, inspector = self._query_port.Eval(self._geometry_context), self._scene_graph.model_inspector()
+        tops = dict.fromkeys(names, -np.inf)
+        for geometry, name in self._names.items():
+            if name in tops and (box := inspector.GetObbInGeometryFrame(geometry)):
+                X_TB = query.GetPoseInWorld(geometry) @ box.pose()
+                half_height = np.abs(X_TB.rotation().matrix()[2]) @ box.half_width()
+                tops[name] = max(tops[name], float(X_TB.translation()[2] + half_height))
+        return tuple(tops.values())
 
     def put(self, objects: Sequence[SceneObject]) -> None:
         """Puts objects at their poses; the arm holds nothing any more."""

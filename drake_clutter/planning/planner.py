@@ -85,7 +85,7 @@ class PickPlacePlanner:
         if hit := scene.close(self.tool.robot.home, self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
             return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
-        tops = [block.top for block in unseen]
+        tops = [*scene.fixture_tops, *(block.top for block in unseen)]
         attempt = Attempts(self.cell, self.planner, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
             for q_pick, q_place, yaw in attempt.ends(grasp):

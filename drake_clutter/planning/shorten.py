@@ -200,7 +200,9 @@ def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floa
     reach[: way.still] = reach[-way.still :] = 0.0
     prog = MathematicalProgram()
     x = prog.NewContinuousVariables(points.size + 1)
-    prog.AddBoundingBoxConstraint((points - reach).ravel(), (points + reach).ravel(), x[:-1])
+    lower, upper = way.robot.position_limits.T
+    nearest, furthest = np.maximum(points - reach, lower), np.minimum(points + reach, upper)
+    prog.AddBoundingBoxConstraint(nearest.ravel(), furthest.ravel(), x[:-1])
     prog.AddBoundingBoxConstraint(0.05**2, (2 * duration + 0.1) ** 2, x[-1:])
     control = x[:-1].reshape(CONTROL_POINTS, n)
     for upright, end, inwards in ((way.upright[0], 0, 1), (way.upright[1], CONTROL_POINTS - 1, -1)):
