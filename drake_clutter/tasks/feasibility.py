@@ -50,7 +50,7 @@ class MoveRow:
         planning_s: s to find out. motion_s: s from home to home.
         attempts: grasps and branches that were looked at.
         clearance: m, the least of the way; infinite if nothing is within 3 cm. between: what is so close.
-        manipulability: The least at the grasp and at the place.
+        manipulability: m^3, the least at the grasp and at the place.
     """
 
     setup: str
