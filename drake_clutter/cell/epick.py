@@ -53,7 +53,8 @@ def epick_sdf(
     p_GCm = np.array([0.0, 0.0, -cup_length / 2])
     body_link = sdf_link("body", "", mass, p_FCm, rods, rods, "cylinder")
     cup = (bellows,)
-    cup_pose = "\n      " + sdf_pose(np.array([0.0, 0.0, tube + cup_length]), Rotation.identity(), "body")
+    p_FG = np.array([0.0, 0.0, tube + cup_length])
+    cup_pose = "\n      " + sdf_pose(p_FG, Rotation.identity(), "body")
     cup_link = sdf_link("cup", cup_pose, CUP_MASS, p_GCm, cup, cup, "cylinder")
     lower = f"<lower>{-stroke:g}</lower>"
     damping = f"<damping>{_CRITICAL * 2 * (stiffness * _LOAD) ** 0.5:.6g}</damping>"

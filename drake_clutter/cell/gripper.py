@@ -1,7 +1,7 @@
 """What a gripper of a cell is asked: where it grasps, what it holds, and how it looks in a plant.
 
-Frames: T the support; F the robot's flange; G the gripper, origin where it touches an object, z out of
-the tool, into the object; O the object.
+Frames: T the support; F the robot's flange; G the gripper, origin where it touches an object, z out
+of the tool, into the object; O the object.
 """
 
 import math
@@ -34,7 +34,7 @@ class Payload:
 
     @property
     def along_axis(self) -> float:
-        """Greatest acceleration along each axis alone, so that the vector is within the limit [m/s^2]."""
+        """Greatest acceleration along each axis, so that the vector is within the limit [m/s^2]."""
         return self.acceleration / math.sqrt(3)
 
 

@@ -126,7 +126,7 @@ class SuctionGripper(Model):
             p_GCm = X_TG.rotation().inverse() @ (X_TO.translation() - X_TG.translation())
             acceleration = self.max_acceleration(object_class.mass, p_GCm)
             if acceleration >= sampling.least_acceleration:
-                # How the load hangs to the side depends on the yaw; its distance from the axis does not.
+                # How the load hangs to the side depends on the yaw; its depth below G does not.
                 p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
                 payload = Payload(object_class.mass, p_GCm, round(acceleration, 1))
                 found.append(Grasp(X_TG.translation(), payload))
@@ -164,7 +164,7 @@ class SuctionGripper(Model):
         bending = np.hypot(moment[..., 0], moment[..., 1])
         opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / self.pull
         pressed = np.maximum(self.pull - force[..., 2], 1e-9)
-        # A thin ring that turns in place slides with its whole circumference at the lever arm of its radius.
+        # A thin ring that turns in place slides with its whole circumference at its radius.
         tangential = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius)
         return np.asarray(np.maximum(opening, tangential / (self.friction * pressed)))
 

@@ -103,7 +103,8 @@ def setups(
 
     Args:
         bases: X_TB as x, y, z (m) and yaw (deg). trays: X_BT likewise.
-        files: YAML with fields of `WorkCell` over those of the default; whole cells if they name a robot's model.
+        files: YAML with fields of `WorkCell` over those of the default; whole cells if they name
+            a robot's model.
         default: A cell.
 
     Raises:

@@ -20,7 +20,13 @@ from drake_clutter.planning.clearance import Clearance, ClearanceScene
 from drake_clutter.planning.paths import SPACING, least_time, sampled, slowed, smooth, timed
 from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.shorten import Wall, Way, shortened
-from drake_clutter.planning.tool_kinematics import CarryWay, ToolKinematics, downwards, inverse, lifted
+from drake_clutter.planning.tool_kinematics import (
+    CarryWay,
+    ToolKinematics,
+    downwards,
+    inverse,
+    lifted,
+)
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
 from drake_clutter.validation import Between, NonNegative, config_class
@@ -230,7 +236,7 @@ class Attempts:
         pick, place = self._pick_end(X_OG, q_pick), None
         if pick is None:
             return None
-        chosen = self._robot.vertical_tool_rows is not None  # else the way decides how the arm arrives
+        chosen = self._robot.vertical_tool_rows is not None  # else the way decides how it arrives
         if chosen and (place := self._place_end(X_OG, q_place)) is None:
             return None
         hangs = X_pick[2, 3] - self._picked.bounds_T[0][2]
@@ -356,7 +362,7 @@ class Attempts:
         return None if None in found else min((c for c in found if c), key=lambda c: c.distance)
 
     def _tilted(self, points: Floats, progress: int) -> bool:
-        """Whether the gripper leaves the vertical at points (m, n), which those of a robot with linear rows do not."""
+        """Whether the gripper leaves the vertical at points (m, n); never with linear rows."""
         if self._robot.vertical_tool_rows is not None:
             return False
         tilt = float(np.linalg.norm(self._tool.axis(points)[:, :2], axis=1).max())
@@ -380,8 +386,8 @@ class Attempts:
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
         acceleration, jacobian = payload.along_axis, self._scene.cup_jacobian
-        way = Way(phase.trajectory, self._robot, upright, carried, acceleration, walls, jacobian, self._tool.axis)
-        quick = shortened(way)
+        ends_of = phase.trajectory, self._robot, upright, carried
+        quick = shortened(Way(*ends_of, acceleration, walls, jacobian, self._tool.axis))
         trajectory = slowed(quick, self._cell, payload) if quick else None
         if trajectory is None or trajectory.end_time() >= phase.sure:
             return phase

@@ -102,7 +102,8 @@ class ClearanceScene:
         return names
 
     def _tops(self, names: Collection[str]) -> tuple[float, ...]:
-        query, inspector = self._query_port.Eval(self._geometry_context), self._scene_graph.model_inspector()
+        query = self._query_port.Eval(self._geometry_context)
+        inspector = self._scene_graph.model_inspector()
         tops = dict.fromkeys(names, -np.inf)
         for geometry, name in self._names.items():
             if name in tops and (box := inspector.GetObbInGeometryFrame(geometry)):

@@ -178,7 +178,12 @@ def _limits(way: Way, points: Floats, duration: float) -> _Rows:
     return rows
 
 
-def _keep_level(way: Way, points: Floats, prog: MathematicalProgram, control: NDArray[np.object_]) -> None:
+def _keep_level(
+    way: Way,
+    points: Floats,
+    prog: MathematicalProgram,
+    control: NDArray[np.object_],
+) -> None:
     """Keeps the tool vertical: exactly, or at control points to first order of the last round's.
 
     In the latter case not at those that are fixed, or move straight up, which are vertical already.

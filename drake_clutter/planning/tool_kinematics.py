@@ -1,7 +1,7 @@
 """Kinematics of a cell's gripper, and ways of the robot along poses of it.
 
-Frames: T the support; B the robot's base; F its flange; G the gripper. Poses are arrays here, as the
-robot's compiled kinematics takes them in batches.
+Frames: T the support; B the robot's base; F its flange; G the gripper. Poses are arrays here, as
+the robot's compiled kinematics takes them in batches.
 """
 
 import math
@@ -170,8 +170,8 @@ class ToolKinematics:
     def homewards(self, q: Floats) -> list[Floats]:
         """Return ways home, (m, n) each.
 
-        The first is straight. The second stays at the same height until G is, seen from above, where
-        it is at home.
+        The first is straight. The second stays at the same height until G is, seen from above,
+        where it is at home.
         """
         home = self.robot.home
         X_TG_home, X_TG = self.pose(home), self.pose(q)

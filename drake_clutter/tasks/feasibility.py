@@ -155,6 +155,7 @@ class FeasibilityStudy:
         if isinstance(found, NoPlan):
             return replace(row, result=found.reason.value, about=found.about, number=found.number)
         carry = found.phases[1].trajectory
+        ends = carry.vector_values([0.0, carry.end_time()]).T
         nearest = min((phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance)
         return replace(
             row,
@@ -163,7 +164,7 @@ class FeasibilityStudy:
             attempts=found.attempts,
             clearance=round(nearest.distance, 6),
             between=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
-            manipulability=float(robot.manipulability(carry.vector_values([0.0, carry.end_time()]).T).min()),
+            manipulability=float(robot.manipulability(ends).min()),
         )
 
     def noise(self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]) -> list[NoiseRow]:
@@ -189,7 +190,8 @@ class FeasibilityStudy:
         X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
         if not gripper.seals(picked.object_class, X_OG):
             return PlanFailure.NO_SEAL.value
-        around, touching = planner.clearance_scene(scene.objects), (*gripper.contact_links, plan.pick)
+        around = planner.clearance_scene(scene.objects)
+        touching = (*gripper.contact_links, plan.pick)
         for phase in plan.phases:
             around.put(scene.objects)
             if phase.name == "carry":
