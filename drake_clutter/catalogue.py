@@ -8,22 +8,27 @@ x, y, z are its sizes in the order of the catalogue, a cylinder's axis is z, a m
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Annotated, Any, Self
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_load_typed
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, refusal, shown
 from drake_clutter.resources import shipped_path
+from drake_clutter.validation import Between, Model, Text, allowed, validate
+from drake_clutter.yaml_text import read_yaml
 
 CATALOGUE_FILE = "catalogue.yaml"
 _CYLINDER_SIDES = 32
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
+_NONE: Any = Field(default_factory=dict)
+_Size = Annotated[float, Between(3, 1000)]
 _GRAMMAR_WORDS = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
 
 
@@ -50,15 +55,14 @@ class PairArrangement(Enum):
     STANDING = "standing"
 
 
-@dataclass
-class Label:
-    """How the texture of a class is drawn. Colours are sRGB hex strings.
+class Label(Model):
+    """How the texture of a class is drawn. Colors are sRGB hex strings.
 
     Attributes:
-        title: the words on the front, at most 24 characters; the class's name when empty.
-        base: colour of the body.
-        accent: colour of the band and the motif.
-        motif: one of `drake_clutter.assets.MOTIFS`.
+        title: The words on the front, at most 24 characters; the class's name when empty.
+        base: Color of the body.
+        accent: Color of the band and the motif.
+        motif: One of `drake_clutter.assets.MOTIFS`.
     """
 
     title: str = ""
@@ -67,42 +71,69 @@ class Label:
     motif: str = "dots"
 
 
-@dataclass
-class ClassEntry:
+def _class_name(name: str) -> str:
+    if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
+        words = ", ".join(sorted(_GRAMMAR_WORDS))
+        raise allowed(f"a name of lower-case letters, digits and _, and none of {words}")
+    return name
+
+
+class ClassEntry(Model):
     """One class as it stands in `catalogue.yaml`.
 
     Attributes:
-        shape: box, cylinder or mesh.
-        size_mm: (3,) mm; a cylinder's is (diameter, diameter, height); a mesh's is measured, and must be left out.
-        mass_g: grams.
-        source: where size and mass come from.
-        pairs: the arrangements in which two of it stand as a pair: lying, standing.
-        only_rest: flat, side or upright: how it rests in all orientations (cans stand, a marker lies); empty if it varies.
-        mesh: a watertight mesh in metres, beside the catalogue; for shape mesh only.
-        label: how its texture is drawn.
+        shape: Box, cylinder or mesh.
+        size_mm: Extents [mm]; a cylinder's are diameter, diameter, height; a mesh's is measured,
+            and must be left out. Shape (3,).
+        mass_g: Mass [g].
+        source: Where size and mass come from.
+        pairs: The arrangements in which two of it stand as a pair.
+        only_rest: How it rests in all orientations (cans stand, a marker lies); None if it varies.
+        mesh: A watertight mesh in meters, beside the catalogue; for shape mesh only.
+        label: How its texture is drawn.
     """
 
-    shape: str = ""
-    size_mm: list[float] = field(default_factory=list)
-    mass_g: float = math.nan
+    shape: Shape
+    size_mm: tuple[_Size, _Size, _Size] | None = None
+    mass_g: Annotated[float, Between(1e-6, 20_000)]
     source: str = ""
-    pairs: list[str] = field(default_factory=list)
-    only_rest: str = ""
-    mesh: str = ""
-    label: Label = field(default_factory=Label)
+    pairs: tuple[PairArrangement, ...] = ()
+    only_rest: Rest | None = None
+    mesh: Text | None = None
+    label: Label = Label()
+
+    @field_validator("size_mm")
+    @classmethod
+    def _round(cls, size: tuple[float, ...] | None, info: ValidationInfo) -> Any:
+        if size and info.data.get("shape") is Shape.CYLINDER and size[0] != size[1]:
+            raise allowed("diameter, diameter, height: a cylinder's first two sizes are equal")
+        return size
+
+    @field_validator("pairs")
+    @classmethod
+    def _once(cls, pairs: tuple[PairArrangement, ...]) -> tuple[PairArrangement, ...]:
+        if len(set(pairs)) != len(pairs):
+            raise allowed("each arrangement once")
+        return pairs
+
+    @model_validator(mode="after")
+    def _size_or_mesh(self) -> Self:
+        is_mesh = self.shape is Shape.MESH
+        if is_mesh == (self.mesh is None) or is_mesh == (self.size_mm is not None):
+            raise allowed("`mesh` and no `size_mm` for a mesh, `size_mm` and no `mesh` for others")
+        return self
 
 
-@dataclass
-class CatalogueFile:
+class CatalogueFile(Model):
     """The schema of `catalogue.yaml`.
 
     Attributes:
-        classes: by name (lower case, digits, underscores).
-        object_sets: named lists of classes; a user's catalogue may name shipped classes too.
+        classes: By name (lower case, digits, underscores).
+        object_sets: Named lists of classes; a user's catalogue may name shipped classes too.
     """
 
-    classes: dict[str, ClassEntry] = field(default_factory=dict)
-    object_sets: dict[str, list[str]] = field(default_factory=dict)
+    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = _NONE
+    object_sets: dict[str, tuple[str, ...]] = _NONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,51 +240,26 @@ def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _checked_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
-    if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
-        raise InputError(
-            f"{where}: bad class name; allowed are lower-case letters, digits and _, and none of "
-            + ", ".join(sorted(_GRAMMAR_WORDS))
-        )
-    try:
-        shape = Shape(entry.shape)
-    except ValueError:
-        raise InputError(f"{where}.shape: {entry.shape!r}; allowed are {', '.join(s.value for s in Shape)}") from None
-    try:
-        pairs = tuple(PairArrangement(pair) for pair in entry.pairs)
-    except ValueError:
-        raise InputError(f"{where}.pairs: {entry.pairs}; allowed are {', '.join(p.value for p in PairArrangement)}") from None
-    if entry.only_rest and entry.only_rest not in {rest.value for rest in Rest}:
-        raise InputError(f"{where}.only_rest: {entry.only_rest!r}; allowed are {', '.join(r.value for r in Rest)}, or none")
-    only_rest = Rest(entry.only_rest) if entry.only_rest else None
-    if len(set(pairs)) != len(pairs):
-        raise InputError(f"{where}.pairs: {entry.pairs}; each arrangement may stand once")
-    if not 0 < entry.mass_g < 20_000:
-        raise InputError(f"{where}.mass_g: {entry.mass_g}; allowed is more than 0 and less than 20000")
+def _object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
     mesh = folder / entry.mesh if entry.mesh else None
-    if (shape is Shape.MESH) != (mesh is not None) or (shape is Shape.MESH) == bool(entry.size_mm):
-        raise InputError(f"{where}: a mesh class has `mesh` and no `size_mm`; a box or cylinder has `size_mm` and no `mesh`")
     if mesh is not None:
         size = _mesh_size(mesh, where)
     else:
-        if len(entry.size_mm) != 3 or not all(3 <= s <= 1000 for s in entry.size_mm):
-            raise InputError(f"{where}.size_mm: {entry.size_mm}; allowed are three numbers from 3 to 1000")
+        assert entry.size_mm is not None
         x, y, z = (s / 1000 for s in entry.size_mm)
         size = (x, y, z)
-        if shape is Shape.CYLINDER and x != y:
-            raise InputError(f"{where}.size_mm: {entry.size_mm}; a cylinder's first two sizes are its diameter, twice")
-    return ObjectClass(name, shape, size, entry.mass_g / 1000, entry.source, pairs, only_rest, mesh, entry.label, folder / name)
-
-
-def _read(folder: Path) -> CatalogueFile:
-    path = folder / CATALOGUE_FILE
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a catalogue is a folder that holds {CATALOGUE_FILE}")
-    try:
-        read: CatalogueFile = yaml_load_typed(schema=CatalogueFile, filename=str(path), defaults=CatalogueFile())
-    except Exception as error:  # Drake's reader raises many kinds; every one means a broken file
-        raise InputError(f"{path}: {error}") from error
-    return read
+    return ObjectClass(
+        name,
+        entry.shape,
+        size,
+        entry.mass_g / 1000,
+        entry.source,
+        entry.pairs,
+        entry.only_rest,
+        mesh,
+        entry.label,
+        folder / name,
+    )
 
 
 @lru_cache
@@ -271,18 +277,20 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     classes: dict[str, ObjectClass] = {}
     object_sets: dict[str, tuple[str, ...]] = {}
     for asset_folder in folders:
-        read = _read(asset_folder)
         path = asset_folder / CATALOGUE_FILE
+        if not path.is_file():
+            what = f"no such file; a catalogue is a folder that holds {CATALOGUE_FILE}"
+            raise refusal(str(path), what)
+        read = validate(CatalogueFile, read_yaml(path, "a catalogue"), str(path))
         for name, entry in read.classes.items():
             if name in classes:
                 raise InputError(f"{path}: classes.{name}: is shipped already; choose another name")
-            classes[name] = _checked_class(name, entry, asset_folder, f"{path}: classes.{name}")
+            classes[name] = _object_class(name, entry, asset_folder, f"{path}: classes.{name}")
         for set_name, members in read.object_sets.items():
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
-                raise InputError(
-                    f"{path}: object_sets.{set_name}: {unknown or members}; allowed is a list, without repeats, of "
-                    + ", ".join(classes)
-                )
-            object_sets[set_name] = tuple(members)
+                what = f"a list, without repeats, of {', '.join(classes)}"
+                found = f"object_sets.{set_name}: {shown(unknown or list(members))}"
+                raise refusal(str(path), f"{found}; allowed is {what}")
+            object_sets[set_name] = members
     return Catalogue(classes, object_sets, folders)

@@ -105,10 +105,10 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Clutt
 
 
 def upgrade(given: Any) -> Any:
-    """Return a config document with the fields of version 0.1 (camera, layout.tray_side, arm) moved into its cell."""
+    """Return a document with the camera, tray and arm of version 0.1 in its cell."""
     if not isinstance(given, dict):
         return given
-    made = {key: upgrade(value) for key, value in given.items()}
+    made = {key: value if key == "cell" else upgrade(value) for key, value in given.items()}
     cell: dict[str, Any] = {}
     if isinstance(camera := made.get("camera"), dict):
         del made["camera"]
@@ -118,11 +118,17 @@ def upgrade(given: Any) -> Any:
         cell["support"] = {"size": [layout["tray_side"]] * 2}
     if isinstance(arm := made.get("arm"), dict):
         del made["arm"]
-        world = made.setdefault("world", {})
-        world["cell"] = {**world.get("cell", {}), **upgrade_cell(arm)}
+        made["world"] = _over({"cell": upgrade_cell(arm)}, made.get("world", {}))
     if cell:
-        made["cell"] = {**cell, **made.get("cell", {})}
+        made["cell"] = _over(cell, made.get("cell", {}))
     return made
+
+
+def _over(moved: Any, given: Any) -> Any:
+    """Return what moved from elsewhere with what is given over it."""
+    if not isinstance(given, dict) or not isinstance(moved, dict):
+        return given
+    return {**moved, **{key: _over(moved.get(key), value) for key, value in given.items()}}
 
 
 def upgrade_head(given: Any) -> Any:
@@ -134,7 +140,7 @@ def _with_complete_cells(given: Any) -> Any:
     if not isinstance(given, dict):
         return given
     made = {key: _with_complete_cells(value) for key, value in given.items()}
-    if isinstance(cell := made.get("cell"), dict):
+    if isinstance(cell := given.get("cell"), dict):
         made["cell"] = to_plain(override(default_cell(), cell, "cell"))
     return made
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import reprlib
 import secrets
 import sys
 from collections.abc import Iterator
@@ -10,9 +11,35 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+_LONGEST_MESSAGE = 300
+"""Characters after the name of the file; a longer message is cut."""
+
 
 class InputError(ValueError):
     """A file, option or value that a user gave and that cannot be used; the message says what is allowed."""
+
+
+def refusal(source: str, message: str) -> InputError:
+    """Return the error for a misuse, in one line of bounded length.
+
+    Args:
+        source: The file or option.
+        message: Field, value and what is allowed.
+    """
+    line = " ".join(message.split())
+    short = line if len(line) <= _LONGEST_MESSAGE else f"{line[: _LONGEST_MESSAGE - 4]} ..."
+    return InputError(f"{source}: {short}")
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, at most 80 characters long."""
+    short = reprlib.Repr()
+    short.maxlevel, short.maxstring, short.maxother = 2, 40, 40
+    try:
+        text = short.repr(value)
+    except ValueError:  # an integer of too many digits
+        return "a number"
+    return text if len(text) <= 80 else f"{text[:76]} ..."
 
 
 @contextmanager

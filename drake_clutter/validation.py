@@ -1,23 +1,31 @@
-"""Reads typed data from files and options: one line names the file, the field, the value and what is allowed.
+"""Reads typed data from files and options.
 
-Schemas are pydantic models or pydantic dataclasses. `Between` and `NonEmpty` are the annotations for what a value may be.
+Misuse is one line that names the file, the field, the value and what is allowed. Schemas are
+pydantic models or pydantic dataclasses.
 """
 
 import dataclasses
-import json
 import math
-import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform
 
 import pydantic.dataclasses
-import yaml
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
-from drake_clutter.files import InputError
+from drake_clutter.files import refusal, shown
+from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
 
 Schema = TypeVar("Schema")
 
@@ -31,26 +39,18 @@ _POSE_FIELDS = {
 }
 """Components of a pose that a setting may name."""
 _KINDS = {
-    "bool_type": "true or false",
-    "string_type": "a text",
-    "list_type": "a list",
-    "tuple_type": "a list",
-    "dict_type": "a mapping",
-    "model_type": "a mapping",
-    "dataclass_type": "a mapping",
-    "model_attributes_type": "a mapping",
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "finite_number": "a finite number",
+    "bool": "true or false",
+    "string": "a text",
+    "float": "a number",
+    "int": "a whole number",
+    "finite": "a finite number",
 }
-"""What is allowed, by pydantic's type of the error."""
-_ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
+"""What is allowed, by the first word of pydantic's type of the error."""
 
 
 @dataclass(frozen=True)
 class Between:
-    """Annotation of an int or float: finite, and between two values.
+    """Annotation of an int or float: finite, between two values, and of that type.
 
     Attributes:
         low: Least value.
@@ -61,26 +61,20 @@ class Between:
     high: float = math.inf
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Validate without converting: a bool is not a number, and a float is not an int."""
-        whole = source is int
-
-        def check(value: Any) -> Any:
-            kind: Any = int if whole else (int, float)
-            if isinstance(value, bool) or not isinstance(value, kind):
-                raise self._error(whole)
-            if not self.low <= value <= self.high or not abs(value) < 1e300:
-                raise self._error(whole)
-            return int(value) if whole else float(value)
-
-        return core_schema.no_info_plain_validator_function(
-            check,
-            json_schema_input_schema=core_schema.int_schema() if whole else core_schema.float_schema(),
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda value: value),
+        """Return the schema of a number in the range."""
+        low = None if self.low == -math.inf else self.low
+        high = None if self.high == math.inf else self.high
+        if source is int:
+            least, greatest = (None if bound is None else int(bound) for bound in (low, high))
+            number: CoreSchema = core_schema.int_schema(strict=True, ge=least, le=greatest)
+        else:
+            number = core_schema.float_schema(strict=True, ge=low, le=high, allow_inf_nan=False)
+        what = "a whole number" if source is int else "a finite number"
+        if low is not None or high is not None:
+            what += f" from {self.low:g} to {self.high:g}"
+        return core_schema.custom_error_schema(
+            number, "allowed", custom_error_message="{what}", custom_error_context={"what": what}
         )
-
-    def _error(self, whole: bool) -> PydanticCustomError:
-        number = "a whole number" if whole else "a finite number"
-        return allowed(f"{number} from {self.low:g} to {self.high:g}")
 
 
 def allowed(what: str) -> PydanticCustomError:
@@ -94,34 +88,47 @@ NonNegative = Annotated[float, Between(0.0, math.inf)]
 """A finite number that is not negative."""
 Positive = Annotated[float, Between(1e-12, math.inf)]
 """A finite number above zero."""
+Share = Annotated[float, Between(0.0, 1.0)]
+"""A number from 0 to 1."""
+Whole = Annotated[int, Between(-math.inf, math.inf)]
+"""Any whole number."""
+Flag = Annotated[bool, Strict()]
+"""True or false."""
+Text = Annotated[str, Field(strict=True, min_length=1)]
+"""A text that is not empty."""
 Vector3 = tuple[Finite, Finite, Finite]
 """Three finite numbers."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def config_class(cls: type[Schema]) -> type[Schema]:
-    """Return a class as a frozen, validated dataclass that takes no field but those that are declared."""
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))(cls)
+    """Return a class as a frozen, validated dataclass that takes no field but those declared."""
+    config = ConfigDict(extra="forbid")
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
     return cast(type[Schema], made)
 
 
 class Model(BaseModel):
     """Base of what is read from files: frozen, and no field but those that are declared."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,), arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,))
 
 
+@cache
 def _adapter(schema: Any) -> TypeAdapter[Any]:
-    if schema not in _ADAPTERS:
-        _ADAPTERS[schema] = TypeAdapter(schema)
-    return _ADAPTERS[schema]
+    return TypeAdapter(schema)
+
+
+@cache
+def _json_schema(schema: Any) -> dict[str, Any]:
+    return _adapter(schema).json_schema()
 
 
 def validate(schema: type[Schema], given: Any, source: str) -> Schema:
     """Return `given` as an instance of a schema.
 
     Args:
-        schema: A pydantic model or dataclass.
+        schema: A pydantic model or dataclass, or a container of them.
         given: What was read.
         source: The file or option that it was read from, for the message.
 
@@ -129,114 +136,101 @@ def validate(schema: type[Schema], given: Any, source: str) -> Schema:
         InputError: The first field that cannot be used, in one line.
     """
     try:
-        validated: Schema = _adapter(schema).validate_python(given)
+        validated: Schema = _adapter(cast(Hashable, schema)).validate_python(given)
     except ValidationError as error:
-        raise InputError(f"{source}: {_message(schema, error.errors()[0])}") from None
+        raise refusal(source, _message(schema, error.errors(include_url=False)[0])) from None
     return validated
 
 
 def _message(schema: Any, error: ErrorDetails) -> str:
-    path = [part for part in error["loc"] if not _is_variant(part)]
-    field = ".".join(str(part) for part in path) or "the file"
-    kind = error["type"]
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{field}: is unknown; allowed are {', '.join(_fields_at(schema, path[:-1]))}"
+    kind, loc = error["type"], error["loc"]
+    if kind in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
+        owner, node = _place(schema, loc[:-1])
+        names = ", ".join(node.get("properties", {}))
+        return f"{_joined(owner, loc[-1])}: is unknown; allowed are {names}"
     if kind in ("missing", "missing_argument"):
-        return f"{field}: is missing"
-    if kind == "union_tag_not_found":
-        return f"{field}.kind: is missing; allowed is {error['ctx']['discriminator']}"
-    if kind == "union_tag_invalid":
-        shown = reprlib.repr(error["ctx"]["tag"])
-        return f"{field}.kind: {shown}; allowed are {error['ctx']['expected_tags']}"
-    what = _KINDS.get(kind, error["msg"])
-    if kind in ("allowed",):
-        what = error["msg"]
-    elif kind == "literal_error" or kind == "enum":
-        what = str(error["ctx"]["expected"])
-    elif kind in ("too_short", "too_long", "missing_positional_only_argument"):
-        what = f"a list of {error['ctx'].get('min_length', error['ctx'].get('max_length'))} values"
-    return f"{field}: {_shown(error['input'])}; allowed is {what}"
+        owner, node = _place(schema, loc[:-1])
+        if "prefixItems" in node:
+            return _line(owner, error["input"], _list(node))
+        needed = ", ".join(node.get("required", {}))
+        return f"{_joined(owner, loc[-1])}: is missing; needed are {needed}"
+    field, node = _place(schema, loc)
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
+        tag = error["input"].get(node["discriminator"]["propertyName"])
+        field = _joined(field, node["discriminator"]["propertyName"])
+        return _line(field, tag, f"one of {', '.join(node['discriminator']['mapping'])}")
+    return _line(field, error["input"], _allowed(error, node))
 
 
-def _is_variant(part: Any) -> bool:
-    """Whether a part of a location names a member of a union, which no file does."""
-    return isinstance(part, str) and ("[" in part or part.startswith("function-"))
+def _line(field: str, value: Any, what: str) -> str:
+    return f"{field}{': ' if field else ''}{shown(value)}; allowed is {what}"
 
 
-def _shown(value: Any) -> str:
-    try:
-        return reprlib.repr(value)
-    except ValueError:  # an integer of too many digits
-        return "a number"
+def _allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
+    kind = error["type"]
+    if kind in ("literal_error", "enum"):
+        values = [str(value) for value in node.get("enum", [node.get("const")])]
+        return values[0] if len(values) == 1 else f"one of {', '.join(values)}"
+    if kind in ("dict_type", "model_type", "dataclass_type", "model_attributes_type"):
+        names = ", ".join(node.get("required") or node.get("properties", ()))
+        return f"a mapping with {names}" if names else "a mapping"
+    if kind == "too_short" and node.get("type") == "object":
+        return "a mapping of at least one entry"
+    if kind in ("list_type", "tuple_type", "too_long", "too_short"):
+        return _list(node)
+    return _KINDS.get(kind.split("_")[0], error["msg"])
 
 
-def _fields_at(schema: Any, path: Sequence[int | str]) -> list[str]:
-    """Return the names of the fields that a mapping at a place of a schema may have."""
-    document = _adapter(schema).json_schema(mode="validation")
-    node: Any = document
-    for part in path:
-        node = _resolved(document, node)
-        if "properties" in node and part in node["properties"]:
-            node = node["properties"][part]
-        elif "oneOf" in node or "anyOf" in node:
-            variants = [_resolved(document, v) for v in node.get("oneOf", node.get("anyOf"))]
-            node = next((v for v in variants if str(part) in str(v.get("properties", {}).get("kind"))), variants[0])
+def _list(node: Mapping[str, Any]) -> str:
+    if "prefixItems" not in node:
+        return "a list of at least one entry" if node.get("minItems") else "a list"
+    items = node["prefixItems"]
+    what = "numbers" if all(item.get("type") == "number" for item in items) else "values"
+    return f"a list of {len(items)} {what}"
+
+
+def _place(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
+    """Return how a place of a document is named, and its part of the schema's JSON schema."""
+    document = _json_schema(schema)
+    field, node = "", _resolved(document, document)
+    for part in loc:
+        if part == "[key]":  # of a mapping with a key that is not allowed
+            break
+        if "discriminator" in node:  # the part is a member of the union, which no file names
+            node = _resolved(document, {"$ref": node["discriminator"]["mapping"][part]})
+            continue
+        field = _joined(field, part)
+        if isinstance(part, int):
+            items = node.get("prefixItems", ())
+            below = items[part] if part < len(items) else node.get("items")
         else:
-            node = node.get("additionalProperties") or node.get("items") or {}
-    return list(_resolved(document, node).get("properties", {}))
+            below = node.get("properties", {}).get(part) or node.get("additionalProperties")
+        node = _resolved(document, below)
+    return field, node
 
 
-def _resolved(document: Mapping[str, Any], node: Any) -> Any:
-    while isinstance(node, dict) and "$ref" in node:
-        node = document["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+def _joined(field: str, part: int | str) -> str:
+    if isinstance(part, int):
+        return f"{field}[{part}]"
+    name = str(part) if str(part).isprintable() and len(str(part)) <= 40 else shown(part)
+    return f"{field}.{name}" if field else name
+
+
+def _resolved(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
+    while isinstance(node, dict) and ("$ref" in node or "anyOf" in node):
+        reference = node.get("$ref", "").rsplit("/", 1)[-1]
+        node = document["$defs"][reference] if reference else node["anyOf"][0]
     return node if isinstance(node, dict) else {}
 
 
 def to_plain(value: Any) -> Any:
     """Return a config as mappings, lists, numbers and texts."""
-    return _adapter(type(value)).dump_python(value, mode="json")
+    return _adapter(cast(Hashable, type(value))).dump_python(value, mode="json", by_alias=True)
 
 
 def config_yaml(config: Any) -> str:
     """Return a config as YAML, every field written out."""
-    return str(yaml.safe_dump(to_plain(config), sort_keys=False, default_flow_style=None, width=100))
-
-
-def read_yaml(path: Path, allowed_content: str) -> Any:
-    """Return what a YAML file holds.
-
-    Args:
-        path: The file.
-        allowed_content: What it may hold, for the message.
-
-    Raises:
-        InputError: It cannot be read, or is not YAML.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed is {allowed_content}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not YAML ({error}); allowed is {allowed_content}") from error
-    return parse_yaml(text, str(path), allowed_content)
-
-
-def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
-    """Return what a YAML text holds.
-
-    Args:
-        text: The text.
-        source: Where it was read, for the message.
-        allowed_content: What it may hold, for the message.
-
-    Raises:
-        InputError: It is not YAML.
-    """
-    try:
-        return yaml.load(text, Loader=yaml.CSafeLoader)
-    except Exception as error:  # PyYAML's constructors raise many kinds for a bad date, number or nesting
-        words = " ".join(str(error).split())
-        raise InputError(f"{source}: is not YAML ({words}); allowed is {allowed_content}") from error
+    return yaml_text(to_plain(config), width=100)
 
 
 def load_typed(
@@ -245,12 +239,13 @@ def load_typed(
     settings: Sequence[str] = (),
     convert: Callable[[Any], Any] = lambda given: given,
 ) -> Schema:
-    """Return a config: the defaults, over them the fields that a file names, over those single fields.
+    """Return a config: the defaults, over them a file's fields, over those single fields.
 
     Args:
         defaults: A complete config.
         path: A YAML file.
-        settings: Fields as text, such as "camera.altitude=2"; x, y, z, roll, pitch and yaw name a pose's components.
+        settings: Fields as text, such as "layout.stack_gap=0.02"; x, y, z, roll, pitch and yaw
+            name a pose's components, numbers a list's.
         convert: Turns what older versions wrote into today's fields.
 
     Raises:
@@ -261,73 +256,70 @@ def load_typed(
         given = read_yaml(path, "a mapping of config fields")
         config = override(config, convert({} if given is None else given), str(path))
     for setting in settings:
-        config = override(config, convert(parse_setting(setting, to_plain(config))), f"--set {setting}")
+        given = _parse_setting(setting, config)
+        config = override(config, convert(given), f"--set {setting}")
     return config
 
 
-def parse_setting(setting: str, plain: Any = None) -> dict[str, Any]:
-    """Return FIELD=VALUE as nested mappings.
-
-    Args:
-        setting: The text.
-        plain: The config that it is for, see `to_plain`: poses and lists in it may be set by component.
-
-    Raises:
-        InputError: The text is no setting.
-    """
+def _parse_setting(setting: str, config: Any) -> Any:
+    """Return FIELD=VALUE as nested mappings, with the rest of a list or collection."""
     name, equals, text = setting.partition("=")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        equals = ""
     if not equals or not name:
-        raise InputError(f"--set {setting}: allowed is FIELD=VALUE, such as exploration.max_moves=20")
+        raise refusal(f"--set {setting}", "allowed is FIELD=VALUE, such as layout.stack_gap=0.02")
+    value = parse_yaml(text, f"--set {setting}", "FIELD=VALUE with a YAML value")
     parts = name.split(".")
     for depth in range(len(parts) - 1, -1, -1):
-        owner, part = _at(plain, parts[:depth]), parts[depth]
-        if isinstance(owner, dict) and {"translation", "rpy_deg"} <= owner.keys() and part in _POSE_FIELDS:
-            field, index = _POSE_FIELDS[part]
-            value = {field: [value if k == index else old for k, old in enumerate(owner[field])]}
-        elif isinstance(owner, list) and part.isdecimal() and int(part) < len(owner):
-            value = [value if k == int(part) else old for k, old in enumerate(owner)]
+        owner, part = _at(config, parts[:depth]), parts[depth]
+        if part in _POSE_FIELDS and {"translation", "rpy_deg"} <= _fields(owner).keys():
+            part, index = _POSE_FIELDS[part]
+            value = _replaced(getattr(owner, part), index, value)
+        if isinstance(owner, tuple) and part.isdecimal() and int(part) < len(owner):
+            value = _replaced(owner, int(part), value)
         else:
-            value = {part: value}
-    nested: dict[str, Any] = value
-    return nested
+            value = {**(owner if isinstance(owner, dict) else {}), part: value}
+    return value
 
 
-def _at(plain: Any, parts: Sequence[str]) -> Any:
+def _replaced(values: tuple[Any, ...], index: int, value: Any) -> list[Any]:
+    return [value if k == index else old for k, old in enumerate(values)]
+
+
+def _at(config: Any, parts: Sequence[str]) -> Any:
     for part in parts:
-        if isinstance(plain, dict):
-            plain = plain.get(part)
-        elif isinstance(plain, list) and part.isdecimal() and int(part) < len(plain):
-            plain = plain[int(part)]
+        if isinstance(config, tuple):
+            config = dict(enumerate(config)).get(int(part) if part.isdecimal() else -1)
         else:
-            return None
-    return plain
+            config = (config if isinstance(config, dict) else _fields(config)).get(part)
+    return config
+
+
+def _fields(config: Any) -> dict[str, Any]:
+    """Return the fields of a model or dataclass by name; none of anything else."""
+    if isinstance(config, BaseModel):
+        return dict(config)
+    if dataclasses.is_dataclass(config):
+        return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return {}
 
 
 def override(defaults: Schema, given: Any, source: str) -> Schema:
     """Return a config with the fields of a document over its own.
 
+    A list, and a part of another kind, replaces the whole. So does a collection by names, such as
+    cameras; but an entry whose name is there keeps the fields that are not given.
+
     Raises:
         InputError: The first field that cannot be used.
     """
+    return validate(type(defaults), _merged(defaults, given), source)
+
+
+def _merged(config: Any, given: Any) -> Any:
     if not isinstance(given, dict):
-        names = ", ".join(_fields_at(type(defaults), ()))
-        raise InputError(f"{source}: the file: {_shown(given)}; allowed is a mapping with some of {names}")
-    return validate(type(defaults), _merged(to_plain(defaults), given), source)
-
-
-def _merged(plain: Any, given: Any) -> Any:
-    """Return a config with mappings merged; a part of another kind replaces the whole."""
-    if not isinstance(plain, dict) or not isinstance(given, dict):
         return given
-    if "kind" in given and given["kind"] != plain.get("kind"):
+    if isinstance(config, dict):
+        return {key: _merged(config.get(key), value) for key, value in given.items()}
+    fields = _fields(config)
+    if given.get("kind", fields.get("kind")) != fields.get("kind"):
         return given
-    return {**plain, **{key: _merged(plain.get(key), value) for key, value in given.items()}}
-
-
-def same_json(a: Any, b: Any) -> bool:
-    """Return whether two plain documents are equal as JSON."""
-    return json.dumps(a, sort_keys=True) == json.dumps(b, sort_keys=True)
+    return {**fields, **{key: _merged(fields.get(key), value) for key, value in given.items()}}

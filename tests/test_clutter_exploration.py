@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import CATALOGUE, random_scene, training_script
+from conftest import CATALOGUE, DEFAULT_CELL, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
@@ -44,7 +44,7 @@ def entry(seed: int) -> SetScene:
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scenes by RG that hide seven, three and two objects, and stand."""
     path = tmp_path_factory.mktemp("scenes") / "few.json"
-    save_scene_set(path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)])
+    save_scene_set(path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)], DEFAULT_CELL)
     return path
 
 

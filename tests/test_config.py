@@ -4,12 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conftest import DEFAULT_CELL, tray, world_with
+from conftest import DEFAULT_CELL, cell_with, tray, world_with
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.config import ClutterConfig, load_config
+from drake_clutter.config import ClutterConfig, load_config, upgrade
 from drake_clutter.files import InputError
-from drake_clutter.validation import config_yaml
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.validation import config_yaml, load_typed
 
 
 def config_file(folder: Path, text: str) -> Path:
@@ -39,6 +40,59 @@ def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
     camera = Camera.over(2.0, width=320, visibility_threshold=0.2)
     cell = DEFAULT_CELL.model_copy(update={"support": tray(0.5), "cameras": {"overhead": camera}})
     assert config == replace(ClutterConfig(), layout=replace(ClutterConfig().layout, stack_gap=0.02), cell=cell)
+
+
+def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(tmp_path: Path) -> None:
+    """Whatever its cameras are called."""
+    text = "{pose: {translation: [0, 0, 2]}, width: 320}"
+    config = load_config(config_file(tmp_path, f"cell: {{cameras: {{camera: {text}, arm: {text}}}}}"))
+    assert list(config.cell.cameras) == ["camera", "arm"]
+    both = "camera: {width: 320, height: 100}\ncell: {cameras: {overhead: {height: 200}}}\n"
+    camera = load_config(config_file(tmp_path, both)).cell.camera
+    assert (camera.width, camera.height) == (320, 200)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["camera: {}\ncell: 3", "arm: {}\nworld: 3", "arm: {}\nworld: {cell: [1]}", "layout: {tray_side: 1}\ncell: {support: 1}"],
+)
+def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"world\.yaml: .*allowed"):
+        load_typed(Scenario(), config_file(tmp_path, text), convert=upgrade)
+
+
+def test_two_cameras_are_read_back(tmp_path: Path) -> None:
+    config = world_with("cell.cameras={side: {pose: {translation: [1, 0, 1]}}, top: {pose: {}}}")
+    assert list(config.cell.cameras) == ["side", "top"]
+    assert load_config(config_file(tmp_path, config_yaml(config))) == config
+    one = load_config(settings=["cell.cameras.top.width=320"], path=tmp_path / "world.yaml")
+    assert [camera.width for camera in one.cell.cameras.values()] == [640, 320]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("fixtures=[{name: tray, box: [1, 1, 1]}]", "fixtures: [{'box': [...], 'name': 'tray'}]; allowed is fixtures with names"),
+        ("fixtures=[{name: a, box: [1, 1, 1]}, {name: a, box: [1, 1, 1]}]", "names that differ, also from tray, camera"),
+        ("fixtures=[{name: overhead, box: [1, 1, 1]}]", "gripper, overhead"),
+        ("fixtures=[{name: a}]", "fixtures[0]: {'name': 'a'}; allowed is either a box or a model"),
+        ("fixtures=[{name: a, box: [1, 1, 1], model: a.sdf}]", "allowed is either a box or a model"),
+        ("fixtures=[{name: a, box: [1, 1]}]", "fixtures[0].box: [1, 1]; allowed is a list of 3 numbers"),
+        (
+            "fixtures=[{name: a, box: [1, 1, 1], color: [2, 0, 0, 1]}]",
+            "fixtures[0].color[0]: 2; allowed is a finite number from 0",
+        ),
+        ("cameras={}", "cameras: {}; allowed is a mapping of at least one entry"),
+        ("robot.home=[]", "robot.home: []; allowed is a list of at least one entry"),
+        ("robot.home=[0, 0, 0]", "allowed is 3 values of"),
+        ("robot.limits.jerk=[1, 2]", "allowed is 6 values of jerk, as home has"),
+        ("robot.limits.position=[[1, 2, 3]]", "robot.limits.position[0]: [1, 2, 3]; allowed is a list of 2 numbers"),
+    ],
+)
+def test_a_cell_that_cannot_be(setting: str, message: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        cell_with(setting)
+    assert message in str(refusal.value)
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:

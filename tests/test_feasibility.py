@@ -122,9 +122,9 @@ def test_the_map_agrees_with_the_poses() -> None:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    save_scene(folder / "pile.yaml", SCENE, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
+    save_scene(folder / "pile.yaml", SCENE, DEFAULT_CELL, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
     leaning = scene_of(resting("gelatin_box"), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0), 0.028))
-    save_scene(folder / "falls.yaml", leaning)
+    save_scene(folder / "falls.yaml", leaning, DEFAULT_CELL)
     return folder
 
 
@@ -205,7 +205,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     pile = [resting("pudding_box"), resting("tomato_soup_can", xy=(-0.1, -0.15))]
     scene, out = scene_of(*pile, side=0.5), tmp_path / "study"
     verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 1.0), ())
-    save_scene(tmp_path / "pile.yaml", scene, verdict)
+    save_scene(tmp_path / "pile.yaml", scene, DEFAULT_CELL, verdict)
     arguments = ["feasibility", str(tmp_path / "pile.yaml"), "--out", str(out)]
     names = ["iiwa14_epick_tray", "ur5e_epick_tray", "ur10e_epick_tray"]
     for name in names:
@@ -233,10 +233,16 @@ def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]", "not 3 numbers"),
-        ("[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]", "quaternion is zero"),
-        ("{name: a}", "allowed is a YAML list"),
-        ("[{translation: [0, 0, 0]}]", "allowed is a YAML list"),
+        (
+            "[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]",
+            r"\[0\]\.translation: \[0, 0\]; allowed",
+        ),
+        (
+            "[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]",
+            "allowed is w, x, y, z that are not all zero",
+        ),
+        ("{name: a}", "{'name': 'a'}; allowed is a list"),
+        ("[{translation: [0, 0, 0]}]", r"\[0\]\.name: is missing; needed are name, translation, quaternion"),
     ],
 )
 def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
@@ -251,7 +257,7 @@ def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
     [
         ("{suction: {cup_diameter: 1.0}}", "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
         ("{base: [0, 0]}", "base: is unknown"),
-        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg.2: 'north'; allowed is a finite number"),
+        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg\\[2\\]: 'north'; allowed is a finite number"),
         ("{reach: 3}", "reach: is unknown"),
     ],
 )

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import yaml
-from conftest import CLASSES, GRAMMARS, rng, world_with
+from conftest import CLASSES, DEFAULT_CELL, GRAMMARS, rng, world_with
 
 from drake_clutter.agents.generation import (
     GenerationAgent,
@@ -38,7 +38,7 @@ def job(nodes: int = 10, seed: int = 5) -> GenerationJob:
 def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
     """The scenes with their verdicts, as scene files."""
     made = map_ordered(partial(SceneGenerator, which), range(count), workers=workers)
-    return [yaml.dump(scene_fields(generated.scene, generated.verdict)) for generated in made]
+    return [yaml.dump(scene_fields(generated.scene, DEFAULT_CELL, generated.verdict)) for generated in made]
 
 
 def test_the_scenes_do_not_depend_on_the_number_of_workers() -> None:

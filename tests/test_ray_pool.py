@@ -19,6 +19,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 import ray
+from conftest import DEFAULT_CELL
 from numpy.typing import NDArray
 from ray.cluster_utils import Cluster
 from test_cli import ABOVE, BELOW, broken, run, scenes_of
@@ -172,7 +173,7 @@ def test_generate_with_a_killed_worker_writes_the_same_scenes(cluster: Cluster, 
     job = GenerationJob("random", "ycb7", None, nodes=5, seed=5, config=ClutterConfig())
     (tmp_path / "alone/scenes").mkdir(parents=True)
     for index, made in enumerate(map_ordered(partial(SceneGenerator, job), range(3), workers=1)):
-        save_scene(tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, made.verdict)
+        save_scene(tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, DEFAULT_CELL, made.verdict)
     command = [sys.executable, "-c", "from drake_clutter.cli import main; main()"]
     command += ["generate", "--nodes", "5", "--count", "3", "--seed", "5", "--json", "--out", str(tmp_path / "there")]
     command += ["--workers", "2", "--ray", cluster.address]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import CATALOGUE, CLASSES, TRAY, random_scene, resting, rng, scene_of
+from conftest import CATALOGUE, CLASSES, DEFAULT_CELL, TRAY, cell_with, random_scene, resting, rng, scene_of, tray
 
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
@@ -34,7 +34,7 @@ def unstable_verdict(scene: Scene) -> Verdict:
 
 def reloaded(folder: Path, scene: Scene, verdict: Verdict | None = None) -> SceneFile:
     path = folder / "scene.yaml"
-    save_scene(path, scene, verdict)
+    save_scene(path, scene, DEFAULT_CELL, verdict)
     return load_scene(path, CATALOGUE)
 
 
@@ -46,7 +46,8 @@ def loads_or_is_refused(path: Path) -> bool:
         message = str(refusal)
     else:
         return True
-    assert message.startswith(str(path))
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
     return False
 
 
@@ -78,8 +79,29 @@ def test_poses_of_every_size_survive(tmp_path: Path) -> None:
     assert reloaded(tmp_path, scene_of(*objects, side=0.1 + 0.2)).scene == scene_of(*objects, side=0.1 + 0.2)
 
 
+def test_a_file_holds_the_cell_that_it_was_made_with(tmp_path: Path) -> None:
+    cell = cell_with("robot.base.x=-0.8", "cameras.overhead.pose.roll=165", "gripper.extension=0.15")
+    save_scene(tmp_path / "scene.yaml", SCENE, cell)
+    read = load_scene(tmp_path / "scene.yaml", CATALOGUE)
+    assert read.cell == cell
+    assert_same(read.scene, SCENE)
+    smaller = scene_of(resting("sugar_box"), side=0.5)
+    save_scene(tmp_path / "scene.yaml", smaller, cell)
+    assert load_scene(tmp_path / "scene.yaml", CATALOGUE).cell == cell.with_support(tray(0.5))
+
+
+def test_a_file_of_version_1_names_the_tray_alone(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(ONE_BOX + "tray: {side: 0.5}\n")
+    read = load_scene(path, CATALOGUE)
+    assert read.scene.support == read.cell.support == tray(0.5)
+    assert read.cell == DEFAULT_CELL.with_support(tray(0.5))
+    path.write_text(ONE_BOX)
+    assert load_scene(path, CATALOGUE).cell == DEFAULT_CELL
+
+
 def test_names_are_any_text(tmp_path: Path) -> None:
-    names = ["yes", "1", "a: b", "Dose \N{LATIN SMALL LETTER O WITH DIAERESIS}", "null", "# no", "  spaced  "]
+    names = ["yes", "1", "a: b", "Dose \N{LATIN SMALL LETTER O WITH DIAERESIS}", "null", "1e-5", "# no", "  spaced  "]
     scene = scene_of(*(resting("large_marker", xy=(0, 0.03 * k), name=name) for k, name in enumerate(names)))
     read = reloaded(tmp_path, scene, stable_verdict(scene))
     assert read.scene.names == tuple(names)
@@ -111,17 +133,17 @@ objects:
 
 def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
     scene = random_scene(2, 12, 12, "pantry14")
-    save_scene(tmp_path / "one.yaml", scene, stable_verdict(scene))
+    save_scene(tmp_path / "one.yaml", scene, DEFAULT_CELL, stable_verdict(scene))
     read = load_scene(tmp_path / "one.yaml", CATALOGUE)
-    save_scene(tmp_path / "two.yaml", read.scene, read.verdict)
+    save_scene(tmp_path / "two.yaml", read.scene, read.cell, read.verdict)
     assert (tmp_path / "one.yaml").read_bytes() == (tmp_path / "two.yaml").read_bytes()
 
 
 # --- What is refused ---
 
 SCENE = random_scene(1, 12, 12, "pantry14")
-DOCUMENT = scene_fields(SCENE, stable_verdict(SCENE))
-UNSTABLE = scene_fields(SCENE, unstable_verdict(SCENE))
+DOCUMENT = scene_fields(SCENE, DEFAULT_CELL, stable_verdict(SCENE))
+UNSTABLE = scene_fields(SCENE, DEFAULT_CELL, unstable_verdict(SCENE))
 
 
 def changed(document: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
@@ -152,36 +174,40 @@ X_TO: Path_ = ("objects", 0, "X_TO")
 NODE: Path_ = ("graph", "nodes", object_node())
 EDGE: Path_ = ("graph", "edges", 0)
 REFUSED: list[tuple[Path_, Any, str]] = [
-    (("version",), 2, "version: 2; allowed is 1"),
-    (("version",), "1", "version: '1'; allowed is an integer"),
+    (("version",), 3, "version: 3; allowed is a whole number from 1 to 2"),
+    (("version",), "1", "version: '1'; allowed is a whole number from 1 to 2"),
     (("version",), True, "version: True"),
-    (("version",), GONE, "version is missing"),
-    (("camera",), 1, "'camera' is unknown; allowed are version, objects, tray"),
+    (("version",), GONE, "version: is missing; needed are version, objects"),
+    (("camera",), 1, "camera: is unknown; allowed are version, objects, tray, cell"),
     (("tray",), 0.7, "tray: 0.7; allowed is a mapping with side"),
-    (("tray", "side"), 0, "tray.side: 0; allowed is 0.1 to 2"),
-    (("tray", "side"), math.nan, "tray.side: nan"),
-    (("seed",), 1.5, "seed: 1.5; allowed is an integer"),
-    (("objects",), GONE, "objects is missing"),
-    (("objects",), [], "objects: []; allowed is a list of at least one object"),
+    (("tray",), {"side": 0.7}, "allowed is a tray or a cell"),
+    (("cell",), "ur10", "cell: 'ur10'; allowed is a mapping with robot, gripper, support, cameras"),
+    (("cell", "support", "size", 0), 5, "cell.support.size[0]: 5; allowed is a finite number from 0.1 to 2"),
+    (("cell", "cameras"), {}, "cell.cameras: {}; allowed is a mapping of at least one entry"),
+    (("tray",), {"side": 0}, "tray.side: 0; allowed is a finite number from 0.1 to 2"),
+    (("tray",), {"side": math.nan}, "tray.side: nan"),
+    (("seed",), 1.5, "seed: 1.5; allowed is a whole number"),
+    (("objects",), GONE, "objects: is missing"),
+    (("objects",), [], "objects: []; allowed is a list of at least one entry"),
     (("objects",), None, "objects: None; allowed is a list"),
     (("objects",), {"a": 1}, "objects: {'a': 1}; allowed is a list"),
     (("objects", 0), "box", "objects[0]: 'box'; allowed is a mapping"),
     (("objects", 1, "class"), "teapot", "objects[1].class: 'teapot'; allowed is one of cracker_box"),
-    (("objects", 1, "class"), GONE, "objects[1]: class is missing"),
+    (("objects", 1, "class"), GONE, "objects[1].class: is missing; needed are name, class, X_TO"),
     (("objects", 1, "class"), 3, "objects[1].class: 3; allowed is a text"),
-    (("objects", 1, "name"), GONE, "objects[1]: name is missing"),
+    (("objects", 1, "name"), GONE, "objects[1].name: is missing"),
     (("objects", 1, "name"), "", "objects[1].name: ''; allowed is a text"),
     (("objects", 1, "name"), None, "objects[1].name: None"),
     (("objects", 1, "name"), "tray", "objects[1].name: 'tray'; allowed is any name but tray"),
     (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is there twice"),
-    (("objects", 1, "colour"), "red", "objects[1]: 'colour' is unknown"),
-    (("objects", 1, "node"), "1", "objects[1].node: '1'; allowed is an integer"),
-    (("objects", 1, "node"), True, "objects[1].node: True; allowed is an integer"),
+    (("objects", 1, "colour"), "red", "objects[1].colour: is unknown; allowed are name, class, X_TO, node"),
+    (("objects", 1, "node"), "1", "objects[1].node: '1'; allowed is a whole number"),
+    (("objects", 1, "node"), True, "objects[1].node: True; allowed is a whole number"),
     (("objects", 1, "node"), 99, "allowed is a structure node, or the class of the object that names this node"),
-    (X_TO, GONE, "objects[0]: X_TO is missing"),
+    (X_TO, GONE, "objects[0].X_TO: is missing"),
     (X_TO, [0, 0, 0], "objects[0].X_TO: [0, 0, 0]; allowed is a mapping with translation, quaternion"),
-    ((*X_TO, "translation"), GONE, "objects[0].X_TO: translation is missing"),
-    ((*X_TO, "translation"), [0, 0], "X_TO.translation: [0, 0]; allowed is a list of 3 finite numbers"),
+    ((*X_TO, "translation"), GONE, "objects[0].X_TO.translation: is missing"),
+    ((*X_TO, "translation"), [0, 0], "X_TO.translation: [0, 0]; allowed is a list of 3 numbers"),
     ((*X_TO, "translation"), [0, 0, 0, 0], "X_TO.translation: [0, 0, 0, 0]"),
     ((*X_TO, "translation"), "0 0 0", "X_TO.translation: '0 0 0'"),
     ((*X_TO, "translation", 1), math.nan, "X_TO.translation[1]: nan; allowed is a finite number"),
@@ -193,24 +219,24 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     ((*X_TO, "quaternion"), [0.71, 0.71, 0, 0], "(this one's is 1.00409)"),
     ((*X_TO, "quaternion", 3), -math.inf, "X_TO.quaternion[3]: -inf"),
     (("graph",), [], "graph: []; allowed is a mapping with nodes, edges"),
-    (("graph", "nodes"), GONE, "graph: nodes is missing"),
+    (("graph", "nodes"), GONE, "graph.nodes: is missing"),
     (("graph", "nodes", 0), GONE, "graph.nodes: allowed is exactly one tray"),
-    (("graph", "nodes", 0, "id"), "0", "graph.nodes[0].id: '0'; allowed is an integer"),
+    (("graph", "nodes", 0, "id"), "0", "graph.nodes[0].id: '0'; allowed is a whole number"),
     (NODE, GONE, "graph.edges: 0 -> 1 joins a node that is not there"),
     ((*NODE, "kind"), "teapot", "kind: 'teapot'; allowed is a structure node, or the class"),
     ((*NODE, "kind"), "tray", "allowed is exactly one tray"),
     ((*NODE, "id"), 0, "allowed is an id that no other node has"),
-    ((*NODE, "colour"), 1, "'colour' is unknown"),
+    ((*NODE, "colour"), 1, "colour: is unknown; allowed are id, kind"),
     (("graph", "edges"), [], "allowed is an acyclic graph in which the tray leads to every node"),
     ((*EDGE, "kind"), "flat_45", "graph.edges[0].kind: 'flat_45'; allowed is one of primitive, flat_0"),
     ((*EDGE, "kind"), 0, "graph.edges[0].kind: 0; allowed is a text"),
-    ((*EDGE, "child"), GONE, "graph.edges[0]: child is missing"),
+    ((*EDGE, "child"), GONE, "graph.edges[0].child: is missing"),
     ((*EDGE, "child"), 99, "joins a node that is not there"),
     ((*EDGE, "child"), 0, "acyclic"),
     (("derivation",), "drop_object", "derivation: 'drop_object'; allowed is a list"),
     (("derivation", 1), 3, "derivation[1]: 3; allowed is a text"),
     (("verdict",), "stable", "verdict: 'stable'; allowed is a mapping"),
-    (("verdict", "stable"), GONE, "verdict: stable is missing"),
+    (("verdict", "stable"), GONE, "verdict.stable: is missing"),
     (("verdict", "stable"), False, "verdict.instability: allowed"),
     (("verdict", "hidden"), ["ghost"], "ghost' is no object"),
     (("verdict", "hidden"), "none", "verdict.hidden: 'none'; allowed is a list"),
@@ -236,22 +262,22 @@ def test_a_broken_field_is_named(path: Path_, value: Any, message: str, tmp_path
         (("verdict", "instability", "reason"), "bored", "verdict.instability.reason: 'bored'; allowed is one of toppled, slid"),
         (("verdict", "instability", "tilt"), "much", "verdict.instability.tilt: 'much'; allowed is a finite number"),
         (("verdict", "instability", "displacement"), math.inf, "verdict.instability.displacement: inf"),
-        (("verdict", "instability", "object"), GONE, "verdict.instability: object is missing"),
-        (("verdict", "instability"), None, "verdict.instability: None; allowed is a mapping"),
+        (("verdict", "instability", "object"), GONE, "verdict.instability.object: is missing"),
+        (("verdict", "instability"), None, "verdict.instability: allowed is one for an unstable scene"),
     ],
 )
 def test_a_broken_instability_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
     file = written(tmp_path, changed(UNSTABLE, path, value))
     with pytest.raises(InputError) as refusal:
         load_scene(file, CATALOGUE)
-    assert str(refusal.value).startswith(f"{file}.{message}")
+    assert str(refusal.value).startswith(f"{file}: {message}")
 
 
 def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> None:
     """1 mm is allowed, as settled objects press on each other and hand-written poses are rounded."""
     for gap, allowed in ((0.0, True), (-0.0009, True), (-0.0011, False), (-0.020, False)):
         scene = scene_of(resting("sugar_box", name="below"), resting("pudding_box", floor=0.038 + gap, name="above"))
-        save_scene(tmp_path / "scene.yaml", scene)
+        save_scene(tmp_path / "scene.yaml", scene, DEFAULT_CELL)
         if allowed:
             assert load_scene(tmp_path / "scene.yaml", CATALOGUE).scene == scene
         else:
@@ -293,7 +319,7 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
 def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
     """At every length: what is not refused holds whole objects, and from the first one on."""
     path = tmp_path / "scene.yaml"
-    save_scene(path, SCENE, stable_verdict(SCENE))
+    save_scene(path, SCENE, DEFAULT_CELL, stable_verdict(SCENE))
     whole = path.read_text()
     refused = 0
     for length in np.linspace(0, len(whole) - 2, 150).astype(int):
@@ -350,7 +376,7 @@ def test_yaml_that_its_reader_stumbles_over_is_refused(line: str, tmp_path: Path
 def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
     path.write_text(ONE_BOX + f"verdict: {verdict}\n")
-    with pytest.raises(InputError, match=r"scene\.yaml\.verdict"):
+    with pytest.raises(InputError, match=r"scene\.yaml: verdict"):
         load_scene(path, CATALOGUE)
 
 
@@ -365,7 +391,7 @@ def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Pa
 def test_a_graph_that_no_derivation_ends_with_is_refused(graph: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
     path.write_text(ONE_BOX + f"graph: {graph}\n")
-    with pytest.raises(InputError, match=r"scene\.yaml\.graph"):
+    with pytest.raises(InputError, match=r"scene\.yaml: graph"):
         load_scene(path, CATALOGUE)
 
 

@@ -1,4 +1,4 @@
-"""Scene files with anything anywhere: they load, or are refused by an error that names them."""
+"""Scene files and configs with anything anywhere: they load, or are refused by an error that names them."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_scene_file import DOCUMENT, GONE, SCENE, Path_, changed, loads_or_is_refused
 
+from drake_clutter.config import upgrade
+from drake_clutter.files import InputError
 from drake_clutter.grammar.graph import OBJECT_SLOT
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.validation import load_typed
+from drake_clutter.yaml_text import yaml_text
 
 
 def places(value: Any, at: Path_ = ()) -> Iterator[Path_]:
@@ -72,3 +77,37 @@ WHOLE = yaml.dump(DOCUMENT, sort_keys=False, default_flow_style=None, width=160)
 def test_any_edit_of_the_text_loads_or_is_refused(fuzzed: Path, start: int, taken: int, inserted: str) -> None:
     fuzzed.write_text(WHOLE[:start] + inserted + WHOLE[start + taken :], encoding="utf-8")
     loads_or_is_refused(fuzzed)
+
+
+POSE = {"translation": [0, 0, 2], "rpy_deg": [180, 0, 0]}
+SCENARIO: dict[str, Any] = {
+    "nodes": 25,
+    "camera_noise": True,
+    "arm": {"base": [-0.65, 0.0, 0.3, 0.0], "home": [0] * 6, "suction": {"cup_diameter": 0.03}, "payload": 10.0},
+    "world": {
+        "camera": {"width": 320, "altitude": 2.0, "hidden_below": 0.2},
+        "layout": {"tray_side": 0.5, "stack_gap": 0.02},
+        "cell": {"support": {"wall_height": 0.1}, "cameras": {"overhead": {"pose": POSE, "height": 240}}},
+    },
+}
+SCENARIO_PLACES = list(places(SCENARIO))
+
+
+@settings(max_examples=300)
+@given(changes=st.lists(st.tuples(st.sampled_from(SCENARIO_PLACES), st.sampled_from(STRANGE)), max_size=3))
+def test_any_value_anywhere_in_a_config_loads_or_is_refused(fuzzed: Path, changes: list[tuple[Path_, Any]]) -> None:
+    document = SCENARIO
+    for path, value in changes:
+        try:
+            document = changed(document, path, value)
+        except (KeyError, IndexError, TypeError):
+            continue
+    fuzzed.write_text(yaml_text(document))
+    message = f"{fuzzed}: "
+    try:
+        load_typed(Scenario(), fuzzed, convert=upgrade)
+    except InputError as refusal:
+        message = str(refusal)
+    assert message.startswith(f"{fuzzed}: ")
+    assert "\n" not in message
+    assert len(message) <= len(f"{fuzzed}: ") + 300

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from conftest import CATALOGUE, GRAMMARS, random_scene, rng
+from conftest import CATALOGUE, DEFAULT_CELL, GRAMMARS, random_scene, rng
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -24,7 +24,7 @@ def entry(number: int, *, frozen: bool) -> SetScene:
 @pytest.mark.parametrize("frozen", [False, True])
 def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
     written = [entry(number, frozen=frozen) for number in range(3)]
-    save_scene_set(tmp_path / "set.json", {"objects": "ycb7", "seed": 5}, written)
+    save_scene_set(tmp_path / "set.json", {"objects": "ycb7", "seed": 5}, written, DEFAULT_CELL)
     held = load_scene_set(tmp_path / "set.json", CATALOGUE)
     assert held.name == "set.json"
     assert held.about == {"objects": "ycb7", "seed": 5}
@@ -58,7 +58,7 @@ def test_laid_anew_it_is_the_same_scene_elsewhere() -> None:
 
 def test_a_changed_set_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "set.json"
-    save_scene_set(path, {"objects": "ycb7"}, [entry(0, frozen=False)])
+    save_scene_set(path, {"objects": "ycb7"}, [entry(0, frozen=False)], DEFAULT_CELL)
     whole = path.read_text()
     path.write_text(whole.replace('"hidden":0', '"hidden":9'))
     with pytest.raises(InputError, match=r"set\.json: sha256"):

@@ -88,7 +88,7 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
     assert told.exit_code == 0, told.output
     assert "gelatin_box -> tray" in told.output
     assert (tmp_path / "replay.html").stat().st_size > 100_000
-    save_scene(tmp_path / "scene.yaml", SCENE)
+    save_scene(tmp_path / "scene.yaml", SCENE, DEFAULT_CELL)
     moves = tmp_path / "moves.yaml"
     moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
     arguments = ["move", str(tmp_path / "scene.yaml"), "--moves", str(moves), "--fidelity", "arm", "--plan-only"]

@@ -142,7 +142,7 @@ def main(
         told = f"only {len(found)} of {MOST_DRAWS * count} scenes are stable, hide something, and are no repeats"
         raise InputError(f"--count {count}: {told}; allowed is what agent and nodes can make")
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_scene_set(out, about, found[:count])
+    save_scene_set(out, about, found[:count], job.config.cell)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
 from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import Between, config_class, load_typed
+from drake_clutter.validation import Between, Flag, config_class, load_typed
 
 CHECKPOINT = "detector.safetensors"
 
@@ -46,7 +46,7 @@ class TrainDetector:
     held_out: Annotated[int, Between(0)] = 200
     objects: str = "pantry14"
     catalogue: str = ""
-    looks_at_color: bool = False
+    looks_at_color: Flag = False
     warm_start: str = ""
     seed: Annotated[int, Between(0)] = 0
     evaluate_every: Annotated[int, Between(1)] = 250

@@ -20,7 +20,7 @@ from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.validation import Between, config_class, load_typed
+from drake_clutter.validation import Between, Flag, config_class, load_typed
 
 
 @config_class
@@ -34,7 +34,7 @@ class TrainExplorer(ExplorerTraining):
         learning: see there.
     """
 
-    privileged: bool = True
+    privileged: Flag = True
     warm_start: str = ""
     evaluate_every: Annotated[int, Between(1)] = 15_000
     learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)

@@ -19,7 +19,7 @@ from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, par
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import Between, Flag, NonNegative, config_class
 
 
 @config_class
@@ -36,7 +36,7 @@ class CloningConfig:
 
     rounds: Annotated[int, Between(1)] = 40
     episodes: Annotated[int, Between(1)] = 100
-    dagger: bool = True
+    dagger: Flag = True
     updates: Annotated[int, Between(1)] = 400
     batch: Annotated[int, Between(1)] = 128
     learning_rate: NonNegative = 1e-3

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Model
+from drake_clutter.validation import Between, Flag, Model
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Camera(Model):
     height: Annotated[int, Between(16, 4096)] = 480
     fov_y_deg: Annotated[float, Between(1.0, 170.0)] = D435_FOV_Y_DEG
     visibility_threshold: Annotated[float, Between(0.0, 1.0)] = 0.30
-    depth_noise: bool = True
+    depth_noise: Flag = True
 
     @staticmethod
     def over(altitude: float, **fields: Any) -> "Camera":

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import model_validator
 
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Model, allowed
+from drake_clutter.validation import Between, Model, Share, Text, allowed
 
 Extent = Annotated[float, Between(0.001, 10.0)]
 
@@ -21,11 +21,11 @@ class Fixture(Model):
         color: Red, green, blue and opacity, 0 to 1; None: it is not drawn.
     """
 
-    name: str
+    name: Text
     pose: PoseSpec = PoseSpec()
     box: tuple[Extent, Extent, Extent] | None = None
     model: str = ""
-    color: tuple[float, float, float, float] | None = None
+    color: tuple[Share, Share, Share, Share] | None = None
 
     @model_validator(mode="after")
     def _box_or_model(self) -> Self:

@@ -2,10 +2,11 @@
 
 from typing import Annotated, Literal
 
+from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Finite, Model, Positive
+from drake_clutter.validation import Between, Finite, Model, Positive, Text, allowed
 
 
 class JointLimits(Model):
@@ -41,15 +42,25 @@ class RobotSpec(Model):
         pedestal_side: Of the pedestal's square section, from the table to the base [m]; 0 for none.
     """
 
-    model: str
-    base_link: str
-    tool_frame: str
+    model: Text
+    base_link: Text
+    tool_frame: Text
     base: PoseSpec
-    home: tuple[Finite, ...]
+    home: Annotated[tuple[Finite, ...], Field(min_length=1)]
     limits: JointLimits
     ik: Literal["ur", "numerical"] = "numerical"
     payload: Positive
     pedestal_side: Annotated[float, Between(0.0, 1.0)] = 0.0
+
+    @field_validator("limits")
+    @classmethod
+    def _one_per_joint(cls, limits: JointLimits, info: ValidationInfo) -> JointLimits:
+        """Refuse limits of another number of joints than `home` has."""
+        joints = len(info.data.get("home", ()))
+        for name, values in limits:
+            if joints and values is not None and len(values) != joints:
+                raise allowed(f"{joints} values of {name}, as home has")
+        return limits
 
     @property
     def X_TB(self) -> RigidTransform:

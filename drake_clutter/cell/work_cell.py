@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import field_validator
+from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.camera import Camera
@@ -15,12 +15,15 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
 from drake_clutter.resources import shipped_path
-from drake_clutter.validation import Model, allowed, load_typed, read_yaml, validate
+from drake_clutter.validation import Model, Text, allowed, load_typed, validate
+from drake_clutter.yaml_text import read_yaml
 
 GripperSpec = SuctionGripper
 """Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
 `Annotated[SuctionGripper | Other, Field(discriminator="kind")]`; each satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
+_RESERVED = ("tray", "camera", "pedestal", "robot", "gripper")
+"""Names of what stands in a cell besides fixtures."""
 
 
 class WorkCell(Model):
@@ -37,15 +40,18 @@ class WorkCell(Model):
     robot: RobotSpec
     gripper: GripperSpec
     support: Support
-    cameras: dict[str, Camera]
+    cameras: Annotated[dict[Text, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()
 
-    @field_validator("cameras")
+    @field_validator("fixtures")
     @classmethod
-    def _at_least_one(cls, cameras: dict[str, Camera]) -> dict[str, Camera]:
-        if not cameras:
-            raise allowed("at least one camera")
-        return cameras
+    def _names_differ(cls, fixtures: tuple[Fixture, ...], info: ValidationInfo) -> Any:
+        taken = [*_RESERVED, *info.data.get("cameras", ())]
+        for fixture in fixtures:
+            if fixture.name in taken:
+                raise allowed(f"fixtures with names that differ, also from {', '.join(taken)}")
+            taken.append(fixture.name)
+        return fixtures
 
     @property
     def camera(self) -> Camera:

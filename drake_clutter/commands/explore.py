@@ -4,11 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from drake_clutter.agents.exploration import make_explorers, play
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, write_json
+from drake_clutter.files import InputError, refusal, write_json
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.plan import plan_fields
 from drake_clutter.reports.episode_page import write_episode_page
@@ -20,6 +18,8 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.validation import Model, Text, validate
+from drake_clutter.yaml_text import read_yaml
 
 Report = Callable[[Step], None]
 
@@ -117,24 +117,22 @@ def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return words
 
 
+class _MoveEntry(Model):
+    pick: Text
+    place: Text
+
+
 def read_moves(path: Path) -> list[Move]:
     """Moves from a YAML list of `{pick: NAME, place: NAME or tray}`.
 
     Raises:
         InputError: the file, the entry and what is allowed.
     """
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({error})") from error
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: allowed is a list of {{pick: NAME, place: NAME or {TRAY}}}")
-    moves = []
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict) or set(entry) != {"pick", "place"} or not all(isinstance(v, str) for v in entry.values()):
-            raise InputError(f"{path}[{index}]: {entry!r}; allowed is {{pick: NAME, place: NAME or {TRAY}}}")
-        moves.append(Move(entry["pick"], entry["place"]))
-    return moves
+    content = f"a list of {{pick: NAME, place: NAME or {TRAY}}}"
+    entries = validate(tuple[_MoveEntry, ...], read_yaml(path, content), str(path))
+    if not entries:
+        raise refusal(str(path), f"holds no moves; allowed is {content}")
+    return [Move(entry.pick, entry.place) for entry in entries]
 
 
 def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
@@ -187,7 +185,7 @@ def write_episode(
     At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `more` is put over what is known of the episode.
     """
     fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
-    save_scene(out / "after.yaml", task.scene)
+    save_scene(out / "after.yaml", task.scene, config.cell)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields, config.cell)
     if fidelity == "arm":
         write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], config.cell)

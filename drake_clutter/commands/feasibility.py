@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from pydantic import field_validator
 
 from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
@@ -29,8 +29,9 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
-from drake_clutter.validation import load_typed, read_yaml, to_plain
+from drake_clutter.validation import Finite, Model, Text, Vector3, allowed, load_typed, to_plain, validate
 from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.yaml_text import read_yaml
 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
 HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
@@ -136,35 +137,29 @@ def _moved(cell: WorkCell, base: Sequence[float]) -> WorkCell:
     return cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": pose})})
 
 
+class _TargetEntry(Model):
+    name: Text
+    translation: Vector3
+    quaternion: tuple[Finite, Finite, Finite, Finite]
+
+    @field_validator("quaternion")
+    @classmethod
+    def _normalized(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
+        norm = math.hypot(*quaternion)
+        if not 1e-9 < norm < math.inf:
+            raise allowed("w, x, y, z that are not all zero")
+        return tuple(value / norm for value in quaternion)
+
+
 def read_targets(path: Path) -> tuple[Target, ...]:
     """Poses of the cup from a YAML list of `{name, translation, quaternion}`, X_TG: z points out of the tool.
 
     Raises:
         InputError: the file, the entry and what is allowed.
     """
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return tuple(
-            Target(str(entry["name"]), Pose(_floats(entry["translation"], 3), _unit(_floats(entry["quaternion"], 4))))
-            for entry in entries
-        )
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        allowed = "a YAML list of {name: TEXT, translation: [x, y, z], quaternion: [w, x, y, z]}"
-        raise InputError(f"{path}: {error}; allowed is {allowed}") from error
-
-
-def _floats(values: Any, count: int) -> Any:
-    found = tuple(float(value) for value in values)
-    if len(found) != count or not all(map(math.isfinite, found)):
-        raise ValueError(f"{values} are not {count} numbers")
-    return found
-
-
-def _unit(quaternion: Any) -> Any:
-    norm = math.hypot(*quaternion)
-    if norm < 1e-9:
-        raise ValueError("a quaternion is zero")
-    return tuple(value / norm for value in quaternion)
+    content = "a list of {name: TEXT, translation: [x, y, z], quaternion: [w, x, y, z]}"
+    entries = validate(tuple[_TargetEntry, ...], read_yaml(path, content), str(path))
+    return tuple(Target(entry.name, Pose(entry.translation, entry.quaternion)) for entry in entries)
 
 
 @dataclass(frozen=True)

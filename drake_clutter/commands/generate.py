@@ -94,7 +94,7 @@ def generate(
     made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers, ray_address=ray_address)
     for index, result in enumerate(progress(made, done, count), start=done):
         failures.update(result.layout_failures)
-        save_scene(paths[index], result.scene, result.verdict)
+        save_scene(paths[index], result.scene, job.config.cell, result.verdict)
         solvable.append(result.solvable.value if result.solvable else None)
         spent = seconds + time.monotonic() - start
         write_json(out / PROGRESS_FILE, {"seconds": spent, "layout_failures": dict(failures), "solvable": solvable})

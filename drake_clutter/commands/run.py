@@ -55,7 +55,7 @@ def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationT
 def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int) -> dict[str, Any]:
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
-    save_scene(out / "scene.yaml", task.start)
+    save_scene(out / "scene.yaml", task.start, scenario.world.cell)
     told: dict[str, Any] = {"timing": asdict(timing), **more} | ({"ended": timing.end} if timing.end else {})
     return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told)
 

@@ -3,14 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from drake_clutter.commands.explore import Report, carry_out, write_episode
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
+from drake_clutter.yaml_text import yaml_text
 
 
 def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: ClutterConfig, report: Report) -> dict[str, Any]:
@@ -46,7 +45,7 @@ def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: Cl
     }
     if solution.plan:
         moves = [{"pick": move.pick, "place": move.place} for move in solution.plan]
-        write_text(out / "moves.yaml", yaml.safe_dump(moves, sort_keys=False))
+        write_text(out / "moves.yaml", yaml_text(moves))
         task = carry_out(scene, solution.plan, seed, config, report)
         fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
         write_episode(out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed, config)

@@ -29,7 +29,7 @@ from drake_clutter.planning.tool_kinematics import (
 )
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import Between, Flag, NonNegative, config_class
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class PlannerConfig:
     time_limit: NonNegative = 600.0
     descent: NonNegative = 0.0
     above: NonNegative = 0.0
-    optimise: bool = True
+    optimise: Flag = True
 
 
 REPORTED = 0.03

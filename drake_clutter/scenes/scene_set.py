@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from drake_clutter.catalogue import Catalogue, ObjectClass
+from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_text
 from drake_clutter.grammar import Derivation, SceneGrammar
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.validation import to_plain, validate
 
 VERSION = 1
 _LAYOUT_TRIES = 100
@@ -53,6 +55,7 @@ class SceneSet:
         about: agent, nodes, seed, object set, commit and whatever else says how it was made.
         scenes: the scenes.
         sha256: of all that.
+        cell: the work cell that it was made with.
     """
 
     name: str
@@ -60,6 +63,7 @@ class SceneSet:
     about: Mapping[str, Any]
     scenes: tuple[SetScene, ...]
     sha256: str
+    cell: WorkCell
 
     @property
     def grammar(self) -> SceneGrammar:
@@ -101,8 +105,15 @@ def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> st
     return hashlib.sha256(json.dumps([head, entries], sort_keys=True).encode()).hexdigest()
 
 
-def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene]) -> None:
-    """Writes a set, one scene a line. `about` names the object set (`objects`) and what else is to be known."""
+def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene], cell: WorkCell) -> None:
+    """Write a set, one scene a line.
+
+    Args:
+        path: The file.
+        about: Names the object set (`objects`) and what else is to be known.
+        scenes: The scenes.
+        cell: The work cell that it was made with.
+    """
     names = sorted({rule for scene in scenes for rule in scene.rules})
     number = {name: k for k, name in enumerate(names)}
     entries: list[dict[str, Any]] = []
@@ -112,7 +123,7 @@ def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetSce
         if scene.settled is not None:
             entry["settled"] = [[round(v, 6) for v in (*pose.translation, *pose.quaternion)] for pose in scene.settled]
         entries.append(entry)
-    head = {"version": VERSION, **about, "rules": names}
+    head = {"version": VERSION, **about, "cell": to_plain(cell), "rules": names}
     head["sha256"] = _digest(head, entries)
     lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
     write_text(path, f'{json.dumps(head)[:-1]}, "scenes": [\n{lines}\n]}}\n')
@@ -139,12 +150,15 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
         raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
     if changed:
         raise InputError(f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made")
+    # A set of version 0.1 has no cell.
+    given = document.pop("cell", None)
+    cell = default_cell() if given is None else validate(WorkCell, given, f"{path}: cell")
     scenes = []
     for entry in entries:
         poses = tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
         rules = tuple(names[k] for k in entry["rules"])
         scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
-    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes), digest)
+    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes), digest, cell)
 
 
 def _pose(numbers: Sequence[float]) -> Pose:

@@ -27,7 +27,8 @@ from drake_clutter.files import InputError, replacing
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import scene_from_text, scene_text
-from drake_clutter.validation import config_yaml, override, parse_yaml
+from drake_clutter.validation import config_yaml, override
+from drake_clutter.yaml_text import parse_yaml
 
 VERSION = 1
 _ARM = ("q", "v", "torque")
@@ -44,7 +45,7 @@ def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Out
     """
     count = 0
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update({"version": VERSION, "scene": scene_text(start), "cell": config_yaml(cell)})
+        file.attrs.update({"version": VERSION, "scene": scene_text(start, cell), "cell": config_yaml(cell)})
         for move, outcome in moves:
             states = [frame.arm for frame in outcome.motion if frame.arm]
             if not states:

@@ -12,7 +12,7 @@ from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.systems.exploration_agent import Choose
 from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
-from drake_clutter.validation import Between, config_class
+from drake_clutter.validation import Between, Flag, config_class
 
 
 @config_class
@@ -39,7 +39,7 @@ class Scenario:
     nodes: Annotated[int, Between(3, 1000)] = 25
     agent: str = "student"
     perception: str = "labels"
-    camera_noise: bool = True
+    camera_noise: Flag = True
     max_moves: Annotated[int, Between(1)] = 20
     seed: Annotated[int, Between(0)] = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)

@@ -1,0 +1,104 @@
+"""Every file in the repository that was written by the program, or an earlier version, still loads."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import CATALOGUE, DEFAULT_CELL, training_script
+
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_head
+from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.validation import load_typed, override
+from drake_clutter.yaml_text import parse_yaml, yaml_text
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = sorted((ROOT / "training/configs").glob("*.yaml"))
+CHECKPOINTS = sorted((ROOT / "training/checkpoints").glob("*.safetensors"))
+SETS = sorted((ROOT / "training/scenes").glob("*.json"))
+CELLS = sorted((ROOT / "models/cells").glob("*.yaml"))
+RESULTS = sorted(
+    path
+    for folder in ("training/results", "benchmarks/results")
+    for path in (ROOT / folder).rglob("*.json*")
+    if path.name != "behavior_hashes.json"  # its cells are no work cells
+)
+
+
+def script_config(name: str) -> Any:
+    """The config of the training that a file is named after."""
+    if name.startswith("detector"):
+        return training_script("train_detector").TrainDetector()
+    if name.startswith("sg"):
+        return training_script("train_generator").TrainGenerator()
+    if name == "student_rg" or name.endswith(("_bc", "_dagger")) or "dagger_seed" in name:
+        return training_script("clone_explorer").CloneExplorer()
+    return training_script("train_explorer").TrainExplorer()
+
+
+def name_of(path: Path) -> str:
+    return path.stem
+
+
+@pytest.mark.parametrize("path", CELLS, ids=name_of)
+def test_cells(path: Path, tmp_path: Path) -> None:
+    cell = load_cell(path)
+    (tmp_path / "cell.yaml").write_text(yaml_text(cell.model_dump(mode="json")))
+    assert load_cell(tmp_path / "cell.yaml") == cell
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=name_of)
+def test_training_configs(path: Path) -> None:
+    assert load_typed(script_config(path.stem), path, convert=upgrade) != script_config(path.stem)
+
+
+@pytest.mark.parametrize("path", CHECKPOINTS, ids=name_of)
+def test_checkpoints_and_their_configs(path: Path) -> None:
+    given = upgrade(load_checkpoint(path).about["config"])
+    if "detector" in path.stem:
+        del given["layout"]  # of version 0.1; a detector has no use for it
+    config = override(script_config(path.stem), given, str(path))
+    assert (config.cell if "detector" in path.stem else config.world.cell) == DEFAULT_CELL
+
+
+@pytest.mark.parametrize("path", SETS, ids=name_of)
+def test_scene_sets(path: Path) -> None:
+    assert load_scene_set(path, CATALOGUE).cell == DEFAULT_CELL
+
+
+def configs_in(document: Any) -> Iterator[tuple[str, Any]]:
+    """The configs in a result, by the name of what they are."""
+    if isinstance(document, list):
+        for item in document:
+            yield from configs_in(item)
+    if isinstance(document, dict):
+        for key, value in document.items():
+            if key in ("config", "scenario", "arm", "cell"):
+                yield key, value
+            else:
+                yield from configs_in(value)
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_results(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    document = json.loads(lines[0]) if path.suffix == ".jsonl" else json.loads("\n".join(lines))
+    upgrade_head(document)
+    for key, value in configs_in(document):
+        if isinstance(value, str):  # YAML, or the name of a config
+            value = parse_yaml(value, str(path))
+        if not isinstance(value, dict):
+            continue
+        if key == "scenario":
+            assert override(Scenario(), upgrade(value), str(path)).world.cell == DEFAULT_CELL
+        elif key in ("arm", "cell"):
+            assert override(DEFAULT_CELL, upgrade_cell(value), str(path)) == DEFAULT_CELL
+        else:
+            of_training = "learning" in value
+            default: Any = script_config("sg") if of_training else ClutterConfig()
+            config = override(default, upgrade(value), str(path))
+            assert (config.world if of_training else config).cell == DEFAULT_CELL

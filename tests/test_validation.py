@@ -1,0 +1,274 @@
+"""Every kind of misuse is one short line: the file, the field, the value and what is allowed."""
+
+import importlib
+from collections.abc import Iterator
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from pydantic import Field
+
+import drake_clutter
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.files import InputError
+from drake_clutter.validation import (
+    Between,
+    Finite,
+    Flag,
+    Model,
+    NonNegative,
+    Positive,
+    Share,
+    Text,
+    Vector3,
+    Whole,
+    config_class,
+    config_yaml,
+    load_typed,
+    override,
+    to_plain,
+    validate,
+)
+from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
+
+
+class Cup(Model):
+    """One member of a union."""
+
+    kind: Literal["cup"] = "cup"
+    radius: Positive = 0.01
+    rims: tuple[Vector3, ...] = ()
+
+
+class Jaws(Model):
+    """The other one."""
+
+    kind: Literal["jaws"] = "jaws"
+    width: Annotated[float, Between(0.01, 0.2)]
+
+
+class Lamp(Model):
+    """An entry of a collection by names."""
+
+    pose: PoseSpec = PoseSpec()
+    power: NonNegative = 1.0
+
+
+@config_class
+class Room:
+    """A config of every kind of field."""
+
+    tool: Annotated[Cup | Jaws, Field(discriminator="kind")] = Cup()
+    lamps: dict[str, Lamp] = field(default_factory=lambda: {"main": Lamp()})
+    shelf: tuple[Lamp, ...] = ()
+    name: Text = "room"
+    lit: Flag = True
+    seats: Annotated[int, Between(1, 8)] = 2
+    storey: Whole = 0
+    share: Share = 0.5
+    height: Finite | None = None
+    door: Literal["left", "right"] = "left"
+    steps: tuple[Positive, ...] = (1.0, 2.0)
+
+
+FIELDS = "tool, lamps, shelf, name, lit, seats, storey, share, height, door, steps"
+REFUSED = [
+    ("lit: 1", "lit: 1; allowed is true or false"),
+    ("lit: 'yes'", "lit: 'yes'; allowed is true or false"),
+    ("name: 3", "name: 3; allowed is a text"),
+    ("name: ''", "name: ''; allowed is a text"),
+    ("seats: 2.0", "seats: 2.0; allowed is a whole number from 1 to 8"),
+    ("seats: true", "seats: True; allowed is a whole number from 1 to 8"),
+    ("seats: 0", "seats: 0; allowed is a whole number from 1 to 8"),
+    ("storey: 0.5", "storey: 0.5; allowed is a whole number"),
+    ("share: 2", "share: 2; allowed is a finite number from 0 to 1"),
+    ("share: true", "share: True; allowed is a finite number from 0 to 1"),
+    ("share: '0.5'", "share: '0.5'; allowed is a finite number from 0 to 1"),
+    ("share: null", "share: None; allowed is a finite number from 0 to 1"),
+    ("share: .nan", "share: nan; allowed is a finite number from 0 to 1"),
+    ("height: .inf", "height: inf; allowed is a finite number"),
+    ("height: 1" + "0" * 400, "allowed is a finite number"),
+    ("height: 0x" + "f" * 5000, "height: a number; allowed is a finite number"),
+    ("lamps: {main: {power: -1}}", "lamps.main.power: -1; allowed is a finite number from 0 to inf"),
+    ("door: up", "door: 'up'; allowed is one of left, right"),
+    ("door: [left]", "door: ['left']; allowed is one of left, right"),
+    ("steps: 1", "steps: 1; allowed is a list"),
+    ("steps: [1, -2]", "steps[1]: -2; allowed is a finite number from 1e-12 to inf"),
+    ("door_: up", f"door_: is unknown; allowed are {FIELDS}"),
+    ("3: up", f"[3]: is unknown; allowed are {FIELDS}"),
+    ('"a\\nb": up', f"'a\\nb': is unknown; allowed are {FIELDS}"),
+    ("tool: cup", "tool: 'cup'; allowed is a mapping"),
+    ("tool: {kind: hook}", "tool.kind: 'hook'; allowed is one of cup, jaws"),
+    ("tool: {kind: [hook]}", "tool.kind: ['hook']; allowed is one of cup, jaws"),
+    ("tool: {kind: jaws}", "tool.width: is missing; needed are width"),
+    ("tool: {kind: jaws, width: 1}", "tool.width: 1; allowed is a finite number from 0.01 to 0.2"),
+    ("tool: {radius: 1, colour: 2}", "tool.colour: is unknown; allowed are kind, radius, rims"),
+    ("tool: {rims: [[1, 2, 3], [1, 2]]}", "tool.rims[1]: [1, 2]; allowed is a list of 3 numbers"),
+    ("tool: {rims: [[1, 2, 3, 4]]}", "tool.rims[0]: [1, 2, 3, 4]; allowed is a list of 3 numbers"),
+    ("tool: {rims: [up]}", "tool.rims[0]: 'up'; allowed is a list of 3 numbers"),
+    ("tool: {rims: [[1, 2, .nan]]}", "tool.rims[0][2]: nan; allowed is a finite number"),
+    ("lamps: [1]", "lamps: [1]; allowed is a mapping"),
+    ("lamps: {main: 3}", "lamps.main: 3; allowed is a mapping with pose, power"),
+    ("lamps: {1: {}}", "lamps[1]: 1; allowed is a text"),
+    ("lamps: {main: {pose: {x: 1}}}", "lamps.main.pose.x: is unknown; allowed are translation, rpy_deg"),
+    ("shelf: [{}, {power: on}]", "shelf[1].power: True; allowed is a finite number from 0 to inf"),
+    ("shelf: [{}, {size: 1}]", "shelf[1].size: is unknown; allowed are pose, power"),
+    ("- 1", f"[1]; allowed is a mapping with {FIELDS}"),
+    ("room", f"'room'; allowed is a mapping with {FIELDS}"),
+    ("lit: [true", "is not YAML (line 2: did not find expected ',' or ']')"),
+    ("lit: true\nname: a\nlit: false", "is not YAML (line 3: 'lit' is there twice in a mapping)"),
+    ("lamps:\n  a: {}\n  b: {power: 1, power: 2}", "(line 3: 'power' is there twice in a mapping)"),
+    ("1e3: a\n1000.0: b", "(line 2: 1000.0 is there twice in a mapping)"),
+    ("lamps: &a [*a]", "is not YAML (line 1: found unconstructable recursive node)"),
+    ("lamps: &a {b: *a}", "is not YAML (line 1: found unconstructable recursive node)"),
+    ("? [a]\n: b", "is not YAML (line 1: found unhashable key)"),
+    ("seats: " + "[" * 3000 + "]" * 3000, "is not YAML"),
+    ("name: !!python/object:os.system {}", "is not YAML (line 1: could not determine a constructor"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), REFUSED, ids=[text[:30] for text, _ in REFUSED])
+def test_a_misuse_is_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "room.yaml"
+    path.write_text(text + "\n")
+    with pytest.raises(InputError) as refused:
+        load_typed(Room(), path)
+    line = str(refused.value)
+    assert line.startswith(f"{path}: ")
+    assert message in line
+    assert "allowed" in line or "needed" in line
+    assert "\n" not in line
+    assert len(line) <= len(f"{path}: ") + 300
+
+
+LONG = "x" * 5000
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {LONG: 1},
+        {"name\n" * 9: 1},
+        {"name": [LONG] * 100},
+        {"lamps": {LONG: {"power": [[LONG] * 9] * 9}}},
+        {"lamps": {LONG: {LONG: 1}}},
+        {"tool": {"kind": LONG}},
+        {"door": {LONG: {LONG: LONG}}},
+        {"lit": 10**5000},
+        [[LONG] * 100] * 100,
+    ],
+)
+def test_a_long_value_is_cut(given: Any) -> None:
+    with pytest.raises(InputError, match="room: ") as refused:
+        override(Room(), given, "room")
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) <= 310
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.yaml: cannot be read \(No such file.*allowed is a room"):
+        read_yaml(tmp_path / "none.yaml", "a room")
+    (tmp_path / "binary.yaml").write_bytes(b"\x89PNG\xff")
+    with pytest.raises(InputError, match=r"binary\.yaml: is not YAML \(invalid start byte\)"):
+        read_yaml(tmp_path / "binary.yaml", "a room")
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("lit", "--set lit: allowed is FIELD=VALUE"),
+        ("=3", "--set =3: allowed is FIELD=VALUE"),
+        ("steps=[1", "--set steps=[1: is not YAML (line 2: did not find"),
+        ("steps={a: 1, a: 2}", "is not YAML (line 1: 'a' is there twice in a mapping)"),
+        ("steps.1=-1", "--set steps.1=-1: steps[1]: -1; allowed is"),
+        ("steps.2=1", "steps: {'2': 1}; allowed is a list"),
+        ("lamps.main.pose.yaw=north", "lamps.main.pose.rpy_deg[2]: 'north'; allowed is a finite number"),
+        ("lamps.main.yaw=3", "lamps.main.yaw: is unknown; allowed are pose, power"),
+        ("door.left=1", "door: {'left': 1}; allowed is one of left, right"),
+    ],
+)
+def test_a_broken_setting(setting: str, message: str) -> None:
+    with pytest.raises(InputError) as refused:
+        load_typed(Room(), settings=[setting])
+    assert message in str(refused.value)
+
+
+def test_settings_change_one_field_each() -> None:
+    two = Room(lamps={"main": Lamp(power=2.0), "side": Lamp(power=3.0)})
+    settings = ["lamps.side.power=1e-3", "lamps.side.pose.yaw=90", "steps.1=5", "tool.radius=2E-2", "name=1e"]
+    made = load_typed(two, settings=settings)
+    pose = PoseSpec(rpy_deg=(0.0, 0.0, 90.0))
+    assert made.lamps == {"main": Lamp(power=2.0), "side": Lamp(power=0.001, pose=pose)}
+    assert (made.steps, made.tool, made.name) == ((1.0, 5.0), Cup(radius=0.02), "1e")
+
+
+def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> None:
+    two = Room(lamps={"main": Lamp(power=2.0), "side": Lamp(power=3.0)})
+    given = {"lamps": {"new": {"power": 4.0}, "side": {"pose": {"translation": [1, 2, 3]}}}}
+    made = override(two, given, "room")
+    pose = PoseSpec(translation=(1.0, 2.0, 3.0))
+    assert list(made.lamps.items()) == [("new", Lamp(power=4.0)), ("side", Lamp(power=3.0, pose=pose))]
+
+
+def test_another_kind_is_not_merged_with_the_one_before() -> None:
+    assert override(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(width=0.1)
+    assert override(Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room").tool == Cup(radius=0.5)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    room = Room(lamps={"side": Lamp(power=1e-5)}, name="1e-5", tool=Jaws(width=0.1), steps=(1e22, 1e-5))
+    assert validate(Room, to_plain(room), "room") == room
+    (tmp_path / "room.yaml").write_text(config_yaml(room))
+    assert load_typed(Room(), tmp_path / "room.yaml") == room
+
+
+def test_numbers_with_an_exponent_are_numbers() -> None:
+    text = "[1e-3, 1E5, -2.e+1, .5e2, 1e-05, +1e3, 1.5e3]"
+    assert parse_yaml(text, "") == [0.001, 1e5, -20.0, 50.0, 1e-5, 1e3, 1500.0]
+    texts = ["1e-3", "e3", "1e", "1e3x", "1e-05", "-1E5", "yes", "12", "1:30", "", "a: b", "ö"]
+    assert parse_yaml(yaml_text(texts), "") == texts
+    assert parse_yaml("[e3, 1e, 1e3x, '1e3']", "") == ["e3", "1e", "1e3x", "1e3"]
+
+
+def test_merge_keys_may_override() -> None:
+    text = "a: &a {x: 1, y: 2}\nb: &b {<<: *a, x: 3}\nc: {<<: [*b, *a], y: 4}\n"
+    assert parse_yaml(text, "")["b"] == {"x": 3, "y": 2}
+    assert parse_yaml(text, "")["c"] == {"x": 3, "y": 4}
+    with pytest.raises(InputError, match="line 2: 'x' is there twice"):
+        parse_yaml("a: &a {x: 1}\nb: {x: 1, <<: *a, x: 2}", "")
+
+
+def schemas() -> list[Any]:
+    """Every model and config class of the package."""
+    root = Path(drake_clutter.__file__).parent
+    files = [path.relative_to(root.parent).with_suffix("") for path in root.rglob("*.py")]
+    names = [".".join(file.parts) for file in files if not file.stem.startswith("__") and "_shipped" not in file.parts]
+    modules = [importlib.import_module(name) for name in names]
+    classes = {value for module in modules for value in vars(module).values() if isinstance(value, type)}
+    return sorted((c for c in classes if "__pydantic_core_schema__" in vars(c)), key=str)
+
+
+def converting(node: Any) -> Iterator[Any]:
+    """The parts of a core schema that take a value of another type, or that name no field in an error."""
+    if isinstance(node, dict):
+        if node.get("type") in ("bool", "int", "float", "union") and not node.get("strict"):
+            yield node
+        for value in node.values():
+            yield from converting(value)
+    elif isinstance(node, list | tuple):
+        for value in node:
+            yield from converting(value)
+
+
+def test_no_schema_converts() -> None:
+    """A plain `int`, `float` or `bool` would take "3", true or 1: use `Between`, `Whole` and `Flag`."""
+    found = [(c.__name__, node) for c in schemas() for node in converting(vars(c)["__pydantic_core_schema__"])]
+    assert not found
+
+
+def test_yaml_is_read_in_one_place() -> None:
+    root = Path(drake_clutter.__file__).parent
+    files = [*root.rglob("*.py"), *(root.parent / "training").glob("*.py")]
+    users = {path.name for path in files if "yaml.safe_load" in path.read_text() or "yaml.load(" in path.read_text()}
+    assert users == {"yaml_text.py"}
