@@ -20,13 +20,13 @@ from rich.console import Console
 from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
-from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import NEAR, REPORTED, PlannerConfig
-from drake_clutter.planning.paths import Payload, sampled, smooth, timed
+from drake_clutter.planning.paths import sampled, smooth, timed
 from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.placement import choose_placement
@@ -254,10 +254,9 @@ def parts(
             return False
         around = planner.clearance_scene(scene.objects)
         q = sampled(plan.phases[1].trajectory)
-        cell = default_cell()
-        poses = cell.robot.X_TB.GetAsMatrix4() @ forward_kinematics(q) @ cell.gripper.X_FG.GetAsMatrix4()
-        timed_as("forward kinematics of a pose", lambda: forward_kinematics(q), len(q))
-        timed_as("inverse kinematics of a pose, eight branches", lambda: planner.reach(poses), len(q))
+        poses = planner.tool.pose(q)
+        timed_as("forward kinematics of a pose", lambda: planner.tool.robot.forward_kinematics(q), len(q))
+        timed_as("inverse kinematics of a pose, eight branches", lambda: planner.tool.solve(poses), len(q))
         timed_as("distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q))
         timed_as("distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q))
         timed_as("timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload()))

@@ -19,11 +19,13 @@ from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.attempts import PlannerConfig, downwards
+from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.reachability import Reachability, base_scores
+from drake_clutter.planning.tool_kinematics import downwards
 from drake_clutter.reports import feasibility_report
+from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
@@ -195,6 +197,30 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
     told = CliRunner().invoke(app, [*arguments, "--seed", "1"])
     assert isinstance(told.exception, InputError)
     assert "holds another study" in str(told.exception)
+
+
+def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene on the small tray that they reach."""
+    quick(monkeypatch)
+    pile = [resting("pudding_box"), resting("tomato_soup_can", xy=(-0.1, -0.15))]
+    scene, out = scene_of(*pile, side=0.5), tmp_path / "study"
+    verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 1.0), ())
+    save_scene(tmp_path / "pile.yaml", scene, DEFAULT_CELL, verdict)
+    arguments = ["feasibility", str(tmp_path / "pile.yaml"), "--out", str(out)]
+    names = ["iiwa14_epick_tray", "ur5e_epick_tray", "ur10e_epick_tray"]
+    for name in names:
+        arguments += ["--arm", str(shipped_path(f"models/cells/{name}.yaml"))]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 0, told.output
+    setups = json.loads((out / "summary.json").read_text())["setups"]
+    assert list(setups) == names
+    for found in setups.values():
+        assert found["planned"] > 0
+        assert set(found["results"]) <= {PLANNED, PlanFailure.NO_FREE_SPOT.value}
+    reach = table(out / "reach.csv")
+    for name in names:
+        assert max(float(row["share"]) for row in reach if row["setup"] == name) == 1.0
+    assert (out / "report.html").stat().st_size > 1e5
 
 
 def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:

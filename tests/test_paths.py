@@ -8,15 +8,11 @@ from conftest import DEFAULT_CELL, rng
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.planning.paths import (
-    ACCELERATION_LIMIT,
     MARGIN,
-    TORQUE_LIMIT,
-    VELOCITY_LIMIT,
-    Payload,
     dynamics_plant,
-    nearest_turns,
     sampled,
     slowed,
     smooth,
@@ -26,14 +22,21 @@ from drake_clutter.planning.paths import (
 )
 
 ARM = DEFAULT_CELL
-HOME = np.array(ARM.robot.home)
+ROBOT = load_robot(ARM.robot)
+HOME = ROBOT.home
+
+
+def unwrapped(q: float, reference: float) -> float:
+    found = ROBOT.unwrap(np.full(6, q), np.full(6, reference))
+    assert (found == found[0]).all()
+    return float(found[0])
 
 
 def test_whole_turns() -> None:
-    assert nearest_turns(np.array([3.0]), np.array([-3.0])) == pytest.approx([3.0 - 2 * math.pi])
-    assert nearest_turns(np.array([3.0]), np.array([6.2])) == pytest.approx([3.0])
-    assert nearest_turns(np.array([-3.0]), np.array([6.2])) == pytest.approx([2 * math.pi - 3.0])
-    assert nearest_turns(np.array([1.0]), np.array([6.2])) == pytest.approx([1.0]), "a turn more is out of the joint's range"
+    assert unwrapped(3.0, -3.0) == pytest.approx(3.0 - 2 * math.pi)
+    assert unwrapped(3.0, 6.2) == pytest.approx(3.0)
+    assert unwrapped(-3.0, 6.2) == pytest.approx(2 * math.pi - 3.0)
+    assert unwrapped(1.0, 6.2) == pytest.approx(1.0), "a turn more is out of the joint's range"
 
 
 def test_a_smooth_way_keeps_its_ends_and_cuts_corners() -> None:
@@ -52,10 +55,14 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
     q = np.array([trajectory.value(t).ravel() for t in times])
     v, a = (np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2))
     torque = torques(dynamics_plant(ARM, payload), q, v, a)
-    pairs = {"speed": v / VELOCITY_LIMIT, "acceleration": a / ACCELERATION_LIMIT, "torque": torque / TORQUE_LIMIT}
+    pairs = {
+        "speed": v / ROBOT.velocity_limits,
+        "acceleration": a / ROBOT.acceleration_limits,
+        "torque": torque / ROBOT.torque_limits,
+    }
     X_FL = np.eye(4)
     X_FL[:3, 3] = [0.0, 0.0, ARM.gripper.length + payload.p_GCm[2]]
-    of_load = np.diff((forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0) / (times[1] - times[0]) ** 2
+    of_load = np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0) / (times[1] - times[0]) ** 2
     pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.acceleration
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
@@ -91,8 +98,8 @@ def test_as_quick_as_drakes_toppra() -> None:
         middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
         path = smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]]))
         toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
-        toppra.AddJointVelocityLimit(-MARGIN * VELOCITY_LIMIT, MARGIN * VELOCITY_LIMIT)
-        toppra.AddJointAccelerationLimit(-MARGIN * ACCELERATION_LIMIT, MARGIN * ACCELERATION_LIMIT)
+        toppra.AddJointVelocityLimit(-MARGIN * ROBOT.velocity_limits, MARGIN * ROBOT.velocity_limits)
+        toppra.AddJointAccelerationLimit(-MARGIN * ROBOT.acceleration_limits, MARGIN * ROBOT.acceleration_limits)
         found = timed(path, ARM, Payload())
         assert found is not None
         assert found.end_time() == pytest.approx(toppra.SolvePathParameterization().end_time(), rel=0.01)
@@ -103,6 +110,6 @@ def test_the_faster_joint_decides() -> None:
     way = straight(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
     trajectory = timed(smooth(way), ARM, Payload())
     assert trajectory is not None
-    cruise = 2.5 / (0.97 * VELOCITY_LIMIT[0])
-    starts = VELOCITY_LIMIT[0] / ACCELERATION_LIMIT[0]
+    cruise = 2.5 / (0.97 * ROBOT.velocity_limits[0])
+    starts = ROBOT.velocity_limits[0] / ROBOT.acceleration_limits[0]
     assert cruise + 0.8 * starts < trajectory.end_time() < cruise + 1.3 * starts

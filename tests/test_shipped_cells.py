@@ -13,7 +13,6 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 from test_robot_model import CELLS
 
-from drake_clutter.cell.epick import epick_sdf
 from drake_clutter.cell.robot_model import RobotModel, load_robot
 from drake_clutter.cell.robot_plant import add_robot, filter_collisions
 from drake_clutter.cell.work_cell import WorkCell, load_cell
@@ -41,7 +40,7 @@ def clearance(cell: WorkCell, robot: RobotModel, with_view: bool) -> Callable[[F
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     instance = add_robot(plant, robot, visuals=False)
-    tool = epick_sdf(cell.gripper, compliant=False)
+    tool = cell.gripper.model_sdf(compliant=False)
     (gripper,) = Parser(plant).AddModelsFromString(tool, "sdf")
     flange = plant.GetFrameByName(robot.spec.tool_frame, instance)
     plant.WeldFrames(flange, plant.GetFrameByName("body", gripper))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, resting, scene_of
 
-from drake_clutter.cell.kinematics import forward_kinematics
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
@@ -74,10 +74,9 @@ def test_what_something_unknown_may_lie_on() -> None:
 
 def highest(plan: Plan) -> float:
     """m, of the cup while it carries."""
-    X_TB, X_FG = DEFAULT_CELL.robot.X_TB.GetAsMatrix4(), DEFAULT_CELL.gripper.X_FG.GetAsMatrix4()
     carry = plan.phases[1]
-    ways = (carry.trajectory.value(time).ravel() for time in np.linspace(0, carry.duration, 40))
-    return max(float((X_TB @ forward_kinematics(q) @ X_FG)[2, 3]) for q in ways)
+    q = carry.trajectory.vector_values(np.linspace(0, carry.duration, 40)).T
+    return float(ToolKinematics(DEFAULT_CELL).pose(q)[:, 2, 3].max())
 
 
 def test_plans_keep_clear_of_what_is_unseen() -> None:

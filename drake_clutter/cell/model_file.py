@@ -20,11 +20,12 @@ _DRAKE = "drake.mit.edu"
 """Namespace of Drake's own elements and attributes."""
 
 
-def model_path(model: str) -> Path:
+def model_path(model: str, field: str = "robot.model") -> Path:
     """Return the file of a model.
 
     Args:
         model: A path, or package://drake_clutter_models/ and a path in `models/`.
+        field: Where it is named in the cell's file.
 
     Raises:
         InputError: There is no such file, or it is neither SDF nor URDF.
@@ -33,7 +34,7 @@ def model_path(model: str) -> Path:
     shipped, inside = model.startswith(prefix), model.removeprefix(prefix)
     path = shipped_path("models") / inside if shipped else Path(model)
     if not path.is_file() or path.suffix not in (".sdf", ".urdf"):
-        raise InputError(f"robot.model: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
+        raise InputError(f"{field}: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
     return path
 
 
@@ -103,13 +104,19 @@ def _mesh_file(path: Path, uri: str, packages: PackageMap) -> Path:
     return stl_as_obj(file) if file.suffix.lower() == ".stl" else file
 
 
-def parse_model(plant: MultibodyPlant, model: str, *, visuals: bool) -> ModelInstanceIndex:
-    """Add a model to a plant that is not finalized.
+def parse_model(
+    plant: MultibodyPlant,
+    model: str,
+    *,
+    visuals: bool,
+    field: str = "robot.model",
+) -> ModelInstanceIndex:
+    """Add a model to a plant that is not finalized; arguments as of `model_path`, `model_text`.
 
     Raises:
         InputError: The file is missing or damaged, or does not hold one model.
     """
-    path = model_path(model)
+    path = model_path(model, field)
     text = model_text(path, visuals=visuals)
     try:
         instances = Parser(plant).AddModelsFromString(text, path.suffix.removeprefix("."))

@@ -13,10 +13,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
+from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, NoGrasp, Payload
 from drake_clutter.validation import Between, Model
 
 Floats = NDArray[np.float64]
@@ -29,6 +31,16 @@ _RING = 24
 """Points of the lip that are looked at."""
 _STANDOFF = 0.05
 """m above the lip, from which is looked."""
+_DOWN = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+"""R_TG of a cup that points down."""
+_DIRECTIONS = np.array(
+    [
+        [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)]
+        for e in (-0.8, 0.0, 0.8)
+        for a in np.arange(8) * math.pi / 4
+    ]
+    + [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+)
 
 
 class SuctionGripper(Model):
@@ -78,9 +90,93 @@ class SuctionGripper(Model):
         """The cup at rest, in the flange's frame."""
         return RigidTransform([0.0, 0.0, self.length])
 
+    @property
+    def contact_links(self) -> tuple[str, ...]:
+        """The cup."""
+        return ("cup",)
 
-EPICK_LENGTH, EPICK_RADIUS, EPICK_MASS = 0.1023, 0.044, 0.71
-"""m, m, kg: the gripper's body."""
+    def model_sdf(self, *, compliant: bool) -> str:
+        """Return the model, see `epick_sdf`."""
+        return epick_sdf(
+            extension=self.extension,
+            cup_diameter=self.cup_diameter,
+            cup_length=self.cup_length,
+            stroke=self.stroke,
+            stiffness=self.stiffness,
+            compliant=compliant,
+        )
+
+    def grasps(
+        self,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        sampling: GraspSampling,
+    ) -> tuple[Grasp, ...] | NoGrasp:
+        """Return where the cup seals on an object's top and can hold, see `Gripper`."""
+        corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
+        corners_T = corners_T + X_TO.translation()
+        lower, upper = corners_T.min(axis=0), corners_T.max(axis=0)
+        found, least = list[Grasp](), math.inf
+        for x, y in _points(lower[:2], upper[:2], sampling.spacing):
+            X_TG = RigidTransform(_DOWN, [x, y, upper[2]])
+            deviation = unevenness(object_class, X_TO.InvertAndCompose(X_TG), self.cup_diameter)
+            least = min(least, deviation)
+            if deviation > self.unevenness:
+                continue
+            p_GCm = X_TG.rotation().inverse() @ (X_TO.translation() - X_TG.translation())
+            acceleration = self.max_acceleration(object_class.mass, p_GCm)
+            if acceleration >= sampling.least_acceleration:
+                # How the load hangs to the side depends on the yaw; its depth below G does not.
+                p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
+                payload = Payload(object_class.mass, p_GCm, round(acceleration, 1))
+                found.append(Grasp(X_TG.translation(), payload))
+                if len(found) == sampling.count:
+                    break
+        if found:
+            return tuple(found)
+        if least > self.unevenness:
+            return NoGrasp(GraspFailure.NO_SEAL, least)
+        return NoGrasp(GraspFailure.TOO_HEAVY, object_class.mass)
+
+    def seals(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+        """Return whether the lip follows the surface at a pose."""
+        return unevenness(object_class, X_OG, self.cup_diameter) <= self.unevenness
+
+    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
+        """Return the acceleration [m/s^2] of a cup that points down, see `Gripper`."""
+
+        def bears(accelerations: Floats) -> NDArray[np.bool_]:
+            load = carried_load(mass, p_GCm, accelerations[:, None, None] * _DIRECTIONS)
+            return np.asarray(self.load_ratio(*load).max(axis=1) * self.safety <= 1)
+
+        low, high = 0.0, 50.0
+        while high - low > 0.01:
+            between = np.linspace(low, high, 9)
+            largest = int(np.argmin(np.append(bears(between), False))) - 1
+            if largest < 0:
+                return -1.0
+            low, high = float(between[largest]), float(between[min(largest + 1, 8)])
+        return low
+
+    def load_ratio(self, force: Floats, moment: Floats) -> Floats:
+        """Return the larger of what opens the lip and what makes it slide, see `Gripper`."""
+        radius = self.cup_diameter / 2
+        bending = np.hypot(moment[..., 0], moment[..., 1])
+        opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / self.pull
+        pressed = np.maximum(self.pull - force[..., 2], 1e-9)
+        # A thin ring that turns in place slides with its whole circumference at its radius.
+        tangential = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius)
+        return np.asarray(np.maximum(opening, tangential / (self.friction * pressed)))
+
+
+def _points(lower: Floats, upper: Floats, spacing: float) -> Floats:
+    """Return points of a rectangle, (n, 2), the nearest to its middle first."""
+    steps = [np.arange(0, (hi - lo) / 2, spacing) for lo, hi in zip(lower, upper, strict=True)]
+    x, y = np.meshgrid(*(np.concatenate([-s[:0:-1], s]) for s in steps), indexing="ij")
+    middle = (lower + upper) / 2
+    points = middle + np.column_stack([x.ravel(), y.ravel()])
+    distances = np.round(np.linalg.norm(points - middle, axis=1), 6)
+    return np.asarray(points[np.argsort(distances, kind="stable")])
 
 
 @lru_cache(maxsize=256)
@@ -89,18 +185,19 @@ def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
     return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
 
 
-def surface_under_lip(object_class: ObjectClass, X_OG: Floats, diameter: float) -> Floats:
+def surface_under_lip(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
     """How far below the lip an object's surface is, along the cup's axis, at points around the lip, m; infinite in the air.
 
     Args:
         object_class: what the cup is on.
-        X_OG: (4, 4), z into the object.
+        X_OG: z into the object.
         diameter: m, of the lip.
     """
+    R_OG = X_OG.rotation().matrix()
     angle = np.arange(_RING) * (2 * np.pi / _RING)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_RING)]) * diameter / 2
-    p = (ring - np.array([0.0, 0.0, _STANDOFF])) @ X_OG[:3, :3].T + X_OG[:3, 3]
-    along = X_OG[:3, 2]
+    p = (ring - np.array([0.0, 0.0, _STANDOFF])) @ R_OG.T + X_OG.translation()
+    along = R_OG[:, 2]
     depth = np.full(_RING, np.inf)
     for half_spaces in _half_spaces(object_class):
         steep, outside = half_spaces[:, :3] @ along, p @ half_spaces[:, :3].T + half_spaces[:, 3]
@@ -113,39 +210,13 @@ def surface_under_lip(object_class: ObjectClass, X_OG: Floats, diameter: float) 
     return depth - _STANDOFF
 
 
-def unevenness(object_class: ObjectClass, X_OG: Floats, diameter: float) -> float:
+def unevenness(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> float:
     """How far, in m, the surface under the lip leaves a plane across the cup; infinite if the lip is partly in the air.
 
     Tilt, curvature, edges and gaps all show as this one number. Arguments: see `surface_under_lip`.
     """
     depth = surface_under_lip(object_class, X_OG, diameter)
     return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
-
-
-def load_share(force: Floats, moment: Floats, config: SuctionGripper) -> Floats:
-    """How much of what the cup can bear a load takes up; above 1 it comes off.
-
-    Args:
-        force: (..., 3) N, with which the object pulls on the lip, in G; moment: (..., 3) N m, about its middle.
-        config: the cup.
-    """
-    radius = config.cup_diameter / 2
-    bending = np.hypot(moment[..., 0], moment[..., 1])
-    opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / config.pull
-    pressed = np.maximum(config.pull - force[..., 2], 1e-9)
-    # A thin ring that turns in place slides with its whole circumference at the lever arm of its radius.
-    sliding = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius) / (config.friction * pressed)
-    return np.asarray(np.maximum(opening, sliding))
-
-
-_DIRECTIONS = np.array(
-    [
-        [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)]
-        for e in (-0.8, 0.0, 0.8)
-        for a in np.arange(8) * math.pi / 4
-    ]
-    + [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
-)
 
 
 def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
@@ -159,26 +230,3 @@ def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floa
     down = np.array([0.0, 0.0, GRAVITY])  # z of a cup that points down
     force = mass * (down - acceleration)
     return force, np.cross(np.broadcast_to(p_GCm, force.shape), force)
-
-
-def greatest_acceleration(mass: float, p_GCm: Floats, config: SuctionGripper) -> float:
-    """m/s^2, with which a cup that points down may move a body in any direction, safety included; negative if it cannot hold it.
-
-    Args:
-        mass: kg.
-        p_GCm: (3,) m, the body's centre of mass.
-        config: the cup.
-    """
-
-    def bears(accelerations: Floats) -> NDArray[np.bool_]:
-        share = load_share(*carried_load(mass, p_GCm, accelerations[:, None, None] * _DIRECTIONS), config)
-        return np.asarray(share.max(axis=1) * config.safety <= 1)
-
-    low, high = 0.0, 50.0
-    while high - low > 0.01:
-        between = np.linspace(low, high, 9)
-        largest = int(np.argmin(np.append(bears(between), False))) - 1
-        if largest < 0:
-            return -1.0
-        low, high = float(between[largest]), float(between[min(largest + 1, 8)])
-    return low

@@ -18,6 +18,9 @@ from drake_clutter.resources import shipped_path
 from drake_clutter.validation import Model, Text, allowed, load_typed, validate
 from drake_clutter.yaml_text import read_yaml
 
+GripperSpec = SuctionGripper
+"""Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
+`Annotated[SuctionGripper | Other, Field(discriminator="kind")]`; each satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
 _RESERVED = ("tray", "camera", "pedestal", "robot", "gripper")
 """Names of what stands in a cell besides fixtures."""
@@ -35,7 +38,7 @@ class WorkCell(Model):
     """
 
     robot: RobotSpec
-    gripper: SuctionGripper
+    gripper: GripperSpec
     support: Support
     cameras: Annotated[dict[Text, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()

@@ -17,7 +17,8 @@ from pydantic import field_validator
 from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.cell.robot_model import load_robot
+from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, output_directory, write_json, write_text
 from drake_clutter.planning.attempts import PlannerConfig
@@ -103,10 +104,14 @@ def setups(
 
     Args:
         bases: X_TB as x, y, z (m) and yaw (deg). trays: X_BT likewise.
-        files: YAML with fields of `WorkCell` over those of the default.
+        files: YAML with fields of `WorkCell` over those of the default; whole cells if they name
+            a robot's model.
         default: A cell.
+
+    Raises:
+        InputError: A file that is none, or a robot that cannot be loaded.
     """
-    found = {path.stem: load_typed(default, path, convert=upgrade_cell) for path in files}
+    found = {path.stem: _cell(path, default) for path in files}
     for base in bases:
         found[f"base {', '.join(f'{v:g}' for v in base)}"] = _moved(default, base)
     for x, y, z, yaw in trays:
@@ -114,6 +119,16 @@ def setups(
         seen_from_tray = [-(c * x + s * y), -(c * y - s * x), -z, -yaw]
         found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = _moved(default, seen_from_tray)
     return found or {"default": default}
+
+
+def _cell(path: Path, default: WorkCell) -> WorkCell:
+    given = read_yaml(path, "a mapping of a cell's fields")
+    robot = given.get("robot") if isinstance(given, dict) else None
+    if not isinstance(robot, dict) or "model" not in robot:
+        return load_typed(default, path, convert=upgrade_cell)
+    cell = load_cell(path)
+    load_robot(cell.robot)
+    return cell
 
 
 def _moved(cell: WorkCell, base: Sequence[float]) -> WorkCell:

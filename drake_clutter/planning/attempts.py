@@ -4,21 +4,31 @@ Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked obje
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.kinematics import forward_kinematics
+from drake_clutter.cell.gripper import Grasp, Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.clearance import Clearance, ClearanceScene
-from drake_clutter.planning.paths import SPACING, Payload, least_time, nearest_turns, sampled, slowed, smooth, straight, timed
+from drake_clutter.planning.paths import SPACING, least_time, sampled, slowed, smooth, timed
 from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.shorten import Wall, Way, shortened
+from drake_clutter.planning.tool_kinematics import (
+    CarryWay,
+    ToolKinematics,
+    downwards,
+    inverse,
+    lifted,
+)
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.plant import rigid_transform
 from drake_clutter.validation import Between, Flag, NonNegative, config_class
 
 Floats = NDArray[np.float64]
@@ -64,49 +74,10 @@ SPARE = 0.005
 """m, that an optimised way is kept further away than it must be: it is looked at in few points."""
 NEAR = 0.06
 """m; what is further away is not looked at when a way is optimised."""
-_VERTICAL_STEP = 0.02
-"""m, between the points of a vertical way."""
 _DESCENT_STEP = 0.005
 """m, between the points of a guarded descent."""
-_JUMP = 0.5
-"""rad, from one point of a vertical way to the next: the branch goes on elsewhere."""
-
-
-def matrix(pose: Pose) -> Floats:
-    """(4, 4) of a pose."""
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = pose.rotation, pose.p
-    return X
-
-
-def inverse(X_AB: Floats) -> Floats:
-    """(4, 4) X_BA."""
-    X = np.eye(4)
-    X[:3, :3] = X_AB[:3, :3].T
-    X[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
-    return X
-
-
-def downwards(yaw: float, p_TG: Floats) -> Floats:
-    """(4, 4) X_TG of a cup that points down."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    X = np.eye(4)
-    X[:3, :3] = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
-    X[:3, 3] = p_TG
-    return X
-
-
-@dataclass(frozen=True)
-class Grasp:
-    """Where the cup goes.
-
-    Attributes:
-        p_TG: (3,) m, on the top face.
-        payload: what the cup then carries.
-    """
-
-    p_TG: Floats
-    payload: Payload
+LEVEL = math.radians(0.5)
+"""By which the gripper's axis may leave the vertical while it carries something [rad]."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +93,10 @@ class End:
     beside: Mapping[str, float]
 
 
+def _array(X_AB: RigidTransform) -> Floats:
+    return np.ascontiguousarray(X_AB.GetAsMatrix4())
+
+
 class Attempts:
     """The search for one move: grasps, yaws, branches and heights, until a way is free."""
 
@@ -129,75 +104,68 @@ class Attempts:
         self,
         cell: WorkCell,
         config: PlannerConfig,
-        reach: Callable[[Floats], Floats],
         scene: ClearanceScene,
         objects: Sequence[SceneObject],
         picked: SceneObject,
         X_TO_place: Pose,
         tops: Sequence[float] = (),
     ) -> None:
-        """Nothing tried yet; `reach` gives the branches for poses X_TG (..., 4, 4), `tops` are of what else there is, m."""
-        self._cell, self._config, self._reach, self._scene, self._picked = cell, config, reach, scene, picked
-        self._X_TO, self._X_TO_place, self._place = matrix(picked.X_TO), matrix(X_TO_place), X_TO_place
+        """Nothing is tried yet; `tops` are heights of what else there is [m]."""
+        self._cell, self._config, self._scene, self._picked = cell, config, scene, picked
+        self._tool, self._place = ToolKinematics(cell), X_TO_place
+        self._robot = self._tool.robot
+        self._X_TO = _array(rigid_transform(picked.X_TO))
+        self._X_TO_place = _array(rigid_transform(X_TO_place))
+        self._touching = [(link, picked.name) for link in cell.gripper.contact_links]
         self.count, self.furthest = 0, NoPlan(PlanFailure.UNREACHABLE, "the grasp")
         self._progress = -1
         placed = replace(picked, X_TO=X_TO_place)
         others = [o for o in objects if o is not picked]
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
         tops = sorted({round(top, 3) for top in (*tops, *(o.top for o in others)) if top > bottom})
-        self._bottoms = [bottom + self._config.rise] + [top + self._config.rise for top in tops if top > bottom]
-        self._home = np.array(cell.robot.home)
+        rise = self._config.rise
+        self._bottoms = [bottom + rise] + [top + rise for top in tops if top > bottom]
 
-    def fail(self, progress: int, reason: PlanFailure, about: str, number: float = math.nan) -> None:
+    def fail(
+        self,
+        progress: int,
+        reason: PlanFailure,
+        about: str,
+        number: float = math.nan,
+    ) -> None:
         """Remembers why an attempt failed, if it came further than those before."""
         if progress > self._progress:
             self._progress, self.furthest = progress, NoPlan(reason, about, number)
 
-    def ends(self, grasp: Grasp) -> list[tuple[Floats, Floats, int, float]]:
-        """q at the grasp and at the place, branch and yaw, the quickest way first."""
+    def ends(self, grasp: Grasp) -> list[tuple[Floats, Floats, float]]:
+        """q (n,) at the grasp and at the place, and yaw, the quickest way first."""
         yaws = np.arange(self._config.yaws) * (2 * math.pi / self._config.yaws)
-        X_pick = np.array([self._lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap) for yaw in yaws])
-        X_place = np.array([self._at_place(X) for X in X_pick])
-        q_pick, q_place = self._reach(X_pick), self._reach(X_place)
+        X_pick = [lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap) for yaw in yaws]
+        X_place = [self._at_place(X) for X in X_pick]
+        q_pick, q_place = self._tool.solve(np.array(X_pick)), self._tool.solve(np.array(X_place))
+        q_place = self._robot.ik.match(q_pick, q_place)
         reached = np.isfinite(q_pick[..., 0])
         if (reached & ~np.isfinite(q_place[..., 0])).any():
             self.fail(0, PlanFailure.UNREACHABLE, "the place")
-        at_pick = nearest_turns(q_pick, self._home)
-        at_place = nearest_turns(q_place, at_pick)
-        turns = np.array([at_pick - self._home, at_place - at_pick, at_place - self._home])
+        at_pick = self._robot.unwrap(q_pick, self._robot.home)
+        at_place = self._robot.unwrap(q_place, at_pick)
+        home = self._robot.home
+        turns = np.array([at_pick - home, at_place - at_pick, at_place - home])
         with np.errstate(invalid="ignore"):
-            length = least_time(turns).sum(axis=0)
+            length = least_time(turns, self._robot).sum(axis=0)
         order = np.argsort(length, axis=None, kind="stable")  # what is not finite comes last
-        chosen = [divmod(int(n), 8) for n in order[: np.isfinite(length).sum()]]
-        return [(at_pick[k, branch], at_place[k, branch], branch, float(yaws[k])) for k, branch in chosen]
-
-    @staticmethod
-    def _lifted(X_TG: Floats, height: float) -> Floats:
-        X = X_TG.copy()
-        X[2, 3] += height
-        return X
+        solutions = self._robot.ik.num_solutions
+        chosen = [divmod(int(k), solutions) for k in order[: np.isfinite(length).sum()]]
+        return [(at_pick[k], at_place[k], float(yaws[k[0]])) for k in chosen]
 
     def _at_place(self, X_TG: Floats) -> Floats:
         return np.asarray(self._X_TO_place @ inverse(self._X_TO) @ X_TG)
-
-    def _column(self, X_TG: Floats, top: float, branch: int, start: Floats) -> Floats | None:
-        """(n, 6) straight up from a pose until the cup is at a height; None if it is out of reach, or the branch jumps."""
-        heights = np.linspace(X_TG[2, 3], top, max(2, math.ceil((top - X_TG[2, 3]) / _VERTICAL_STEP) + 1))
-        X = np.broadcast_to(X_TG, (len(heights), 4, 4)).copy()
-        X[:, 2, 3] = heights
-        q = self._reach(X)[:, branch]
-        if not np.isfinite(q).all():
-            return None
-        q[0] = start
-        for k in range(1, len(q)):
-            q[k] = nearest_turns(q[k], q[k - 1])
-        return None if np.abs(np.diff(q, axis=0)).max() > _JUMP else q
 
     def _free(self, way: Floats, end: End, progress: int, what: str) -> Clearance | None:
         """The least clearance along a way; None, and the reason is remembered, if it is less than it must be.
 
         Args:
-            way: (n, 6) rad.
+            way: (m, n) rad.
             end: to which the way is near.
             progress: see `fail`.
             what: the way is.
@@ -219,7 +187,7 @@ class Attempts:
         The cup may come close to its object, and the held object to what it touches at the end of its way; but as much further
         away as they are aside of that end, at least.
         """
-        if here.pair == ("cup", self._picked.name):
+        if here.pair in self._touching:
             close = self._config.lip_gap / 2
         elif here.pair[0] == self._picked.name and here.pair[1] in end.beside:
             close = end.beside[here.pair[1]]
@@ -227,82 +195,115 @@ class Attempts:
             return least
         return min(least, close + float(np.linalg.norm(self._scene.cup_position()[:2] - end.at)))
 
-    def _poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, Floats]:
-        """X_TG at the grasp and at the place, and X_OG, (4, 4) each."""
-        X_pick = self._lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap)
-        return X_pick, self._at_place(X_pick), inverse(self._X_TO) @ X_pick
+    def _poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, RigidTransform]:
+        """X_TG at the grasp and at the place, (4, 4) each, and X_OG."""
+        X_pick = lifted(downwards(yaw, grasp.p_TG), self._config.lip_gap)
+        return X_pick, self._at_place(X_pick), RigidTransform(inverse(self._X_TO) @ X_pick)
 
-    def ends_free(self, X_OG: Floats, q_pick: Floats, q_place: Floats) -> tuple[End, End] | None:
-        """Both ends of the object's way; None if the arm or the object is in collision there."""
+    def _pick_end(self, X_OG: RigidTransform, q: Floats) -> End | None:
+        """The start of the object's way; None if the arm is in collision there."""
         self._set_up("approach", X_OG)
-        pick, place = ((X_TO @ X_OG)[:2, 3] for X_TO in (self._X_TO, self._X_TO_place))
-        if self._free(q_pick[None], End(pick, {}), 1, "at the grasp") is None:
+        at = (self._X_TO @ _array(X_OG))[:2, 3]
+        if self._free(q[None], End(at, {}), 1, "at the grasp") is None:
             return None
         self._set_up("carry", X_OG)
-        ends = End(pick, self._beside(q_pick)), End(place, self._beside(q_place))
-        return None if self._free(q_place[None], ends[1], 2, "at the place") is None else ends
+        return End(at, self._beside(q))
+
+    def _place_end(self, X_OG: RigidTransform, q: Floats) -> End | None:
+        """The end of the object's way; None if the arm or the object is in collision there."""
+        self._set_up("carry", X_OG)
+        end = End((self._X_TO_place @ _array(X_OG))[:2, 3], self._beside(q))
+        return None if self._free(q[None], end, 2, "at the place") is None else end
 
     def _beside(self, q: Floats) -> dict[str, float]:
         name = self._picked.name
-        close = [here for here in self._scene.close(q, self._config.clearance) if here.pair[0] == name]
+        near = self._scene.close(q, self._config.clearance)
+        close = [here for here in near if here.pair[0] == name]
         return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
 
     def exist(self, grasp: Grasp) -> bool:
         """Whether some yaw and branch reach both ends without collision."""
-        return any(self.ends_free(self._poses(grasp, yaw)[2], q, p) is not None for q, p, _, yaw in self.ends(grasp))
+        for q_pick, q_place, yaw in self.ends(grasp):
+            X_OG = self._poses(grasp, yaw)[2]
+            if self._pick_end(X_OG, q_pick) and self._place_end(X_OG, q_place):
+                return True
+        return False
 
-    def carry_out(self, grasp: Grasp, q_pick: Floats, q_place: Floats, branch: int, yaw: float) -> Plan | None:
+    def carry_out(self, grasp: Grasp, q_pick: Floats, q_place: Floats, yaw: float) -> Plan | None:
         """A plan with this grasp, yaw and branch, at the least height that is free; None if there is none."""
         self.count += 1
         X_pick, X_place, X_OG = self._poses(grasp, yaw)
-        ends = self.ends_free(X_OG, q_pick, q_place)
-        if ends is None:
+        pick, place = self._pick_end(X_OG, q_pick), None
+        if pick is None:
             return None
-        name, hangs = self._picked.name, X_pick[2, 3] - self._picked.bounds_T[0][2]
+        chosen = self._robot.vertical_tool_rows is not None  # else the way decides how it arrives
+        if chosen and (place := self._place_end(X_OG, q_place)) is None:
+            return None
+        hangs = X_pick[2, 3] - self._picked.bounds_T[0][2]
         for bottom in self._bottoms:
             self.count += 1
-            up = self._column(X_pick, bottom + hangs, branch, q_pick)
-            down = self._column(X_place, bottom + hangs, branch, q_place)
-            if up is None or down is None:
-                self.fail(3, PlanFailure.UNREACHABLE, "above the grasp" if up is None else "above the place", bottom + hangs)
+            way = self._tool.carry(X_pick, X_place, bottom + hangs, q_pick, q_place)
+            if isinstance(way, str):
+                self.fail(3, PlanFailure.UNREACHABLE, way, bottom + hangs)
                 return None
-            phases = self._phases(grasp, X_OG, up, down, branch, ends)
+            if not chosen and (place := self._place_end(X_OG, way.down[0])) is None:
+                continue
+            assert place is not None
+            phases = self._phases(grasp, X_OG, way, (pick, place))
             if phases is not None:
-                x, y, z = (float(v) for v in inverse(X_OG)[:3, 3])
-                descent = self._descent(X_OG, q_place, branch)
-                mass = self._picked.object_class.mass
-                return Plan(name, self._picked.X_TO, self._place, X_OG, mass, (x, y, z), phases, self.count, 0.0, descent)
+                return self._planned(X_OG, phases, way.down[0])
         return None
 
-    def _descent(self, X_OG: Floats, q_place: Floats, branch: int) -> Trajectory | None:
+    def _planned(self, X_OG: RigidTransform, phases: tuple[Phase, ...], q_place: Floats) -> Plan:
+        x, y, z = (float(v) for v in inverse(X_OG.GetAsMatrix4())[:3, 3])
+        return Plan(
+            self._picked.name,
+            self._picked.X_TO,
+            self._place,
+            X_OG,
+            self._picked.object_class.mass,
+            (x, y, z),
+            phases,
+            self.count,
+            0.0,
+            self._descent(X_OG, q_place),
+        )
+
+    def _descent(self, X_OG: RigidTransform, q_place: Floats) -> Trajectory | None:
         """Straight down from the place as far as it is asked for, and the arm is free; what it holds may touch anything."""
-        X_place, way = matrix(self._place) @ X_OG, [q_place]
+        X_place, way = self._X_TO_place @ _array(X_OG), [q_place]
         heights = np.arange(0.0, self._config.descent + 1e-9, _DESCENT_STEP)
         self._set_up("retreat", X_OG)
         self._scene.put_one(self._picked.name, self._place.moved((0.0, 0.0, -10.0)))
-        for height in heights[1:]:
-            q = nearest_turns(self._reach(self._lifted(X_place, -height))[branch], way[-1])
-            jumps = not np.abs(q - way[-1]).max() < _JUMP  # also if it is out of reach, and so not a number
-            if jumps or self._free(q[None], End(X_place[:2, 3], {}), 0, "the descent") is None:
+        for before, height in pairwise(heights):
+            X = np.array([lifted(X_place, -before), lifted(X_place, -height)])
+            step = self._tool.track(X, way[-1])
+            end = End(X_place[:2, 3], {})
+            if step is None or self._free(step[1:], end, 0, "the descent") is None:
                 break
-            way.append(q)
+            way.append(step[1])
         if len(way) == 1:
             return None
         return PiecewisePolynomial.FirstOrderHold(heights[: len(way)] / DESCENT_SPEED, np.array(way).T)
 
     def _phases(
-        self, grasp: Grasp, X_OG: Floats, up: Floats, down: Floats, branch: int, ends: tuple[End, End]
+        self,
+        grasp: Grasp,
+        X_OG: RigidTransform,
+        way: CarryWay,
+        ends: tuple[End, End],
     ) -> tuple[Phase, ...] | None:
-        empty = Payload()
-        across = straight(up[-1], down[-1])
+        empty, up, down = Payload(), way.up, way.down
+        to_grasp, to_home = (self._tool.homewards(column[-1]) for column in (up, down))
         ways = {
-            "carry": ([np.vstack([up, across[1:-1], down[::-1]])], grasp.payload),
-            "approach": ([np.vstack([up, way[1:]])[::-1] for way in self._homewards(up[-1], branch)], empty),
-            "retreat": ([np.vstack([down, way[1:]]) for way in self._homewards(down[-1], branch)], empty),
+            "carry": ([way.whole], grasp.payload),
+            "approach": ([np.vstack([up, home[1:]])[::-1] for home in to_grasp], empty),
+            "retreat": ([np.vstack([down, home[1:]]) for home in to_home], empty),
         }
         found = {}
         for progress, (name, (choices, payload)) in enumerate(ways.items(), start=4):
-            phase = next((made for way in choices if (made := self._phase(name, way, payload, X_OG, ends, progress))), None)
+            made = (self._phase(name, choice, payload, X_OG, ends, progress) for choice in choices)
+            phase = next((phase for phase in made if phase), None)
             if phase is None:
                 return None
             found[name] = phase
@@ -310,23 +311,12 @@ class Attempts:
             found = {name: self._shortened(found[name], payload, X_OG, ends) for name, (_, payload) in ways.items()}
         return found["approach"], found["carry"], found["retreat"]
 
-    def _homewards(self, start: Floats, branch: int) -> list[Floats]:
-        """(n, 6) each: straight home, and at the same height until the cup is where it is at home, seen from above."""
-        X_TB, X_FG = self._cell.robot.X_TB.GetAsMatrix4(), self._cell.gripper.X_FG.GetAsMatrix4()
-        X_TG_home, X_TG = (X_TB @ forward_kinematics(q) @ X_FG for q in (self._home, start))
-        X_TG[:2, 3] = X_TG_home[:2, 3]
-        back = nearest_turns(self._reach(X_TG)[branch], start)
-        direct = straight(start, self._home)
-        if not np.isfinite(back).all():
-            return [direct]
-        return [direct, np.vstack([straight(start, back), straight(back, self._home)[1:]])]
-
     def _phase(
         self,
         name: str,
         way: Floats,
         payload: Payload,
-        X_OG: Floats,
+        X_OG: RigidTransform,
         ends: tuple[End, End],
         progress: int,
     ) -> Phase | None:
@@ -341,19 +331,19 @@ class Attempts:
             return None
         return Phase(name, trajectory, clearance, trajectory.end_time())
 
-    def _set_up(self, phase: str, X_OG: Floats) -> None:
+    def _set_up(self, phase: str, X_OG: RigidTransform) -> None:
         """The scene as it is during a phase."""
         name = self._picked.name
         self._scene.release()
         self._scene.put_one(name, self._place if phase == "retreat" else self._picked.X_TO)
         if phase == "carry":
-            self._scene.hold(name, inverse(X_OG))
+            self._scene.hold(name, X_OG)
 
     def _checked(
         self,
         phase: str,
         path: Trajectory,
-        X_OG: Floats,
+        X_OG: RigidTransform,
         ends: tuple[End, End],
         progress: int,
         spacing: float = SPACING / 2,
@@ -361,6 +351,8 @@ class Attempts:
         """The least clearance along a path, looked at every so many radians; None if it is too little."""
         self._set_up(phase, X_OG)
         points = sampled(path, spacing)
+        if phase == "carry" and self._tilted(points, progress):
+            return None
         if phase != "carry":
             return self._free(points, End(ends[int(phase == "retreat")].at, {}), progress, phase)
         half = len(points) // 2  # what it touched at the start it has left by then
@@ -369,7 +361,16 @@ class Attempts:
             found.append(self._free(points[half:], ends[1], progress, phase))
         return None if None in found else min((c for c in found if c), key=lambda c: c.distance)
 
-    def _shortened(self, phase: Phase, payload: Payload, X_OG: Floats, ends: tuple[End, End]) -> Phase:
+    def _tilted(self, points: Floats, progress: int) -> bool:
+        """Whether the gripper leaves the vertical at points (m, n); never with linear rows."""
+        if self._robot.vertical_tool_rows is not None:
+            return False
+        tilt = float(np.linalg.norm(self._tool.axis(points)[:, :2], axis=1).max())
+        if tilt > LEVEL:
+            self.fail(progress, PlanFailure.TRAJECTORY_INFEASIBLE, "carry", tilt)
+        return tilt > LEVEL
+
+    def _shortened(self, phase: Phase, payload: Payload, X_OG: RigidTransform, ends: tuple[End, End]) -> Phase:
         """The phase along a quicker way; as it is if none is found."""
         self._set_up(phase.name, X_OG)
         least, carried = self._config.clearance + SPARE, phase.name == "carry"
@@ -384,7 +385,9 @@ class Attempts:
             return found
 
         upright = phase.name != "approach", phase.name != "retreat"  # at home it may go any way
-        quick = shortened(Way(phase.trajectory, upright, carried, payload.along_axis, walls, self._scene.cup_jacobian))
+        acceleration, jacobian = payload.along_axis, self._scene.cup_jacobian
+        ends_of = phase.trajectory, self._robot, upright, carried
+        quick = shortened(Way(*ends_of, acceleration, walls, jacobian, self._tool.axis))
         trajectory = slowed(quick, self._cell, payload) if quick else None
         if trajectory is None or trajectory.end_time() >= phase.sure:
             return phase

@@ -1,11 +1,11 @@
 """How far the arm, and what it holds, is from everything else."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, CollisionFilterDeclaration, GeometrySet, SignedDistancePair
+from pydrake.geometry import Box, CollisionFilterDeclaration, GeometryId, GeometrySet, SignedDistancePair
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
@@ -13,7 +13,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
+from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.planning.tool_kinematics import inverse
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
@@ -34,15 +36,12 @@ class Clearance:
     pair: tuple[str, str] = ("", "")
 
 
-_MOVES_WITH = {"base": 0, "shoulder": 1, "upper_arm": 2, "forearm": 3, "wrist_1": 4, "wrist_2": 5}
-"""How many of the joints move a link; all of them the rest of arm and tool."""
-
-
 class ClearanceScene:
     """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put.
 
     Attributes:
         arm_names: of the bodies of arm and tool.
+        fixture_tops: Heights of the highest points of the cell's fixtures [m].
     """
 
     def __init__(
@@ -69,12 +68,14 @@ class ClearanceScene:
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
         self._at, self._v_at = joint_numbers(self.plant, self._arm)
+        self._moved_by = load_robot(cell.robot).links
+        self._fixed = (*self._arm.fixed, self.plant.GetBodyByName("tray"))
         self._names = self._name_geometries()
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
-        self._fixed = (self.plant.world_body(), self.plant.GetBodyByName("tray"))
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
+        self.fixture_tops = self._tops({fixture.name for fixture in cell.fixtures})
         self._held: tuple[str, Floats] | None = None
         self._transient: list[object] = []
 
@@ -84,17 +85,32 @@ class ClearanceScene:
             found.Add(self.plant.GetCollisionGeometriesForBody(body))
         return found
 
-    def _name_geometries(self) -> dict[object, str]:
-        names = {}
+    def _name_geometries(self) -> dict[GeometryId, str]:
+        names = dict[GeometryId, str]()
         owners = {body.index(): name for name, body in self._bodies.items()}
+        fixtures = {body.index(): body.model_instance() for body in self._arm.fixed[1:]}
         inspector = self._scene_graph.model_inspector()
-        for index in range(self.plant.num_bodies()):
-            body = self.plant.get_body(BodyIndex(index))
+        shapes = {body.index() for body in self._fixed} - set(fixtures)
+        for index in map(BodyIndex, range(self.plant.num_bodies())):
+            body = self.plant.get_body(index)
+            name = owners.get(index, body.name())
+            if index in fixtures:
+                name = self.plant.GetModelInstanceName(fixtures[index])
             for geometry in self.plant.GetCollisionGeometriesForBody(body):
-                fixed = body in (self.plant.world_body(), self.plant.GetBodyByName("tray"))
                 of_its_own = inspector.GetName(geometry).split("::")[-1]
-                names[geometry] = of_its_own if fixed else owners.get(body.index(), body.name())
+                names[geometry] = of_its_own if index in shapes else name
         return names
+
+    def _tops(self, names: Collection[str]) -> tuple[float, ...]:
+        query = self._query_port.Eval(self._geometry_context)
+        inspector = self._scene_graph.model_inspector()
+        tops = dict.fromkeys(names, -np.inf)
+        for geometry, name in self._names.items():
+            if name in tops and (box := inspector.GetObbInGeometryFrame(geometry)):
+                X_TB = query.GetPoseInWorld(geometry) @ box.pose()
+                half_height = np.abs(X_TB.rotation().matrix()[2]) @ box.half_width()
+                tops[name] = max(tops[name], float(X_TB.translation()[2] + half_height))
+        return tuple(tops.values())
 
     def put(self, objects: Sequence[SceneObject]) -> None:
         """Puts objects at their poses; the arm holds nothing any more."""
@@ -108,15 +124,15 @@ class ClearanceScene:
         self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
-    def hold(self, name: str, X_GO: Floats) -> None:
-        """From now on the object moves with the cup, X_GO (4, 4)."""
+    def hold(self, name: str, X_OG: RigidTransform) -> None:
+        """From now on the object moves with the gripper."""
         self.release()
         held = self._geometries(self._bodies[name])
         others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
         tool = self._geometries(*(body for body in self._arm.bodies if body.model_instance() == self._arm.tool))
         declaration = CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
         self._transient.append(self._filters.ApplyTransient(declaration))
-        self._held = name, X_GO
+        self._held = name, inverse(X_OG.GetAsMatrix4())
 
     def release(self) -> None:
         """Holds nothing any more."""
@@ -142,11 +158,11 @@ class ClearanceScene:
         return Clearance(float(pair.distance), (first, second) if moves else (second, first))
 
     def close(self, q: Floats, within: float) -> list[Clearance]:
-        """At joint angles (6,) rad: all that is closer than `within`, m."""
+        """At joint positions (n,): all that is closer than `within`, m."""
         return [self._named(pair) for pair in self._close(q, within)]
 
     def gradients(self, q: Floats, within: float) -> list[tuple[Clearance, Floats]]:
-        """As `close`, each with how the distance changes with the joint angles, (6,) m/rad."""
+        """As `close`, each with how the distance changes with the joint positions, (n,) m/rad."""
         pairs = self._close(q, within)
         if not pairs:
             return []
@@ -157,7 +173,7 @@ class ClearanceScene:
         p_TF = self._arm.flange.CalcPoseInWorld(self._context).translation()
         found = []
         for pair in pairs:
-            gradient = np.zeros(6)
+            gradient = np.zeros(len(self._at))
             for geometry, p_S, sign in ((pair.id_A, pair.p_ACa, 1.0), (pair.id_B, pair.p_BCb, -1.0)):
                 if joints := self._joints_that_move(self._names[geometry]):
                     nx, ny, nz = sign * pair.nhat_BA_W
@@ -172,7 +188,7 @@ class ClearanceScene:
         return np.asarray(self._arm.cup.CalcPoseInWorld(self._context).translation())
 
     def cup_jacobian(self, q: Floats) -> Floats:
-        """(6, 6) at joint angles (6,) rad: how the cup turns (first three rows) and moves, in T."""
+        """(6, n) at joint positions (n,): how the cup turns (first three rows) and moves, in T."""
         self._q[self._at] = q
         self.plant.SetPositions(self._context, self._q)
         world = self.plant.world_frame()
@@ -183,5 +199,5 @@ class ClearanceScene:
 
     def _joints_that_move(self, name: str) -> int:
         if name in self.arm_names:
-            return _MOVES_WITH.get(name, 6)
-        return 6 if self._held is not None and name == self._held[0] else 0
+            return self._moved_by.get(name, len(self._at))
+        return len(self._at) if self._held is not None and name == self._held[0] else 0

@@ -1,7 +1,6 @@
 """From joint angles along a way to a trajectory that respects the arm's limits."""
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -13,20 +12,14 @@ from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.epick import epick_sdf
-from drake_clutter.cell.kinematics import forward_kinematics
-from drake_clutter.cell.sdf import sdf_text
-from drake_clutter.cell.ur10 import JOINT_RANGE, LINKS
+from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.robot_model import RobotModel, load_robot
+from drake_clutter.cell.robot_plant import add_robot
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.time_optimal import squared_speeds
-from drake_clutter.resources import shipped_path
 
 Floats = NDArray[np.float64]
 
-VELOCITY_LIMIT = np.array([link.speed for link in LINKS])
-TORQUE_LIMIT = np.array([link.torque for link in LINKS])
-ACCELERATION_LIMIT = np.array([4.0, 4.0, 6.0, 10.0, 10.0, 10.0])
-"""rad/s, N m, and rad/s^2; the last is ours, the data sheet has none."""
 MARGIN = 0.97
 """Share of the limits that is used: between the points at which they are imposed a trajectory may exceed them a little."""
 SPACING = 0.08
@@ -38,69 +31,48 @@ _GRID = 300
 """Points of a path at which the limits are imposed."""
 
 
-@dataclass(frozen=True)
-class Payload:
-    """What hangs on the cup.
-
-    Attributes:
-        mass: kg.
-        p_GCm: (3,) m, rounded, so that plants can be kept.
-        acceleration: m/s^2, of the cup along each axis, at most; infinite without a load.
-    """
-
-    mass: float = 0.0
-    p_GCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    acceleration: float = math.inf
-
-    @property
-    def along_axis(self) -> float:
-        """m/s^2, along each axis alone, so that the vector is within the limit."""
-        return self.acceleration / math.sqrt(3)
-
-
 @lru_cache(maxsize=64)
 def _plant(cell: WorkCell, mass: float, p_GCm: tuple[float, float, float]) -> MultibodyPlant:
-    """The arm alone, the cup rigid, with a load; for dynamics."""
     plant = MultibodyPlant(0.0)
-    (robot,) = Parser(plant).AddModelsFromString(sdf_text(shipped_path("models/ur10.sdf"), visuals=False), "sdf")
-    (tool,) = Parser(plant).AddModelsFromString(epick_sdf(cell.gripper, compliant=False), "sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot), cell.robot.X_TB)
-    plant.WeldFrames(plant.GetFrameByName("flange", robot), plant.GetFrameByName("body", tool))
+    robot = add_robot(plant, load_robot(cell.robot), visuals=False)
+    (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=False), "sdf")
+    flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
+    plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
     if mass:
         inertia = SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(0.05))
         load = plant.AddRigidBody("load", robot, inertia)
-        plant.WeldFrames(plant.GetFrameByName("cup", tool), load.body_frame(), RigidTransform(list(p_GCm)))
+        frame = plant.GetFrameByName("cup", tool)
+        plant.WeldFrames(frame, load.body_frame(), RigidTransform(list(p_GCm)))
     plant.Finalize()
     return plant
 
 
 def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
-    """The arm with a rigid cup and the load, no geometry."""
+    """Return the arm with a rigid gripper and the load, without surroundings."""
     return _plant(cell, payload.mass, payload.p_GCm)
 
 
-def nearest_turns(q: Floats, reference: Floats) -> Floats:
-    """Joint angles (..., 6) rad turned by whole turns so that they lie nearest to others, within the joints' range."""
-    turned = q + 2 * np.pi * np.round((reference - q) / (2 * np.pi))
-    over = np.abs(turned) > JOINT_RANGE
-    return np.asarray(np.where(over, turned - 2 * np.pi * np.sign(turned), turned))
+def least_time(turns: Floats, robot: RobotModel) -> Floats:
+    """Return in which time (...) [s] joints turn so far, from rest to rest.
 
-
-def least_time(turns: Floats) -> Floats:
-    """(...) s, in which joints turn so far (..., 6) rad from rest to rest, by their limits of speed and acceleration alone."""
-    far, speed, acceleration = np.abs(turns), VELOCITY_LIMIT, ACCELERATION_LIMIT
-    quick = far < speed**2 / acceleration
-    return np.asarray(np.where(quick, 2 * np.sqrt(far / acceleration), far / speed + speed / acceleration).max(axis=-1))
+    Args:
+        turns: Shape (..., n).
+        robot: Its limits of velocity and acceleration alone.
+    """
+    far, speed, acceleration = np.abs(turns), robot.velocity_limits, robot.acceleration_limits
+    reaches_no_cruise = far < speed**2 / acceleration
+    triangle, trapezoid = 2 * np.sqrt(far / acceleration), far / speed + speed / acceleration
+    return np.asarray(np.where(reaches_no_cruise, triangle, trapezoid).max(axis=-1))
 
 
 def straight(start: Floats, end: Floats) -> Floats:
-    """(n, 6) rad, from one configuration to another, `SPACING` apart at most."""
+    """(m, n) rad, from one configuration to another, `SPACING` apart at most."""
     steps = max(2, math.ceil(np.abs(end - start).max() / SPACING) + 1)
     return np.linspace(start, end, steps)
 
 
 def smooth(way: Floats) -> BsplineTrajectory:
-    """A twice differentiable path of which the points (n, 6) of a way are the control points: it cuts the corners."""
+    """A twice differentiable path of which the points (m, n) of a way are the control points: it cuts the corners."""
     distinct = np.concatenate([[True], np.abs(np.diff(way, axis=0)).max(axis=1) > 1e-9])
     points = way[distinct]
     while len(points) < _ORDER - 2:
@@ -112,7 +84,7 @@ def smooth(way: Floats) -> BsplineTrajectory:
 
 
 def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
-    """(n, 6) rad along a trajectory, about `spacing` apart."""
+    """(m, n) rad along a trajectory, about `spacing` apart."""
     coarse = path.vector_values(np.linspace(path.start_time(), path.end_time(), 60)).T
     count = max(20, math.ceil(np.abs(np.diff(coarse, axis=0)).max(axis=1).sum() / spacing))
     return np.asarray(path.vector_values(np.linspace(path.start_time(), path.end_time(), count)).T)
@@ -120,16 +92,17 @@ def sampled(path: Trajectory, spacing: float = SPACING / 2) -> Floats:
 
 def timed(path: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
     """The path as fast as velocity, acceleration, torque and the cup's hold allow; None if they do not."""
-    plant = dynamics_plant(cell, payload)
+    plant, robot = dynamics_plant(cell, payload), load_robot(cell.robot)
+    torque_limit = MARGIN * robot.torque_limits
     grid = np.linspace(path.start_time(), path.end_time(), _GRID)
     velocity = path.MakeDerivative(1)
     q, slope, curve = path.vector_values(grid).T, velocity.vector_values(grid).T, velocity.MakeDerivative(1).vector_values(grid).T
     with np.errstate(divide="ignore"):
-        fastest = ((MARGIN * VELOCITY_LIMIT / np.abs(slope)) ** 2).min(axis=1)
-    limit = np.broadcast_to(MARGIN * ACCELERATION_LIMIT, slope.shape)
+        fastest = ((MARGIN * robot.velocity_limits / np.abs(slope)) ** 2).min(axis=1)
+    limit = np.broadcast_to(MARGIN * robot.acceleration_limits, slope.shape)
     rows = [(slope, curve, -limit, limit)]
     if math.isfinite(payload.acceleration):
-        p_BCm = (forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
+        p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
         limit = np.full(p_BCm.shape, payload.along_axis)
         of_load = np.gradient(p_BCm, grid, axis=0, edge_order=2)
         rows.append((of_load, np.gradient(of_load, grid, axis=0, edge_order=2), -limit, limit))
@@ -145,12 +118,12 @@ def timed(path: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | No
         return PathParameterizedTrajectory(path, softened(along) if payload.mass else along)
 
     trajectory, rest = run_through(), np.zeros_like(q)
-    if trajectory is None or (np.abs(torques(plant, *motion(trajectory, 40))) <= MARGIN * TORQUE_LIMIT).all():
+    if trajectory is None or (np.abs(torques(plant, *motion(trajectory, 40))) <= torque_limit).all():
         return trajectory
     held = torques(plant, q, rest, rest)  # the torques' limits are rarely needed, and take most of the time
-    if (np.abs(held) > MARGIN * TORQUE_LIMIT).any():
+    if (np.abs(held) > torque_limit).any():
         return None
-    lower, upper = -MARGIN * TORQUE_LIMIT - held, MARGIN * TORQUE_LIMIT - held
+    lower, upper = -torque_limit - held, torque_limit - held
     rows.append((torques(plant, q, rest, slope) - held, torques(plant, q, slope, curve) - held, lower, upper))
     return run_through()
 
@@ -171,17 +144,19 @@ def softened(along: Trajectory) -> Trajectory:
 def slowed(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
     """The same motion, evenly slower until velocity, acceleration, torque and the cup's hold allow it; None if they never do."""
     plant, end = dynamics_plant(cell, payload), trajectory.end_time()
+    robot = load_robot(cell.robot)
     count = max(200, math.ceil(end / 0.005))
     q, v, a = motion(trajectory, count)
     held = torques(plant, q, np.zeros_like(q), np.zeros_like(q))
     moving = torques(plant, q, v, a) - held
-    room = MARGIN * TORQUE_LIMIT - np.sign(moving) * held
+    room = MARGIN * robot.torque_limits - np.sign(moving) * held
     if (room <= 0).any():
         return None
-    square = max((np.abs(v) / VELOCITY_LIMIT / MARGIN).max() ** 2, (np.abs(a) / ACCELERATION_LIMIT / MARGIN).max())
+    square = (np.abs(v) / robot.velocity_limits / MARGIN).max() ** 2
+    square = max(square, (np.abs(a) / robot.acceleration_limits / MARGIN).max())
     square = max(square, (np.abs(moving) / room).max())
     if math.isfinite(payload.acceleration):
-        p_BCm = (forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
+        p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
         of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
         square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.acceleration)
     by = max(1.0, math.sqrt(square))
@@ -189,7 +164,7 @@ def slowed(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajecto
 
 
 def motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
-    """q rad, v rad/s and a rad/s^2, (count, 6) each, at times equally far apart, both ends among them."""
+    """q rad, v rad/s and a rad/s^2, (count, n) each, at times equally far apart, both ends among them."""
     times = np.linspace(trajectory.start_time(), trajectory.end_time(), count)
     v, a = (trajectory.MakeDerivative(order).vector_values(times).T for order in (1, 2))
     return trajectory.vector_values(times).T, v, a
@@ -205,7 +180,7 @@ def _context(plant: MultibodyPlant) -> Context:
 
 
 def torques(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
-    """(n, 6) N m, that motions (n, 6) each, take."""
+    """(m, n) N m, that motions (m, n) each, take."""
     context, forces, found = _context(plant), MultibodyForces(plant), np.empty_like(q)
     for k in range(len(q)):
         plant.SetPositions(context, q[k])

@@ -11,13 +11,11 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
 from drake_clutter.planning.clearance import Clearance
 from drake_clutter.scenes.scene import Pose
-
-Floats = NDArray[np.float64]
 
 DESCENT_SPEED = 0.02
 """m/s, of a guarded descent; half a millimetre between two of the executor's looks for a touch."""
@@ -62,7 +60,7 @@ class Phase:
 
     Attributes:
         name: approach, carry or retreat.
-        trajectory: q (6,) rad over time, s.
+        trajectory: q (n,) rad over time, s.
         clearance: the least along it, densely checked, from what was not allowed to touch; the arm's own parts left out.
         sure: s, that the sure way takes; the duration, unless the way was optimised.
     """
@@ -84,10 +82,10 @@ class Plan:
 
     Attributes:
         pick: the object's name; X_TO_pick, X_TO_place: where it is, and where it is let go.
-        X_OG: (4, 4) the grasp.
+        X_OG: The grasp.
         mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
         phases: in order.
-        descent: q (6,) rad over time, s: straight down from the place at `DESCENT_SPEED`, to be run until the object touches
+        descent: q (n,) rad over time, s: straight down from the place at `DESCENT_SPEED`, to be run until the object touches
             something; or None.
         attempts: grasps and branches that were looked at.
         seconds: that planning took.
@@ -96,7 +94,7 @@ class Plan:
     pick: str
     X_TO_pick: Pose
     X_TO_place: Pose
-    X_OG: Floats
+    X_OG: RigidTransform
     mass: float
     p_GCm: tuple[float, float, float]
     phases: tuple[Phase, ...]
@@ -148,7 +146,7 @@ def plan_fields(found: Plan | NoPlan) -> dict[str, Any]:
     return {
         "planned": True,
         "place": {"translation": list(pose.translation), "quaternion": list(pose.quaternion)},
-        "X_OG": found.X_OG.tolist(),
+        "X_OG": found.X_OG.GetAsMatrix4().tolist(),
         "duration": found.duration,
         "descent": found.depth,
         "phases": phases,

@@ -3,36 +3,36 @@
 Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object.
 """
 
-import math
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drake_clutter.cell.kinematics import branches
-from drake_clutter.cell.suction import greatest_acceleration, unevenness
+from drake_clutter.cell.gripper import Grasp, GraspSampling, Gripper, NoGrasp
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.attempts import Attempts, Grasp, PlannerConfig, downwards, inverse, matrix
+from drake_clutter.planning.attempts import Attempts, PlannerConfig
 from drake_clutter.planning.clearance import ClearanceScene
-from drake_clutter.planning.paths import Payload
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
-
-Floats = NDArray[np.float64]
+from drake_clutter.simulation.plant import rigid_transform
 
 
 class PickPlacePlanner:
-    """Plans moves of objects among objects; the same question has the same answer."""
+    """Plans moves of objects among objects; the same question has the same answer.
+
+    Attributes:
+        cell: What stands around the objects.
+        planner: How plans are searched.
+        tool: Kinematics of the gripper.
+    """
 
     def __init__(self, cell: WorkCell, planner: PlannerConfig) -> None:
         self.cell, self.planner = cell, planner
-        self._X_BT = cell.robot.X_TB.inverse().GetAsMatrix4()
-        self._X_GF = cell.gripper.X_FG.inverse().GetAsMatrix4()
+        self.tool = ToolKinematics(cell)
+        self._gripper: Gripper = cell.gripper
         self._scenes: dict[Hashable, ClearanceScene] = {}
         self._grasps = lru_cache(maxsize=256)(self._find_grasps)
 
@@ -82,63 +82,39 @@ class PickPlacePlanner:
         if self.cell.pedestal_in_support:
             return NoPlan(PlanFailure.IN_COLLISION, "pedestal and tray")
         scene = self.clearance_scene(objects, unseen)
-        if hit := scene.close(np.array(self.cell.robot.home), self.planner.clearance):
+        if hit := scene.close(self.tool.robot.home, self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
             return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
-        tops = [block.top for block in unseen]
-        attempt = Attempts(self.cell, self.planner, self.reach, scene, objects, picked, X_TO_place, tops)
+        tops = [*scene.fixture_tops, *(block.top for block in unseen)]
+        attempt = Attempts(self.cell, self.planner, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
-            for q_pick, q_place, branch, yaw in attempt.ends(grasp):
+            for q_pick, q_place, yaw in attempt.ends(grasp):
                 if attempt.count >= self.planner.attempts:
                     return attempt.furthest
                 if time.perf_counter() - begun > self.planner.time_limit:
                     return NoPlan(PlanFailure.TIME_OUT, str(attempt.furthest), self.planner.time_limit)
-                found = attempt.carry_out(grasp, q_pick, q_place, branch, yaw)
+                found = attempt.carry_out(grasp, q_pick, q_place, yaw)
                 if found is not None:
                     return found
         return attempt.furthest
 
     def holds(self, scene_object: SceneObject) -> bool:
-        """Whether the cup seals somewhere on top of an object and can carry it."""
+        """Whether the gripper takes an object somewhere and can carry it."""
         return not isinstance(self._grasps(scene_object), NoPlan)
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
         """Whether the cup can hold an object, and none of the others rests on it: without that, no plan is worth asking for."""
         return not rests_on(scene_object, objects) and self.holds(scene_object)
 
-    def _find_grasps(self, picked: SceneObject) -> list[Grasp] | NoPlan:
-        """Where the cup seals on top and can hold, the nearest to its middle first."""
-        suction = self.cell.gripper
-        lower, upper = picked.bounds_T
-        X_TO = matrix(picked.X_TO)
-        top = float(upper[2])
-        steps = [np.arange(0, (hi - lo) / 2, self.planner.grasp_spacing) for lo, hi in zip(lower[:2], upper[:2], strict=True)]
-        offsets = [np.concatenate([-s[:0:-1], s]) for s in steps]
-        x, y = np.meshgrid(*offsets, indexing="ij")
-        middle = (lower[:2] + upper[:2]) / 2
-        points = middle + np.column_stack([x.ravel(), y.ravel()])
-        points = points[np.argsort(np.round(np.linalg.norm(points - middle, axis=1), 6), kind="stable")]
-        found, least = list[Grasp](), math.inf
-        for point in points:
-            X_TG = downwards(0.0, np.array([*point, top]))
-            X_OG = inverse(X_TO) @ X_TG
-            uneven = unevenness(picked.object_class, X_OG, suction.cup_diameter)
-            least = min(least, uneven)
-            if uneven > suction.unevenness:
-                continue
-            p_GCm = inverse(X_TG)[:3, :3] @ (X_TO[:3, 3] - X_TG[:3, 3])
-            acceleration = greatest_acceleration(picked.object_class.mass, p_GCm, suction)
-            if acceleration >= self.planner.least_acceleration:
-                # How the load hangs to the side depends on the cup's yaw; its distance from the axis does not.
-                payload = Payload(picked.object_class.mass, (0.0, 0.0, round(float(p_GCm[2]), 2)), round(acceleration, 1))
-                found.append(Grasp(X_TG[:3, 3], payload))
-                if len(found) == self.planner.grasps:
-                    break
-        if picked.object_class.mass + self.cell.gripper.mass > self.cell.robot.payload:
-            return NoPlan(PlanFailure.TOO_HEAVY, picked.name, picked.object_class.mass)
-        if not found:
-            reason = PlanFailure.NO_SEAL if least > suction.unevenness else PlanFailure.TOO_HEAVY
-            return NoPlan(reason, picked.name, least if reason is PlanFailure.NO_SEAL else picked.object_class.mass)
+    def _find_grasps(self, picked: SceneObject) -> tuple[Grasp, ...] | NoPlan:
+        """Where the gripper takes an object and can hold it, the nearest to its middle first."""
+        object_class, config = picked.object_class, self.planner
+        if object_class.mass + self._gripper.mass > self.cell.robot.payload:
+            return NoPlan(PlanFailure.TOO_HEAVY, picked.name, object_class.mass)
+        sampling = GraspSampling(config.grasp_spacing, config.grasps, config.least_acceleration)
+        found = self._gripper.grasps(object_class, rigid_transform(picked.X_TO), sampling)
+        if isinstance(found, NoGrasp):
+            return NoPlan(PlanFailure(found.reason.value), picked.name, found.number)
         return found
 
     def ends_exist(self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose) -> bool:
@@ -148,9 +124,5 @@ class PickPlacePlanner:
         if rests_on(picked, objects) or isinstance(grasps, NoPlan):
             return False
         scene = self.clearance_scene(objects)
-        attempts = Attempts(self.cell, self.planner, self.reach, scene, objects, picked, X_TO_place)
+        attempts = Attempts(self.cell, self.planner, scene, objects, picked, X_TO_place)
         return any(attempts.exist(grasp) for grasp in grasps)
-
-    def reach(self, X_TG: Floats) -> Floats:
-        """(..., 8, 6) rad, see `branches`."""
-        return branches(self._X_BT @ X_TG @ self._X_GF)

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.cell.kinematics import manipulability
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.attempts import PlannerConfig, downwards
-from drake_clutter.planning.paths import nearest_turns
+from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.tool_kinematics import downwards
 
 Floats = NDArray[np.float64]
 
@@ -27,9 +26,9 @@ class Reach:
     """How poses of the cup are reached.
 
     Attributes:
-        branches: (n,) of the arm's eight, without collision.
+        branches: (n,) solutions without collision.
         manipulability: (n,) m^3, the best of them; 0 where there is none.
-        q: (n, 6) rad, of that one; NaN where there is none.
+        q: (n, joints) rad, of that one; NaN where there is none.
         in_the_way: what the arm would hit where it reaches a pose, but only with collision; else "".
     """
 
@@ -51,15 +50,16 @@ class Reachability:
 
     def poses(self, X_TG: Floats) -> Reach:
         """Of poses (n, 4, 4) of the cup."""
-        q = self._planner.reach(X_TG)
-        worth = np.nan_to_num(manipulability(q), nan=-1.0)
+        robot = self._planner.tool.robot
+        q = self._planner.tool.solve(X_TG)
+        worth = np.nan_to_num(robot.manipulability(q), nan=-1.0)
         count, best = np.zeros(len(q), int), np.zeros(len(q))
-        best_q, in_the_way = np.full((len(q), 6), np.nan), [""] * len(q)
+        best_q, in_the_way = np.full((len(q), robot.num_joints), np.nan), [""] * len(q)
         for k in range(len(q)):
             for branch in np.argsort(-worth[k]):
                 if worth[k, branch] < 0:
                     break
-                at = nearest_turns(q[k, branch], np.array(self._cell.robot.home))
+                at = robot.unwrap(q[k, branch], robot.home)
                 if hit := self._scene.close(at, self._least):
                     in_the_way[k] = in_the_way[k] or " and ".join(min(hit, key=lambda c: c.distance).pair)
                     continue

@@ -16,19 +16,21 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
+from pydrake.math import RigidTransform
 
 from drake_clutter.agents.generation import wilson_interval
-from drake_clutter.cell.kinematics import forward_kinematics
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
-from drake_clutter.planning.attempts import PlannerConfig, inverse
+from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.reports.arm_pictures import strip
 from drake_clutter.reports.pictures import Marks, PictureCamera
 from drake_clutter.scenes.interfaces import ArmState, Frame
 from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.simulation.plant import pose_of
 from drake_clutter.tasks.feasibility import PLANNED
 
 Rows = Sequence[Mapping[str, Any]]
@@ -290,11 +292,11 @@ def _worst(moves: Rows, setups: Mapping[str, WorkCell], scene_of: Callable[[str]
 def _moments(plan: Plan, scene: Scene, cell: WorkCell) -> list[Frame]:
     """At the grasp, in the middle of the way, and at the place."""
     carry, frames = plan.phases[1].trajectory, []
-    X_TB, X_FG = cell.robot.X_TB.GetAsMatrix4(), cell.gripper.X_FG.GetAsMatrix4()
+    tool = ToolKinematics(cell)
     for time in (0.0, carry.end_time() / 2, carry.end_time()):
         q = carry.value(time).ravel()
-        X_TO = X_TB @ forward_kinematics(q) @ X_FG @ inverse(plan.X_OG)
-        poses = {**scene.poses, plan.pick: Pose.of(X_TO[:3, :3], X_TO[:3, 3])}
+        X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
+        poses = {**scene.poses, plan.pick: pose_of(X_TO)}
         frames.append(Frame(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
     return frames
 

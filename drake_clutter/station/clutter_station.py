@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet, SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import PdControllerGains, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
@@ -21,7 +22,7 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.kinematics import JOINTS
 from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
-from drake_clutter.cell.suction import load_share, surface_under_lip, unevenness
+from drake_clutter.cell.suction import surface_under_lip
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
@@ -239,7 +240,7 @@ class Vacuum:
         elif self.held and not wanted:
             self._release(context)
         elif self.held:
-            share = float(load_share(*station.hold.load(context), station.cell.gripper))
+            share = float(station.cell.gripper.load_ratio(*station.hold.load(context)))
             self.largest_share = max(self.largest_share, share)
             self._overloaded = self._overloaded + 1 if share > 1 else 0
             if self._overloaded * LOAD_PERIOD > LETS_GO_AFTER:
@@ -247,11 +248,11 @@ class Vacuum:
                 self._release(context)
         return EventStatus.DidNothing()
 
-    def _grasp(self, context: Context, name: str) -> Floats:
-        """X_OG, (4, 4)."""
+    def _grasp(self, context: Context, name: str) -> RigidTransform:
+        """X_OG."""
         X_TG = self.station.arm.cup.CalcPoseInWorld(context)
         X_TO = self.station.scene.bodies[name].EvalPoseInWorld(context)
-        return np.asarray((X_TO.inverse() @ X_TG).GetAsMatrix4())
+        return X_TO.inverse() @ X_TG
 
     def _take(self, context: Context) -> None:
         """Takes the object that is first under the lip, if it is close enough and the lip seals on it."""
@@ -259,13 +260,12 @@ class Vacuum:
         grasps = {name: self._grasp(context, name) for name in station.takeable}
         below = {n: surface_under_lip(station.classes[n], X_OG, suction.cup_diameter).min() for n, X_OG in grasps.items()}
         first = min(below, key=lambda name: below[name])
-        uneven = unevenness(station.classes[first], grasps[first], suction.cup_diameter)
-        if below[first] <= SUCKED_FROM and uneven <= suction.unevenness:
+        if below[first] <= SUCKED_FROM and suction.seals(station.classes[first], grasps[first]):
             station.hold.attach(context, station.scene.bodies[first])
             self.held, self.taken, self.sealed, self._X_OG = first, first, True, grasps[first]
 
     def _release(self, context: Context) -> None:
-        self.slip = float(np.linalg.norm(self._grasp(context, self.held)[:3, 3] - self._X_OG[:3, 3]))
+        self.slip = float(np.linalg.norm(self._grasp(context, self.held).translation() - self._X_OG.translation()))
         self.station.hold.release(context)
         self.held = ""
 

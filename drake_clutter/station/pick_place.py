@@ -9,8 +9,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, EventStatus, LeafSystem, State
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
+from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.paths import Payload, dynamics_plant, motion, torques
+from drake_clutter.planning.paths import dynamics_plant, motion, torques
 from drake_clutter.planning.plan import DESCENT_SPEED, Plan
 
 Floats = NDArray[np.float64]

@@ -9,14 +9,13 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 
 from drake_clutter.catalogue import Shape
-from drake_clutter.cell.kinematics import forward_kinematics, manipulability
-from drake_clutter.cell.suction import unevenness
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import PlannerConfig, inverse, matrix
+from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.paths import sampled
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
@@ -24,6 +23,7 @@ from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.plant import rigid_transform
 from drake_clutter.tasks.exploration import legal_moves
 
 PLANNED = "planned"
@@ -149,11 +149,13 @@ class FeasibilityStudy:
             return replace(row, about=move.place)
         px, py, pz = (round(v, 6) for v in X_TO.translation)
         row = replace(row, place_x=px, place_y=py, place_z=pz)
-        found = self.planner(scene.support).plan(scene.objects, move.pick, X_TO)
+        planner = self.planner(scene.support)
+        found, robot = planner.plan(scene.objects, move.pick, X_TO), planner.tool.robot
         row = replace(row, planning_s=round(found.seconds, 4))
         if isinstance(found, NoPlan):
             return replace(row, result=found.reason.value, about=found.about, number=found.number)
         carry = found.phases[1].trajectory
+        ends = carry.vector_values([0.0, carry.end_time()]).T
         nearest = min((phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance)
         return replace(
             row,
@@ -162,7 +164,7 @@ class FeasibilityStudy:
             attempts=found.attempts,
             clearance=round(nearest.distance, 6),
             between=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
-            manipulability=float(manipulability(carry.vector_values([0.0, carry.end_time()]).T).min()),
+            manipulability=float(robot.manipulability(ends).min()),
         )
 
     def noise(self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]) -> list[NoiseRow]:
@@ -183,23 +185,23 @@ class FeasibilityStudy:
     def _holds(self, plan: Plan, scene: Scene, planner: PickPlacePlanner, error: float) -> str:
         """Whether a plan that was made for other poses works with the right ones; else what goes wrong."""
         q = plan.phases[1].trajectory.value(0.0).ravel()
-        X_TB, gripper = self._world.cell.robot.X_TB, self._world.cell.gripper
-        X_TG = X_TB.GetAsMatrix4() @ forward_kinematics(q) @ gripper.X_FG.GetAsMatrix4()
-        picked = scene[plan.pick]
-        X_OG = inverse(matrix(picked.X_TO)) @ X_TG
-        if unevenness(picked.object_class, X_OG, gripper.cup_diameter) > gripper.unevenness:
+        picked, gripper = scene[plan.pick], self._world.cell.gripper
+        X_TG = RigidTransform(planner.tool.pose(q))
+        X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
+        if not gripper.seals(picked.object_class, X_OG):
             return PlanFailure.NO_SEAL.value
         around = planner.clearance_scene(scene.objects)
+        touching = (*gripper.contact_links, plan.pick)
         for phase in plan.phases:
             around.put(scene.objects)
             if phase.name == "carry":
-                around.hold(plan.pick, inverse(X_OG))
+                around.hold(plan.pick, X_OG)
             else:
                 around.put_one(plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place)
             for at in sampled(phase.trajectory):
                 for here in around.close(at, 0.0):
                     # The cup is pressed on; what the object leaves or comes to it may graze by as much as it is misjudged.
-                    grazed = plan.pick in here.pair and here.pair[0] in ("cup", plan.pick)
+                    grazed = plan.pick in here.pair and here.pair[0] in touching
                     if not grazed or here.distance < -error - 0.002:
                         return f"hits {here.pair[1]}"
         return "holds"
