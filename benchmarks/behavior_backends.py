@@ -11,21 +11,23 @@ from functools import cache
 
 import numpy as np
 
-from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
+from drake_clutter.agents.backends import backends
+from drake_clutter.agents.exploration import PolicyMaker, make_explorers
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import shipped_path
-from drake_clutter.scenes.interfaces import CannotJudge, MoveExecutor, Verdict
+from drake_clutter.scenes.interfaces import CannotJudge, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
-from drake_clutter.systems.teleported_loop import explore_images
-from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.episode import BackendFactory, run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
 
 WORLD, MAX_MOVES, OBJECTS = ClutterConfig(), 10, "ycb7"
 NODES = 25
@@ -93,20 +95,19 @@ def _scene(case: Case) -> Scene:
 
 
 @cache
-def _explorers(agent: str) -> ExplorerMaker:
+def _explorers(agent: str) -> PolicyMaker:
     return make_explorers(agent, WORLD)
 
 
 @cache
-def _executor(fidelity: str) -> MoveExecutor:
-    return EXECUTORS[fidelity](WORLD)
+def _backends(fidelity: str) -> BackendFactory:
+    return backends(fidelity, WORLD, follow_falls=True)
 
 
 def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
-    executor, detector = _executor(fidelity), DETECTORS[fidelity](WORLD.cell.camera)
-    task = ExplorationTask(_scene(case), executor, detector, WORLD.exploration, MAX_MOVES)
-    play(task, _explorers(case.agent)(task), item_rng(case.number))
-    return _episode(task)
+    backend = _backends(fidelity)(_scene(case), item_rng(case.number))
+    policy = _explorers(case.agent)(backend)
+    return _episode(run_episode(backend, policy, max_moves=MAX_MOVES))
 
 
 def static(case: Case) -> list[Line]:
@@ -139,14 +140,14 @@ def _closed_loop(case: Case, perception: str) -> list[Line]:
     scenario, scene = _scenario(case, perception), _scene(case)
     loop = ClosedLoop(
         scene,
-        policy_of(scenario.agent, scenario.world),
         perceive=perception_of(scenario, scene.support),
-        max_moves=scenario.max_moves,
         seed=scenario.seed,
         world=scenario.world,
+        record=True,
     )
-    timing = loop.run(record=True)
-    return _episode(loop.task, loop.known, timing.end)
+    policy = policy_of(scenario.agent, scenario.world)
+    task = run_episode(loop, policy, max_moves=scenario.max_moves)
+    return _episode(task, loop.belief.objects, "nothing feasible")
 
 
 def closed_loop_labels(case: Case) -> list[Line]:
@@ -164,15 +165,10 @@ def images(case: Case) -> list[Line]:
     scenario, scene = _scenario(case, "depth"), _scene(case)
     perceive = perception_of(scenario, scene.support)
     assert perceive is not None
-    task, known = explore_images(
-        scene,
-        policy_of(scenario.agent, scenario.world),
-        perceive,
-        max_moves=scenario.max_moves,
-        seed=scenario.seed,
-        world=scenario.world,
-    )
-    return _episode(task, known)
+    backend = ImageBackend(scene, perceive, seed=scenario.seed, world=scenario.world)
+    policy = policy_of(scenario.agent, scenario.world)
+    task = run_episode(backend, policy, max_moves=scenario.max_moves)
+    return _episode(task, backend.belief.objects)
 
 
 @cache
@@ -210,15 +206,15 @@ def _verdict(judge: str, verdict: Verdict | CannotJudge) -> Line:
     return Line(f"{judge}: {words}", {"poses": poses, "shares": shares})
 
 
-def _episode(task: ExplorationTask, known: Sequence[SceneObject] = (), end: str = "") -> list[Line]:
+def _episode(task: ExplorationTask, known: Sequence[SceneObject] = (), end: str = EpisodeEnd.GAVE_UP.value) -> list[Line]:
     """An episode.
 
     Args:
         task: the episode's book.
         known: K_t at the end, of an agent that keeps it.
-        end: why the agent ended by itself, or "".
+        end: why the agent ended by itself, as it is recorded.
     """
-    ended = task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value
+    ended = task.end.value if task.end else end
     belief: dict[str, Part] = {}
     if known:
         names = "\n".join(f"{o.name} {o.object_class.name}" for o in known)

@@ -10,7 +10,7 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "files", "learning", "records", "resources", "seeding", "validation", "workers", "yaml_text"},
+    0: {"assets", "catalogue", "files", "learning", "records", "resources", "seeding", "statistics", "validation", "workers", "yaml_text"},
     1: {"cell", "config", "grammar"},
     2: {"scenes", "stability"},
     3: {"export", "simulation"},

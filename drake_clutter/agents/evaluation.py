@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.exploration import ExplorerMaker, make_explorers, play
-from drake_clutter.agents.generation import mean_interval, wilson_interval
+from drake_clutter.agents.backends import backends
+from drake_clutter.agents.exploration import PolicyMaker, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
-from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
+from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,8 @@ class EpisodePlayer:
         # In this process: an object class is known by its identity.
         self._catalogue = load_catalogue(catalogue_folder)
         self._set = cache(partial(load_scene_set, catalogue=self._catalogue))
-        self._executor = EXECUTORS[fidelity](config, follow_falls=False)
-        self._detector = DETECTORS[fidelity](config.cell.camera)
-        self._explorers: dict[str, ExplorerMaker] = {}
+        self._start_backend = backends(fidelity, config)
+        self._explorers: dict[str, PolicyMaker] = {}
 
     def _scene(self, episode: Episode) -> Scene:
         if episode.number is None:
@@ -88,8 +89,9 @@ class EpisodePlayer:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
         if episode.agent not in self._explorers:
             self._explorers[episode.agent] = make_explorers(episode.agent, self._config)
-        task = ExplorationTask(self._scene(episode), self._executor, self._detector, self._config.exploration, self._max_moves)
-        play(task, self._explorers[episode.agent](task), item_rng(self._seed, episode.index))
+        backend = self._start_backend(self._scene(episode), item_rng(self._seed, episode.index))
+        policy = self._explorers[episode.agent](backend)
+        task = run_episode(backend, policy, max_moves=self._max_moves)
         found_after = np.cumsum([len(step.newly_found) for step in task.steps], dtype=int)
         return EpisodeResult(
             scene=episode.scene,
@@ -101,14 +103,6 @@ class EpisodePlayer:
             found_after=tuple(int(n) for n in found_after),
             not_carried_out=sum(not step.outcome.result.carried_out for step in task.steps),
         )
-
-
-def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> tuple[float, float]:
-    """95 % confidence interval of a ratio of sums over scenes, by bootstrap."""
-    scenes = np.random.default_rng(0).integers(len(numerators), size=(2000, len(numerators)))
-    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(axis=1)
-    low, high = np.quantile(ratios, [0.025, 0.975]).tolist()
-    return low, high
 
 
 def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) -> dict[str, Any]:
@@ -138,17 +132,3 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
     row["moves_of_successes_ci95"] = mean_interval(won_moves)
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
     return row
-
-
-def in_words(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]:
-    """A row of `summarise_episodes` for people: lines of a table, one for each limit of moves, as cells by column."""
-    lines = []
-    for limit in limits:
-        part = row[f"within_{limit}"]
-        low, high = part["success_ci95"]
-        cells = {"in": str(limit), "success (95 %)": f"{part['success']:.2f} ({low:.2f}-{high:.2f})"}
-        cells |= {"found": f"{part['found']:.2f}", "of hidden": f"{part['found_of_hidden']:.2f}"}
-        lines.append(cells | {"collapsed": f"{part['collapsed']:.2f}", "moves": ""})
-    if row["moves_of_successes"] is not None:
-        lines[-1]["moves"] = f"{row['moves_of_successes']:.1f}"
-    return lines

@@ -4,6 +4,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
+from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork
 from drake_clutter.catalogue import load_catalogue
@@ -41,7 +42,7 @@ class ExplorerTraining:
         return ClutterExploration(
             load_scene_set(Path(self.scenes), load_catalogue(Path(self.catalogue) if self.catalogue else None)),
             privileged=privileged,
-            fidelity=self.fidelity,
+            fidelity=backends(self.fidelity, self.world),
             config=self.world,
             max_moves=self.max_moves,
             most_objects=self.most_objects,

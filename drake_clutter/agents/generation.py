@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.stats import norm
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
@@ -20,6 +19,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.statistics import mean_interval, wilson_interval
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
 from drake_clutter.validation import to_plain
@@ -188,25 +188,6 @@ class SceneGenerator:
                 return scene, failures
             failures[scene.reason.value] += 1
         raise RuntimeError(f"{LAYOUT_TRIES} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}")
-
-
-def wilson_interval(successes: int, count: int) -> tuple[float, float]:
-    """95 % confidence interval of a proportion (Wilson 1927)."""
-    if count == 0:
-        return 0.0, 1.0
-    z = float(norm.ppf(0.975))
-    share = successes / count
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * float(np.sqrt(share * (1 - share) / count + z * z / (4 * count * count)))
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
-def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """95 % confidence interval of a mean, by the normal approximation; None for fewer than two values."""
-    if len(values) < 2:
-        return None
-    half = float(norm.ppf(0.975) * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return float(np.mean(values)) - half, float(np.mean(values)) + half
 
 
 def summarise(

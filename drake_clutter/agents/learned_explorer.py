@@ -4,7 +4,7 @@ Both look before they move: where the camera sees no free place, nothing is put,
 another object it might topple, and would hide more; it is put there when the tray is full.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,11 @@ from drake_clutter.config import ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
 from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import TRAY, SceneObject
-from drake_clutter.tasks.exploration import Decision, ExplorationTask
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph, seen
+from drake_clutter.scenes.placement import free_places
+from drake_clutter.scenes.scene import TRAY
+from drake_clutter.tasks.belief import Belief, Decision
+from drake_clutter.tasks.episode import Backend
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph
 
 TEACHER, STUDENT = "teacher", "student"
 
@@ -63,7 +64,7 @@ def _refuse_unknown(classes: Collection[str], numbers: Collection[str], path: Pa
 
 
 class LearnedExplorer:
-    """Takes the likeliest pick and place for which there is room (an `Explorer`); one instance plays one episode."""
+    """Takes the likeliest pick and place for which there is room (a `Policy`)."""
 
     def __init__(
         self,
@@ -71,38 +72,32 @@ class LearnedExplorer:
         numbers: dict[str, int],
         path: Path,
         config: ExplorationConfig,
-        task: ExplorationTask | None = None,
+        backend: Backend | None = None,
     ) -> None:
-        """Begins an episode.
+        """With a network.
 
         Args:
             network, numbers: see `load_explorer`; path: of the checkpoint, for errors.
             config: how objects are put down.
-            task: whose scene the agent knows all of; None: it knows K_t.
+            backend: of the episode whose true scene the agent knows; None: it knows K_t.
         """
-        self._network, self._numbers, self._path, self._config, self._task = network, numbers, path, config, task
-        self._known: tuple[SceneObject, ...] = ()
+        self._network, self._numbers, self._path = network, numbers, path
+        self._config, self._backend = config, backend
 
-    def choose(
-        self, observation: Observation, tried: Sequence[Move], rng: np.random.Generator, failed: Collection[Move] = ()
+    def __call__(
+        self, belief: Belief, observation: Observation, rng: np.random.Generator
     ) -> Decision:
-        """See `Explorer.choose`.
+        """Choose the next move.
 
         Raises:
             InputError: an object of a class that the agent has not learned.
         """
-        self._known = seen(self._known, observation)
-        shown = self._known if self._task is None else self._task.scene.objects
-        return self.decide(shown, observation, tried, failed)
-
-    def decide(
-        self, shown: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], failed: Collection[Move]
-    ) -> Decision:
-        """The same for given objects: what is remembered is the caller's business."""
+        shown = belief.objects if self._backend is None else self._backend.scene.objects
         _refuse_unknown({o.object_class.name for o in shown}, self._numbers, self._path)
-        graph = exploration_graph(shown, observation, tried, self._numbers, failed)
+        graph = exploration_graph(
+            shown, observation, belief.history, self._numbers, belief.invalid_moves
+        )
         allowed, names = graph["allowed"], tuple(o.name for o in shown)
-        some = np.random.default_rng(0)  # it decides where, not whether
         chances: dict[str, float] = {}
         while allowed.any():
             moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
@@ -111,7 +106,7 @@ class LearnedExplorer:
             x, y = moves[0].tolist()
             for place in (0, y):
                 move = Move(names[x - 1], names[place - 1] if place else TRAY)
-                if allowed[x, place] and choose_placement(observation, move, self._config, some) is not None:
+                if allowed[x, place] and free_places(observation, move, self._config) is not None:
                     return Decision(move, chances, names)
                 allowed[x, place] = 0
         return Decision(None)
@@ -141,11 +136,7 @@ class LearnedExplorers:
         _refuse_unknown(classes, self._numbers, path)
         self.privileged = checkpoint.about["kind"] == TEACHER
 
-    def __call__(self, task: ExplorationTask) -> LearnedExplorer:
-        """For an episode."""
-        known_to = task if self.privileged else None
-        return LearnedExplorer(self._network, self._numbers, self._path, self._config, known_to)
-
-    def student(self) -> LearnedExplorer:
-        """One that knows what it is shown."""
-        return LearnedExplorer(self._network, self._numbers, self._path, self._config)
+    def __call__(self, backend: Backend | None = None) -> LearnedExplorer:
+        """Return the policy of an episode; only a privileged one needs its backend."""
+        true = backend if self.privileged else None
+        return LearnedExplorer(self._network, self._numbers, self._path, self._config, true)

@@ -56,9 +56,9 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare explorers on scenes that hide something."""
-    from drake_clutter.agents.evaluation import in_words
     from drake_clutter.agents.exploration import BASELINES
     from drake_clutter.commands import evaluate as command
+    from drake_clutter.reports.in_words import in_words
 
     named = scenes or place
     if named is None or None not in (scenes, place):

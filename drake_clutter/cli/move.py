@@ -41,6 +41,7 @@ def move(
 ) -> None:
     """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
     from drake_clutter.commands import explore as command
+    from drake_clutter.reports.in_words import plans_in_words
     from drake_clutter.scenes.interfaces import Move
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
@@ -53,7 +54,7 @@ def move(
     start = command.at_rest(file.scene, world, seed)
     if plan_only:
         plans = command.plan_only(start, chosen, seed, world, out)
-        show({"plans": plans} if as_json else command.plans_in_words(plans), as_json, f"{out}")
+        show({"plans": plans} if as_json else plans_in_words(plans), as_json, f"{out}")
         return
     task = command.carry_out(start, chosen, seed, world, report_step, fidelity.value)
     fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world)

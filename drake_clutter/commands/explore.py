@@ -4,20 +4,26 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.agents.exploration import make_explorers, play
+import numpy as np
+
+from drake_clutter.agents.backends import backends
+from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, refusal, write_json
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import plan_fields
+from drake_clutter.planning.plan import NoPlan, PlanFailure, plan_fields
 from drake_clutter.reports.episode_page import write_episode_page
-from drake_clutter.scenes.interfaces import Move
+from drake_clutter.scenes.interfaces import Move, Observation
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import write_trajectories
-from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.belief import Belief, Decision
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
 from drake_clutter.validation import Model, Text, validate
 from drake_clutter.yaml_text import read_yaml
 
@@ -36,12 +42,6 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     return scene.at(verdict.settled)
 
 
-def _task(scene: Scene, config: ClutterConfig, max_moves: int, fidelity: str) -> ExplorationTask:
-    return ExplorationTask(
-        scene, EXECUTORS[fidelity](config), DETECTORS[fidelity](config.cell.camera), config.exploration, max_moves
-    )
-
-
 def explore(
     scene: Scene, agent_name: str, fidelity: str, max_moves: int, seed: int, config: ClutterConfig, report: Report
 ) -> ExplorationTask:
@@ -50,15 +50,15 @@ def explore(
     Args:
         scene: at rest.
         agent_name: see `make_explorers`.
-        fidelity: one of `EXECUTORS`.
+        fidelity: one of `FIDELITIES`.
         max_moves: after which it ends.
         seed: of the agent's and the world's chances.
         config: the world.
         report: called after each move.
     """
-    task = _task(scene, config, max_moves, fidelity)
-    play(task, make_explorers(agent_name, config)(task), item_rng(seed), report)
-    return task
+    backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+    policy = make_explorers(agent_name, config)(backend)
+    return run_episode(backend, policy, max_moves=max_moves, report=report)
 
 
 def _check_names(moves: Sequence[Move], number: int, in_view: Sequence[str], scene: Scene) -> None:
@@ -77,13 +77,20 @@ def carry_out(
     Raises:
         InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
     """
-    task, rng = _task(scene, config, len(moves), fidelity), item_rng(seed)
-    for number, move in enumerate(moves):
-        _check_names(moves, number, [d.name for d in task.look.observation.detections], task.scene)
-        report(task.step(move, rng))
-        if task.end is EpisodeEnd.COLLAPSED:
-            break
-    return task
+    backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+
+    def next_of_list(
+        belief: Belief, observation: Observation, rng: np.random.Generator
+    ) -> Decision:
+        number = len(belief.history)
+        if number == len(moves):
+            return Decision(None)
+        _check_names(moves, number, [d.name for d in observation.detections], backend.scene)
+        return Decision(moves[number])
+
+    return run_episode(
+        backend, next_of_list, max_moves=len(moves), report=report, until_all_found=False
+    )
 
 
 def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path) -> list[dict[str, Any]]:
@@ -96,25 +103,15 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
     plans = list[dict[str, Any]]()
     for number, move in enumerate(moves):
         _check_names(moves, number, [d.name for d in look.observation.detections], scene)
-        found = executor.plan(scene, look.observation, move, rng)
+        command = resolve_placement(move, look.observation, config.exploration, rng)
+        found = (
+            NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
+            if command is None
+            else executor.plan(scene, command)
+        )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
     write_json(out / "plan.json", {"seed": seed, "plans": plans})
     return plans
-
-
-def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What of `plan.json` fits on a screen."""
-    words = {}
-    for plan in plans:
-        move = f"{plan['move']['pick']} to {plan['move']['place']}"
-        if plan["planned"]:
-            parts = [f"{phase['name']} {phase['duration']:.2f} s" for phase in plan["phases"]]
-            nearest = min((phase["clearance"] for phase in plan["phases"] if phase["clearance"] is not None), default=None)
-            clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
-            words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['seconds']:.2f} s"
-        else:
-            words[move] = f"no plan: {plan['reason']}{': ' + plan['about'] if plan['about'] else ''}"
-    return words
 
 
 class _MoveEntry(Model):
@@ -148,8 +145,8 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
                 "instability": str(instability) if instability else None,
                 "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
-                "picks": dict(step.decision.picks) if step.decision else {},
-                "known": list(step.decision.known) if step.decision else [],
+                "picks": dict(step.decision.picks),
+                "known": list(step.decision.known),
                 "visible_share": step.look.visible_share,
                 "reward": step.reward,
             }

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from pydantic import field_validator
 
-from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.robot_model import load_robot
@@ -28,6 +27,7 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
 from drake_clutter.validation import Finite, Model, Text, Vector3, allowed, load_typed, to_plain, validate
 from drake_clutter.workers.mapping import map_ordered

@@ -14,6 +14,7 @@ from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
+from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.validation import config_yaml
 
@@ -45,18 +46,20 @@ def scene_of(scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] 
 
 def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
     """Plays a scenario on a scene at rest."""
-    choose, options = policy_of(scenario.agent, scenario.world), {"max_moves": scenario.max_moves, "seed": scenario.seed}
+    policy = policy_of(scenario.agent, scenario.world)
     perceive = perception_of(scenario, scene.support)
-    loop = ClosedLoop(scene, choose, perceive=perceive, world=scenario.world, **options)
-    timing = loop.run(report, record=True)
-    return loop.task, timing
+    loop = ClosedLoop(
+        scene, perceive=perceive, seed=scenario.seed, world=scenario.world, record=True
+    )
+    task = run_episode(loop, policy, max_moves=scenario.max_moves, report=report)
+    return task, loop.timing
 
 
 def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int) -> dict[str, Any]:
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.start, scenario.world.cell)
-    told: dict[str, Any] = {"timing": asdict(timing), **more} | ({"ended": timing.end} if timing.end else {})
+    told: dict[str, Any] = {"timing": asdict(timing), **more}
     return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told)
 
 

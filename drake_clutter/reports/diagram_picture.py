@@ -20,7 +20,6 @@ from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.closed_loop import ClosedLoop
-from drake_clutter.tasks.exploration import Decision
 
 _WIDTH, _HEIGHT = 4.3, 1.0
 """Of a system's box, in the units of the picture."""
@@ -80,5 +79,5 @@ def _at_box(middle: np.ndarray, way: np.ndarray, aside: np.ndarray) -> np.ndarra
 
 
 if __name__ == "__main__":
-    empty = ClosedLoop(Scene((), default_cell().support), lambda *_: Decision(None), max_moves=1, seed=0, world=ClutterConfig())
+    empty = ClosedLoop(Scene((), default_cell().support), seed=0, world=ClutterConfig())
     draw_diagram(empty.diagram, Path(sys.argv[1]))

@@ -20,7 +20,8 @@ from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
 from drake_clutter.reports.recording import episode_frames, write_recording
 from drake_clutter.scenes.interfaces import Instability, Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.tasks.exploration import Decision, Step
+from drake_clutter.tasks.belief import Decision
+from drake_clutter.tasks.exploration import Step
 
 _TEMPLATE = Path(__file__).with_name("episode_page.html")
 _IMAGES = "images"
@@ -141,7 +142,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         notes.append(f"{escape(_fall_in_words(outcome.instability))}.")
     if outcome.detail:
         notes.append(f"{escape(outcome.detail)}.")
-    if step.decision is not None and step.decision.observation is not None:
+    if step.decision.observation is not None:
         seen = step.decision.observation
         names = _listed([detection.object_class.name for detection in seen.detections])
         alt = f"The depth image before move {number}, with what was recognised in it: {names or 'nothing'}"
@@ -176,9 +177,9 @@ def _place(scene: Scene, step: Step) -> Pose | None:
     )
 
 
-def _beliefs(decision: Decision | None, scene: Scene, found: Sequence[str]) -> str:
+def _beliefs(decision: Decision, scene: Scene, found: Sequence[str]) -> str:
     """What the agent went by: how likely it was to pick each object, the likeliest first, and what it knew."""
-    if decision is None or not decision.picks:
+    if not decision.picks:
         return ""
     likeliest = sorted(decision.picks.items(), key=lambda item: -item[1])
     bars = [

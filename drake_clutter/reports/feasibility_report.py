@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydrake.math import RigidTransform
 
-from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
@@ -31,6 +30,7 @@ from drake_clutter.reports.pictures import Marks, PictureCamera
 from drake_clutter.scenes.interfaces import ArmState, Frame
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import pose_of
+from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility import PLANNED
 
 Rows = Sequence[Mapping[str, Any]]

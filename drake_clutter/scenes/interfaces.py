@@ -125,6 +125,21 @@ class Move:
         return f"{self.pick} -> {self.place}"
 
 
+@dataclass(frozen=True)
+class PickPlaceCommand:
+    """A move with its poses, ready to be carried out.
+
+    Attributes:
+        move: What to pick, and on what to place it.
+        X_TO_pick: Pose at which the picked object was seen.
+        X_TO_place: Pose at which it is released.
+    """
+
+    move: Move
+    X_TO_pick: Pose
+    X_TO_place: Pose
+
+
 class MoveResult(Enum):
     """How a move ended."""
 
@@ -213,9 +228,11 @@ class Detection:
     sure: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observation:
     """What the camera has shown at one time; it holds nothing that is hidden.
+
+    Observations are equal only to themselves, so that what follows from one can be cached.
 
     Attributes:
         depth: (height, width) m along the camera's axis, inf where nothing is seen.
@@ -242,11 +259,18 @@ class Observation:
 
 
 class MoveExecutor(Protocol):
-    """Carries moves out."""
+    """Carries out commands in a scene at rest."""
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
-        """What the move leads to. `observation` decides where the object lands, `rng` draws what chance decides.
+    def execute(
+        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
+    ) -> Outcome:
+        """Return the outcome of a command.
+
+        Args:
+            scene: The objects before the move, at rest.
+            command: What to carry out.
+            rng: Draws random release offsets.
 
         Raises:
-            KeyError: the move names an object that is not in view.
+            KeyError: The command names an object that is not in the scene.
         """

@@ -1,8 +1,9 @@
-"""Where exactly a picked object lands: decided once, from what the camera sees, for every fidelity."""
+"""Where a picked object is put: the free places that the camera sees, and the draw of one."""
 
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import njit
@@ -13,7 +14,7 @@ from scipy.spatial import ConvexHull
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.scenes.interfaces import Detection, Move, Observation
+from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Pose
 
 CELL = 0.005
@@ -188,24 +189,53 @@ def has_clear_top(observation: Observation, detection: Detection) -> bool:
     return bool(seen_through(observation, points[over]).mean() > 0.98) if over.any() else True
 
 
-def choose_placement(observation: Observation, move: Move, config: ExplorationConfig, rng: np.random.Generator) -> Pose | None:
-    """The pose X_TO at which the picked object is let go, or None if no place is known to be free.
+class FreePlaces(NamedTuple):
+    """Equally good poses at which a picked object can be released.
 
-    The object keeps its orientation, or is turned by a quarter about the vertical if only that fits. A place counts as free
-    where the camera sees through the air that the object will take up, its clearance included; what lies in shadow, or where
-    the picked object itself still is, does not.
-    On the tray the place furthest from the centre is taken, where an object hides least and leaves the most room; on an
-    object, the place nearest to the middle of what is seen of its top, with the centre of mass over that top.
+    Attributes:
+        translations: p_TO [m]. Shape (n, 3), n > 0.
+        quaternion: Of R_TO, the same for all of them.
+    """
+
+    translations: NDArray[np.float64]
+    quaternion: tuple[float, float, float, float]
+
+
+_FREE_PLACES: WeakKeyDictionary[
+    Observation, dict[tuple[Move, ExplorationConfig], FreePlaces | None]
+] = WeakKeyDictionary()
+"""Places that have been searched for, by observation: action filters and commands ask alike."""
+
+
+def free_places(
+    observation: Observation, move: Move, config: ExplorationConfig
+) -> FreePlaces | None:
+    """Return the equally good places for a move, or None if no place is known to be free.
+
+    The object keeps its orientation, or is turned by a quarter about the vertical if only that
+    fits. A place is free where the camera sees through the air that the object will take up, its
+    clearance included; what lies in shadow, or where the picked object itself still is, is not.
+    On the tray the places farthest from the center are taken, where an object hides least and
+    leaves the most room; on an object, those nearest to the middle of the visible part of its top,
+    with the center of mass over that top.
 
     Args:
-        observation: what the camera sees before the pick.
-        move: what to pick and where to put it.
-        config: clearance and height of release.
-        rng: decides between places that are equally good.
+        observation: What the camera sees before the pick.
+        move: What to pick and where to put it.
+        config: Clearance and release height.
 
     Raises:
-        KeyError: the move names an object that is not in view.
+        KeyError: The move names an object that is not in view.
     """
+    known = _FREE_PLACES.setdefault(observation, {})
+    if (move, config) not in known:
+        known[move, config] = _search_places(observation, move, config)
+    return known[move, config]
+
+
+def _search_places(
+    observation: Observation, move: Move, config: ExplorationConfig
+) -> FreePlaces | None:
     picked = observation[move.pick]
     if move.place == TRAY:
         floor, (cells, cost) = 0.0, _tray_places(observation.support)
@@ -220,8 +250,33 @@ def choose_placement(observation: Observation, move: Move, config: ExplorationCo
         arguments = (grid.x, grid.y, levels, turned.footprint, cells, cost)
         best = _first_fits(observation.depth, camera.altitude, camera.focal_length, *arguments)
         if len(best):
-            # In the order of the cells, so that the draw does not depend on how they were sorted.
+            # In the order of the cells, so that a draw does not depend on how they were sorted.
             best = best[np.lexsort(cells[best].T[::-1])]
-            x, y = grid.at(cells[best[rng.integers(len(best))]][None])[0]
-            return Pose((float(x), float(y), floor + config.release_height - turned.lowest), turned.quaternion)
+            height = np.full(len(best), floor + config.release_height - turned.lowest)
+            return FreePlaces(np.column_stack([grid.at(cells[best]), height]), turned.quaternion)
     return None
+
+
+def resolve_placement(
+    move: Move, observation: Observation, config: ExplorationConfig, rng: np.random.Generator
+) -> PickPlaceCommand | None:
+    """Return the command for a move, or None if no place is known to be free.
+
+    Args:
+        move: What to pick and where to put it.
+        observation: What the camera sees before the pick.
+        config: Clearance and release height.
+        rng: Decides between equally good places.
+
+    Raises:
+        KeyError: The move names an object that is not in view.
+        ValueError: The move puts an object on itself.
+    """
+    if move.place == move.pick:
+        raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
+    places = free_places(observation, move, config)
+    if places is None:
+        return None
+    x, y, z = places.translations[rng.integers(len(places.translations))].tolist()
+    X_TO_place = Pose((x, y, z), places.quaternion)
+    return PickPlaceCommand(move, observation[move.pick].X_TO, X_TO_place)

@@ -7,8 +7,7 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups
-from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Observation, Outcome
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import Settled, settle
@@ -36,13 +35,11 @@ class SettleExecutor:
         """
         self._config, self._follow_falls = config, follow_falls
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
-        """See `MoveExecutor.execute`."""
-        X_TO = choose_placement(observation, move, self._config.exploration, rng)
-        return Outcome(MoveResult.NO_FREE_SPOT, scene) if X_TO is None else self.put(scene, move.pick, X_TO, rng)
-
-    def put(self, scene: Scene, pick: str, X_TO: Pose, rng: np.random.Generator) -> Outcome:
-        """Lets an object of the scene go at a pose, random offsets added, and settles."""
+    def execute(
+        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
+    ) -> Outcome:
+        """See `MoveExecutor.execute`. Random offsets are added to the pose of release."""
+        pick, X_TO = command.move.pick, command.X_TO_place
         # What is let go sinks by the height of release; else it would never count as calm.
         sinks = self._config.settle.calm_displacement + self._config.exploration.release_height
         settle_config = replace(self._config.settle, calm_displacement=sinks)

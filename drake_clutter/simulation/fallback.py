@@ -3,7 +3,7 @@
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.interfaces import CannotJudge, Move, MoveResult, Observation, Outcome, Verdict
+from drake_clutter.scenes.interfaces import CannotJudge, MoveResult, Outcome, PickPlaceCommand, Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
@@ -30,11 +30,13 @@ class FastOrDrakeExecutor:
         """Makes both; `follow_falls` is Drake's, see `SettleExecutor`."""
         self._fast, self._settle = FastExecutor(config), SettleExecutor(config, follow_falls=follow_falls)
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+    def execute(
+        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
+    ) -> Outcome:
         """See `MoveExecutor.execute`."""
         state = rng.bit_generator.state
-        outcome = self._fast.execute(scene, observation, move, rng)
+        outcome = self._fast.execute(scene, command, rng)
         if outcome.result is MoveResult.CANNOT_JUDGE:
-            rng.bit_generator.state = state  # so that the object lands where it would have, had Drake been asked first
-            return self._settle.execute(scene, observation, move, rng)
+            rng.bit_generator.state = state  # the same offsets as if Drake had been asked first
+            return self._settle.execute(scene, command, rng)
         return outcome

@@ -10,10 +10,9 @@ from drake_clutter.scenes.interfaces import (
     InstabilityReason,
     Move,
     MoveResult,
-    Observation,
     Outcome,
+    PickPlaceCommand,
 )
-from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import TRAY, Scene, random_offsets
 from drake_clutter.stability.judge import FastJudge
 
@@ -32,14 +31,14 @@ class FastExecutor:
         self._config = config
         self._judge = judge or FastJudge(config)
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+    def execute(
+        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
+    ) -> Outcome:
         """See `MoveExecutor.execute`."""
-        X_TO = choose_placement(observation, move, self._config.exploration, rng)
-        if X_TO is None:
-            return Outcome(MoveResult.NO_FREE_SPOT, scene)
         (x, y, _) = random_offsets(1, self._config.settle.jitter, rng)[0]
-        moved = scene.at({move.pick: X_TO.moved((x, y, -self._config.exploration.release_height))})
-        found = self._judged(scene, moved, move)
+        resting = command.X_TO_place.moved((x, y, -self._config.exploration.release_height))
+        moved = scene.at({command.move.pick: resting})
+        found = self._judged(scene, moved, command.move)
         if isinstance(found, CannotJudge):
             return Outcome(MoveResult.CANNOT_JUDGE, scene, cannot_judge=found)
         return Outcome(MoveResult.PLACED if found is None else MoveResult.COLLAPSED, moved, found)

@@ -15,11 +15,10 @@ from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.planning.attempts import PlannerConfig
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried, touching_groups
-from drake_clutter.scenes.interfaces import Frame, Instability, Move, MoveResult, Observation, Outcome
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import Frame, Instability, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import fallen, settle
@@ -207,24 +206,16 @@ class ArmExecutor:
     has moved or turned past the limits, or the picked one past them from where it was let go.
     """
 
-    def __init__(
-        self,
-        config: ClutterConfig,
-        *,
-        follow_falls: bool = True,
-        planner: PlannerConfig | None = None,
-    ) -> None:
-        """Makes an executor; `follow_falls` changes nothing, falls are part of the simulation."""
+    def __init__(self, config: ClutterConfig, *, planner: PlannerConfig | None = None) -> None:
+        """Makes an executor."""
         self._config = config
         self._planner_config = planner or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
-    def plan(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Plan | NoPlan:
-        """The plan for a move, or why there is none."""
-        X_TO = choose_placement(observation, move, self._config.exploration, rng)
-        if X_TO is None:
-            return NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
-        return self.planner(scene.support).plan(scene.objects, move.pick, X_TO)
+    def plan(self, scene: Scene, command: PickPlaceCommand) -> Plan | NoPlan:
+        """Return the plan for a command, or why there is none."""
+        planner = self.planner(scene.support)
+        return planner.plan(scene.objects, command.move.pick, command.X_TO_place)
 
     def planner(self, support: Support) -> PickPlacePlanner:
         """For a tray; kept."""
@@ -232,18 +223,18 @@ class ArmExecutor:
             self._planner = PickPlacePlanner(self._config.cell.with_support(support), self._planner_config)
         return self._planner
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
+    def execute(
+        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
+    ) -> Outcome:
         """See `MoveExecutor.execute`."""
-        plan = self.plan(scene, observation, move, rng)
+        plan = self.plan(scene, command)
         if isinstance(plan, NoPlan):
-            no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
-            result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
-            return Outcome(result, scene, detail="" if no_spot else str(plan))
+            return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
         simulation = ArmSimulation(self._config.cell, scene, plan)
         told = simulation.run(record=True)
         came_off = not told.sealed or not math.isnan(told.dropped)
         X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulation.running.lowered))
-        outcome = judged(scene, scene.at(told.poses), move.pick, X_TO_place, came_off, self._config.settle)
+        outcome = judged(scene, scene.at(told.poses), command.move.pick, X_TO_place, came_off, self._config.settle)
         return replace(outcome, motion=told.motion, detail=str(told))
 
 

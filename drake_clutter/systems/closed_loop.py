@@ -1,8 +1,8 @@
-"""The closed loop: station, camera, perception, agent, planner and executor in one Diagram, and a referee who knows the truth."""
+"""The closed loop: station, camera, perception, agent, planner and executor in one Diagram."""
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,25 +12,32 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
 
-from drake_clutter.config import ClutterConfig
+from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Observation, Outcome
-from drake_clutter.scenes.placement import choose_placement
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
 from drake_clutter.station.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
 from drake_clutter.station.clutter_station import ClutterStation, Freedom, Vacuum
 from drake_clutter.station.pick_place import PickPlaceExecutor
-from drake_clutter.systems.exploration_agent import AgentState, Choose, ExplorationAgent, Phase, Request, hopeless
+from drake_clutter.systems.exploration_agent import (
+    AgentState,
+    ExplorationAgent,
+    Phase,
+    Request,
+    in_true_names,
+    infeasible_moves,
+)
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception, for_who_sees
 from drake_clutter.systems.tracking import tracked
-from drake_clutter.tasks.exploration import ExplorationTask, Step
+from drake_clutter.tasks.belief import Belief, Policy
+from drake_clutter.tasks.exploration import Attempt
 
 LATENCY = 1.15
 """s, from an image to the plan: 0.15 for perception, 1 for planning."""
@@ -48,51 +55,41 @@ class Timing:
     Attributes:
         robot: s simulated. wall: s.
         planning: s, of all plans.
-        end: why the agent ended by itself, or "".
     """
 
     robot: float
     wall: float
     planning: float
-    end: str
-
-
-class _Elsewhere:
-    """In place of an executor: moves are carried out in the diagram."""
-
-    def execute(self, scene: Scene, observation: Observation, move: Move, rng: np.random.Generator) -> Outcome:
-        raise NotImplementedError("the arm of the diagram carries moves out")
 
 
 class ClosedLoop:
-    """One scene and everything that searches it.
+    """One scene and everything that searches it (a `Backend`).
 
     Attributes:
         diagram: all of it.
-        task: the referee's book: what was found, how every move went, and why the episode ended.
+        scene: The true objects, as they were when the agent last looked.
+        look: What a perfect detector sees of them.
     """
 
     def __init__(
         self,
         scene: Scene,
-        choose: Choose,
         *,
         perceive: Perceive | None = None,
-        max_moves: int,
         seed: int,
         world: ClutterConfig,
+        record: bool = False,
     ) -> None:
         """Builds the diagram around a scene at rest.
 
         Args:
             scene: the objects.
-            choose: the explorer's policy.
             perceive: what sees; None: the perfect detector.
-            max_moves: after which the episode ends.
             seed: of all chances.
             world: config.
+            record: Whether outcomes have motions.
         """
-        self._start = scene
+        self.scene, self._record = scene, record
         world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else for_who_sees(world)
         builder, camera, eye = DiagramBuilder(), world.cell.camera, Intrinsics.of(world.cell.camera)
@@ -117,11 +114,10 @@ class ClosedLoop:
         self._ways = PickPlacePlanner(world.cell, ways)
         self.agent = ExplorationAgent.AddToBuilder(
             builder,
-            choose=choose,
-            track=tracked if self._tracks else None,
-            max_moves=max_moves,
+            config=self._world.exploration,
             seed=seed,
-            hopeless=self._hopeless,
+            tracker=tracked if self._tracks else None,
+            action_filter=self._infeasible_moves,
         )
         self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed, latency=LATENCY)
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=world.cell)
@@ -143,14 +139,15 @@ class ClosedLoop:
         self.diagram.set_name("closed_loop")
         self.simulator = Simulator(self.diagram)
         self.vacuum = Vacuum(self.station, self._suction)
-        self.task = ExplorationTask(scene, _Elsewhere(), LabelDetector(camera), world.exploration, max_moves)
-        self._planning = 0.0
+        self._detector = LabelDetector(camera)
+        self.look = self._detector.look(scene)
+        self._planning, self._begun_at = 0.0, time.perf_counter()
         self._empty = self._empty_cell(sensor)
 
     def _empty_cell(self, sensor: RgbdSensor) -> NDArray[np.float32]:
         """(height, width) m, the depth of the cell as it is without objects: they are below the floor, where nobody sees them."""
         root = self.diagram.CreateDefaultContext()
-        below = [replace(o, X_TO=o.X_TO.moved((0.0, 0.0, -10.0))) for o in self._start.objects]
+        below = [replace(o, X_TO=o.X_TO.moved((0.0, 0.0, -10.0))) for o in self.scene.objects]
         self.station.set_scene(root, np.array(self._world.cell.robot.home), below)
         image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root))
         return np.asarray(image.data[..., 0].copy())
@@ -159,17 +156,18 @@ class ClosedLoop:
         context = self.executor.GetMyContextFromRoot(root)
         return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
 
-    def _hopeless(self, known: Sequence[SceneObject], observation: Observation) -> list[Move]:
+    def _infeasible_moves(self, belief: Belief, observation: Observation) -> list[Move]:
         """Moves of what no cup holds, and those that are not worth trying with any hand."""
+        known = belief.objects
         able = {o.name for o in known if self._ways.can_pick(o, known)}
-        return hopeless(known, observation, able, self._empty, self._world.exploration)
+        return infeasible_moves(known, observation, able, self._empty, self.config)
 
     def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
-        X_TO = choose_placement(request.observation, request.move, self._world.exploration, rng)
-        if X_TO is None:
+        if request.command is None:
             return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
-        unseen = unseen_blocks(request.known, request.observation, self._empty)
-        found = self._ways.plan(request.known, request.move.pick, X_TO, unseen)
+        known = request.belief.objects
+        unseen = unseen_blocks(known, request.observation, self._empty)
+        found = self._ways.plan(known, request.move.pick, request.command.X_TO_place, unseen)
         self._planning += found.seconds
         return found
 
@@ -178,15 +176,27 @@ class ClosedLoop:
         return state
 
     @property
-    def known(self) -> tuple[SceneObject, ...]:
-        """K_t, as the agent has it now."""
-        return self._agent_state(self.simulator.get_context()).known
+    def config(self) -> ExplorationConfig:
+        """The task's config."""
+        return self._world.exploration
 
-    def run(self, report: Callable[[Step], None] = lambda _: None, *, record: bool = False) -> Timing:
-        """Simulates until all is found, the pile has collapsed, or the agent has ended; `report` is called after each move."""
-        begun_at = time.perf_counter()
+    @property
+    def belief(self) -> Belief:
+        """What the agent knows now."""
+        return self._agent_state(self.simulator.get_context()).belief
+
+    @property
+    def timing(self) -> Timing:
+        """How long the episode has taken so far."""
+        robot = self.simulator.get_context().get_time()
+        return Timing(robot, time.perf_counter() - self._begun_at, self._planning)
+
+    def rollout(self, policy: Policy) -> Iterator[Attempt]:
+        """See `Backend.rollout`."""
+        self.agent.policy = policy
+        self._begun_at = time.perf_counter()
         root = self.simulator.get_mutable_context()
-        self.station.set_scene(root, np.array(self._world.cell.robot.home), self._start.objects)
+        self.station.set_scene(root, np.array(self._world.cell.robot.home), self.scene.objects)
         self.simulator.set_monitor(self.vacuum)
         freedom = Freedom(self.station, self.vacuum)
         freedom.begin(root)
@@ -194,7 +204,7 @@ class ClosedLoop:
         plan: Plan | None = None
         beside, motion, answers, k = (set[str](), set[str]()), list[Frame](), dict[int, Answer](), 0
         state = self._agent_state(root)
-        while self.task.end is None and state.phase is not Phase.DONE:
+        while state.phase is not Phase.DONE:
             now = root.get_time()
             running = self.executor.running(self.executor.GetMyContextFromRoot(root))
             if running.plan is not plan and running.plan is not None:
@@ -207,7 +217,7 @@ class ClosedLoop:
             freedom.update(root, wanted, must_hold=must_hold)
             k += 1
             self.simulator.AdvanceTo(k * LOOK + TIME_STEP / 2)
-            if record and running.schedule is not None and now - running.begun < running.schedule.end:
+            if self._record and running.schedule is not None and now - running.begun < running.schedule.end:
                 context = self.station.plant_context(root)
                 arm = self.station.arm_state(context, self._suction(root))
                 motion.append(Frame(root.get_time() - running.begun, self.station.scene.poses(context), arm))
@@ -216,28 +226,32 @@ class ClosedLoop:
             before, state = state, self._agent_state(root)
             looked_again = state.phase is Phase.DONE or state.request is not before.request
             if looked_again and before.request is not None:
-                report(self._judged(root, before.request, answers[before.request.number], tuple(motion)))
+                answer = answers[before.request.number]
+                yield self._judged(root, before.request, answer, tuple(motion))
                 motion.clear()
-        end = state.finish.value if state.finish and self.task.end is None else ""
-        return Timing(root.get_time(), time.perf_counter() - begun_at, self._planning, end)
 
     def _objects(self, root: Context) -> tuple[SceneObject, ...]:
-        return self._start.at(self.station.scene.poses(self.station.plant_context(root))).objects
+        return self.scene.at(self.station.scene.poses(self.station.plant_context(root))).objects
 
-    def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Step:
+    def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Attempt:
         """How a move went, by the truth, once the agent has looked again."""
-        before, plan = self.task.scene, answer.plan
+        before, plan, decision = self.scene, answer.plan, request.decision
         assert plan is not None
-        # What an agent that tracks calls an object is its own affair.
-        move, decision = request.truly(before.objects) if self._tracks else (request.move, request.decision)
+        if self._tracks:
+            decision = in_true_names(
+                decision, request.belief, request.observation, before.objects
+            )
+        move = decision.move
+        assert move is not None
         if isinstance(plan, NoPlan):
             no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
-            return self.task.note(move, Outcome(result, before, detail="" if no_spot else str(plan)), decision)
+            outcome = Outcome(result, before, detail="" if no_spot else str(plan))
+            return Attempt(decision, outcome, self.look)
         after = replace(before, objects=self._objects(root))
         # What hung on the cup, which may not be what the agent took it for.
         picked = self.vacuum.taken or nearest(before.objects, plan.X_TO_pick).name
-        move, decision = replace(move, pick=picked), replace(decision, move=replace(move, pick=picked))
+        decision = replace(decision, move=replace(move, pick=picked))
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
         lowered = self.executor.running(self.executor.GetMyContextFromRoot(root)).lowered
         X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO).moved((0.0, 0.0, -lowered))
@@ -247,4 +261,6 @@ class ClosedLoop:
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"
         # The simulation goes on from where things are in it.
-        return self.task.note(move, replace(outcome, scene=after, motion=motion, detail=detail), decision)
+        outcome = replace(outcome, scene=after, motion=motion, detail=detail)
+        self.scene, self.look = after, self._detector.look(after)
+        return Attempt(decision, outcome, self.look)

@@ -1,9 +1,8 @@
-"""The exploring agent in the loop: it looks, chooses a move, waits until that is done or refused, and looks again."""
+"""The exploring agent in the loop: it looks, chooses a move, waits for its end, looks again."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,58 +11,75 @@ from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, Leaf
 
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.planning.plan import NoPlan, Plan
-from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, PickPlaceCommand
+from drake_clutter.scenes.placement import free_places, resolve_placement
+from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.scenes.unseen import under_nameless
 from drake_clutter.seeding import item_rng
 from drake_clutter.station.arm_executor import nearest
 from drake_clutter.systems.move_planner import Answer
-from drake_clutter.systems.tracking import Tracked
-from drake_clutter.tasks.exploration import Decision, legal_moves
-from drake_clutter.tasks.exploration_graph import seen
+from drake_clutter.tasks.belief import (
+    ActionFilter,
+    Belief,
+    Decision,
+    Policy,
+    Tracker,
+    legal_moves,
+    select_move,
+    update_belief,
+)
 
-STUCK_WITHIN = 0.01
-"""m; an object that was to be moved and is seen so near to where it was has not been moved."""
 PERIOD = 0.05
 """s, between two looks at what the others are doing."""
 
-Track = Callable[[Sequence[SceneObject], Observation], Tracked]
-"""From K_t and an image whose detections' names mean nothing, see `tracked`."""
-Choose = Callable[[Sequence[SceneObject], Observation, Sequence[Move], np.random.Generator, Sequence[Move]], Decision]
-"""From K_t, what is in view, the moves so far, chance, and the moves that failed since anything last changed."""
 
-
-Hopeless = Callable[[Sequence[SceneObject], Observation], Sequence[Move]]
-"""From K_t and what is in view, the moves that are not worth trying."""
-
-
-def hopeless(
+def infeasible_moves(
     known: Sequence[SceneObject],
     observation: Observation,
     pickable: Collection[str],
     empty: NDArray[np.float32],
     config: ExplorationConfig,
 ) -> list[Move]:
-    """Moves of what cannot be picked, and those for which there is no free place.
+    """Return the moves of what cannot be picked, and those for which there is no free place.
 
     Also those of what may carry something that was not recognised, as long as others are left.
 
     Args:
-        known: K_t; observation: what is in view.
-        pickable: names of what is known to carry nothing, and can be held.
-        empty: (height, width) m, see `under_nameless`.
-        config: of the task.
+        known: K_t.
+        observation: What is in view.
+        pickable: Names of what is known to carry nothing, and can be held.
+        empty: Depth of the empty cell [m], see `under_nameless`. Shape (height, width).
+        config: Of the task.
     """
-    some = np.random.default_rng(0)  # it decides where, not whether
     free = [
         move
         for move in legal_moves(observation)
-        if move.pick in pickable and choose_placement(observation, move, config, some) is not None
+        if move.pick in pickable and free_places(observation, move, config) is not None
     ]
     risky = under_nameless(known, observation, empty)
     worth_trying = {move for move in free if move.pick not in risky} or set(free)
     return [move for move in legal_moves(observation) if move not in worth_trying]
+
+
+def in_true_names(
+    decision: Decision, belief: Belief, observation: Observation, objects: Sequence[SceneObject]
+) -> Decision:
+    """Return a decision in the names of what is really there.
+
+    Args:
+        decision: In the names of the belief; its move is not None.
+        belief: When it was made; each object is the true one nearest to its place.
+        observation: When it was made; it is kept in the decision.
+        objects: The true ones.
+    """
+    assert decision.move is not None
+    name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in belief.objects}
+    return Decision(
+        Move(name[decision.move.pick], name[decision.move.place]),
+        {name[pick]: chance for pick, chance in decision.picks.items()},
+        tuple(name[known] for known in decision.known),
+        observation,
+    )
 
 
 class Phase(Enum):
@@ -71,14 +87,7 @@ class Phase(Enum):
 
     LOOKING = "waits for things to come to rest, then looks"
     WAITING = "waits for a plan, or for its end"
-    DONE = "has ended"
-
-
-class Finish(Enum):
-    """Why the agent ended by itself."""
-
-    OUT_OF_MOVES = "out of moves"
-    NOTHING_FEASIBLE = "nothing feasible"
+    DONE = "has no move left"
 
 
 @dataclass(frozen=True)
@@ -87,86 +96,54 @@ class Request:
 
     Attributes:
         number: 1 for the episode's first.
-        move: what to do.
-        observation: what was in view when it was chosen; known: K_t then.
-        decision: why.
+        decision: Of which the move is part.
+        command: The move with its poses; None: no place is known to be free.
+        observation: What was in view when it was decided.
+        belief: What was known then.
     """
 
     number: int
-    move: Move
-    observation: Observation = field(repr=False)
-    known: tuple[SceneObject, ...] = field(repr=False)
     decision: Decision = field(repr=False)
+    command: PickPlaceCommand | None
+    observation: Observation = field(repr=False)
+    belief: Belief = field(repr=False)
 
     def __deepcopy__(self, memo: object) -> "Request":
         """Itself: it never changes, and Drake copies abstract values again and again."""
         return self
 
-    def truly(self, objects: Sequence[SceneObject]) -> tuple[Move, Decision]:
-        """Move and decision in the names of what is really there, each known object being the nearest to its place."""
-        name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in self.known}
-        move = Move(name[self.move.pick], name[self.move.place])
-        picks = {name[pick]: chance for pick, chance in self.decision.picks.items()}
-        known = tuple(name[known] for known in self.decision.known)
-        return move, replace(self.decision, move=move, picks=picks, known=known, observation=self.observation)
+    @property
+    def move(self) -> Move:
+        """What to do."""
+        assert self.decision.move is not None
+        return self.decision.move
 
 
 @dataclass(frozen=True)
 class AgentState:
-    """Everything that the agent remembers.
+    """What the agent is doing, and what it knows.
 
     Attributes:
-        phase: what it is doing. look_at: s, when it is to look next.
-        known: K_t, each object as it was last seen.
-        lost: names of those of them that are not in view any more, and not where they were.
-        tried: all moves; failed: those that could not be carried out since anything last changed.
-        request: the latest; carried_out: how many moves were; acted: whether the latest was, and nobody has looked since.
-        finish: why it ended.
+        phase: What it is doing.
+        look_at: When it looks next [s].
+        belief: What it knows.
+        request: The latest.
+        carried_out: How many moves were carried out.
     """
 
     phase: Phase = Phase.LOOKING
     look_at: float = 0.0
-    known: tuple[SceneObject, ...] = ()
-    lost: tuple[str, ...] = ()
-    tried: tuple[Move, ...] = ()
-    failed: tuple[Move, ...] = ()
+    belief: Belief = field(default_factory=Belief)
     request: Request | None = None
     carried_out: int = 0
-    acted: bool = False
-    finish: Finish | None = None
 
     def __deepcopy__(self, memo: object) -> "AgentState":
         """Itself, as of `Request`."""
         return self
 
-    @property
-    def refused(self) -> "AgentState":
-        """After a request that could not be carried out."""
-        assert self.request is not None
-        move = self.request.move
-        return replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), failed=(*self.failed, move))
-
-    def placed(self, X_TO: Pose) -> "AgentState":
-        """After a request that was carried out: until it is seen there, an object is taken to be where it was put."""
-        assert self.request is not None
-        move = self.request.move
-        known = tuple(replace(o, X_TO=X_TO) if o.name == move.pick else o for o in self.known)
-        over = replace(self, phase=Phase.LOOKING, tried=(*self.tried, move), known=known)
-        return replace(over, carried_out=self.carried_out + 1, acted=True)
-
-    @property
-    def stuck(self) -> str | None:
-        """The object that was to be moved, if it is seen where it was: the cup did not get it."""
-        assert self.request is not None
-        pick = self.request.move.pick
-        before, now = (next((o for o in known if o.name == pick), None) for known in (self.request.known, self.known))
-        if before is None or now is None or np.linalg.norm(before.X_TO.p - now.X_TO.p) > STUCK_WITHIN:
-            return None
-        return pick
-
 
 class ExplorationAgent(LeafSystem):
-    """Chooses moves until nothing is left to do.
+    """Chooses moves until none is left.
 
     Input ports: observation, abstract, an `Observation`; answer, abstract, the planner's `Answer`; finished (2,), how many plans
         have been carried out, and how far below its place the latest has let go of its object, m.
@@ -176,26 +153,26 @@ class ExplorationAgent(LeafSystem):
     def __init__(
         self,
         *,
-        choose: Choose,
-        track: Track | None,
-        max_moves: int,
+        config: ExplorationConfig,
         seed: int,
-        hopeless: Hopeless | None = None,
+        policy: Policy | None = None,
+        tracker: Tracker | None = None,
+        action_filter: ActionFilter | None = None,
         rest: float = 0.5,
     ) -> None:
-        """Begins an episode.
+        """Begin an episode.
 
         Args:
-            choose: the policy.
-            track: what gives detections names that last; None: they have them.
-            max_moves: after which it ends; a move that could not be carried out counts as one.
-            seed: of its chances.
-            hopeless: what is not worth trying; None: everything is.
-            rest: s, that it waits for things to come to rest before it looks.
+            config: Of the task.
+            seed: Of the policy's chances, and of those of the placement.
+            policy: Chooses the moves; without one, `policy` is to be set before a simulation.
+            tracker: Gives detections names that last; None: they have them.
+            action_filter: Adds to the invalid moves; None: every legal move may be tried.
+            rest: For which it lets things come to rest before it looks [s].
         """
         super().__init__()
-        self._choose, self._track, self._max_moves, self._seed, self._rest = choose, track, max_moves, seed, rest
-        self._hopeless = hopeless
+        self.policy, self._config, self._seed, self._rest = policy, config, seed, rest
+        self._tracker, self._action_filter = tracker, action_filter
         self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(None))
         self._answer = self.DeclareAbstractInputPort("answer", AbstractValue.Make(Answer()))
         self._finished = self.DeclareVectorInputPort("finished", 2)
@@ -207,11 +184,19 @@ class ExplorationAgent(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, *, choose: Choose, track: Track | None, max_moves: int, seed: int, hopeless: Hopeless
+        builder: DiagramBuilder,
+        *,
+        config: ExplorationConfig,
+        seed: int,
+        tracker: Tracker | None,
+        action_filter: ActionFilter,
     ) -> "ExplorationAgent":
-        """Adds one."""
-        options: dict[str, Any] = {"max_moves": max_moves, "seed": seed, "hopeless": hopeless}
-        system: ExplorationAgent = builder.AddSystem(ExplorationAgent(choose=choose, track=track, **options))
+        """Add one."""
+        system: ExplorationAgent = builder.AddSystem(
+            ExplorationAgent(
+                config=config, seed=seed, tracker=tracker, action_filter=action_filter
+            )
+        )
         system.set_name("exploration_agent")
         return system
 
@@ -226,43 +211,42 @@ class ExplorationAgent(LeafSystem):
         time = context.get_time()
         if now.phase is Phase.LOOKING and time >= now.look_at:
             return self.decided(now, self._observation.Eval(context))
-        if now.phase is Phase.WAITING:
-            assert now.request is not None
-            answer: Answer = self._answer.Eval(context)
-            if answer.number < now.request.number:
-                return now
-            if isinstance(answer.plan, NoPlan):
-                return replace(now.refused, look_at=time)
-            finished, lowered = self._finished.Eval(context)
-            if finished > now.carried_out:
-                assert isinstance(answer.plan, Plan)
-                return replace(now.placed(answer.plan.X_TO_place.moved((0.0, 0.0, -lowered))), look_at=time + self._rest)
-        return now
-
-    def looked(self, now: AgentState, observation: Observation) -> tuple[AgentState, Observation]:
-        """After a look: what is known then, and what was seen in the names of what is known."""
-        if self._track is not None:
-            observation, lost = self._track(now.known, observation)
-            # What is lost is no longer known: wherever it is, it will be found again as another.
-            now = replace(now, known=tuple(o for o in now.known if o.name not in lost), lost=(*now.lost, *lost))
-        return replace(now, known=seen(now.known, observation)), observation
+        if now.phase is not Phase.WAITING:
+            return now
+        assert now.request is not None
+        move = now.request.move
+        answer: Answer = self._answer.Eval(context)
+        if answer.number < now.request.number:
+            return now
+        if isinstance(answer.plan, NoPlan):
+            belief = now.belief.record(move, MoveResult.NOT_PLANNED)
+            return replace(now, phase=Phase.LOOKING, look_at=time, belief=belief)
+        finished, lowered = self._finished.Eval(context)
+        if finished <= now.carried_out:
+            return now
+        assert isinstance(answer.plan, Plan)
+        X_TO = answer.plan.X_TO_place.moved((0.0, 0.0, -lowered))
+        return replace(
+            now,
+            phase=Phase.LOOKING,
+            look_at=time + self._rest,
+            belief=now.belief.record(move, MoveResult.PLACED, X_TO),
+            carried_out=now.carried_out + 1,
+        )
 
     def decided(self, now: AgentState, observation: Observation) -> AgentState:
-        """After a look: with a request for a move, or done."""
-        now, observation = self.looked(now, observation)
-        if now.acted:
-            again = [move for move in legal_moves(observation) if move.pick == now.stuck]
-            now = replace(now, acted=False, failed=(*now.failed, *again) if again else ())
-        number = len(now.tried) + 1
-        if number > self._max_moves:
-            return replace(now, phase=Phase.DONE, finish=Finish.OUT_OF_MOVES)
-        names = {TRAY, *(o.name for o in now.known)}  # of what is lost nothing more is said
-        still_failed = (move for move in now.failed if {move.pick, move.place} <= names)
-        failed = (*still_failed, *(self._hopeless(now.known, observation) if self._hopeless else ()))
-        decision = self._choose(now.known, observation, now.tried, item_rng(self._seed, number), failed)
+        """Return the state after a look: with a request for a move, or done."""
+        assert self.policy is not None, "the policy is set before a simulation"
+        belief, observation = update_belief(now.belief, observation, self._tracker)
+        number = len(belief.history) + 1
+        rng = item_rng(self._seed, number)
+        decision = select_move(self.policy, belief, observation, rng, self._action_filter)
         if decision.move is None:
-            return replace(now, phase=Phase.DONE, finish=Finish.NOTHING_FEASIBLE)
-        return replace(now, phase=Phase.WAITING, request=Request(number, decision.move, observation, now.known, decision))
+            return replace(now, belief=belief, phase=Phase.DONE)
+        rng = item_rng(self._seed, number)
+        command = resolve_placement(decision.move, observation, self._config, rng)
+        request = Request(number, decision, command, observation, belief)
+        return replace(now, belief=belief, phase=Phase.WAITING, request=request)
 
     def _calc_request(self, context: Context, output: AbstractValue) -> None:
         state: AgentState = context.get_abstract_state(self._state).get_value()

@@ -10,8 +10,8 @@ from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
-from drake_clutter.systems.exploration_agent import Choose
 from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
+from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import Between, Flag, config_class
 
 
@@ -72,15 +72,14 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     return LearnedPerception(detector.detect, noise=scenario.camera_noise, seed=scenario.seed)
 
 
-def policy_of(name: str, config: ClutterConfig) -> Choose:
-    """An explorer's policy as the loop's agent needs it: a function of what it is given, without memory of its own.
+def policy_of(name: str, config: ClutterConfig) -> Policy:
+    """Return an explorer that knows no more than the camera shows.
 
     Raises:
         InputError: no such explorer, or one that knows more than the camera shows.
     """
     if name in BASELINES:
-        agent = BASELINES[name]()
-        return lambda _, observation, tried, rng, failed: agent.choose(observation, tried, rng, failed)
+        return BASELINES[name]
     explorers = make_explorers(name, config)
     from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
 
@@ -88,5 +87,4 @@ def policy_of(name: str, config: ClutterConfig) -> Choose:
         raise InputError(
             f"agent: {name} knows more than the camera shows; allowed is a student, or one of {', '.join(BASELINES)}"
         )
-    learned = explorers.student()
-    return lambda known, observation, tried, _, failed: learned.decide(known, observation, tried, failed)
+    return explorers()

@@ -11,11 +11,20 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Move, MoveResult
-from drake_clutter.scenes.scene import TRAY, Scene
+from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
-from drake_clutter.tasks.exploration_graph import BOUND, EDGE_KINDS, FEATURES, GLOBALS, GraphObservation, exploration_graph, seen
+from drake_clutter.tasks.belief import Decision
+from drake_clutter.tasks.episode import BackendFactory, teleport_backends
+from drake_clutter.tasks.exploration import Attempt, EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.exploration_graph import (
+    BOUND,
+    EDGE_KINDS,
+    FEATURES,
+    GLOBALS,
+    GraphObservation,
+    exploration_graph,
+)
 
 TRAINING_SET = "training/scenes/train_sg_star.json"
 _TRIES = 100
@@ -44,7 +53,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         scenes: SceneSet | Path | str | None = None,
         *,
         privileged: bool = False,
-        fidelity: str = "fast",
+        fidelity: str | BackendFactory = "fast",
         max_moves: int | None = None,
         most_objects: int = 24,
         config: ClutterConfig | None = None,
@@ -54,7 +63,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         Args:
             scenes: a set, or the file of one; None: the shipped training set.
             privileged: whether all objects are seen, or K_t.
-            fidelity: one of `EXECUTORS`.
+            fidelity: one of `TELEPORT_FIDELITIES`, or what starts episodes on other backends.
             max_moves: after which an episode ends; None: the config's.
             most_objects: that a scene may have.
             config: the world.
@@ -66,10 +75,9 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         self._nodes = most_objects + 1
         self.grammar = scenes.grammar
         self.numbers = node_numbers([c.name for c in scenes.classes])
-        if fidelity not in EXECUTORS:
-            raise InputError(f"fidelity: {fidelity!r}; allowed are {', '.join(EXECUTORS)}")
-        self._executor = EXECUTORS[fidelity](self._config, follow_falls=False)
-        self._detector = DETECTORS[fidelity](self._config.cell.camera)
+        if isinstance(fidelity, str):
+            fidelity = teleport_backends(fidelity, self._config)
+        self._start_backend = fidelity
         self._judge = FastJudge(self._config)
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
@@ -113,8 +121,10 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         """
         if len(scene.objects) >= self._nodes:
             raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
-        self.task = ExplorationTask(scene, self._executor, self._detector, self._config.exploration, self._max_moves)
-        self.known, self._refused = seen((), self.task.look.observation), 0
+        self.backend, self._refused = self._start_backend(scene, self.np_random), 0
+        self.task = ExplorationTask(
+            scene, self.backend.look, self._config.exploration, self._max_moves
+        )
         return self._noted(self.observe())
 
     def _noted(self, observation: GraphObservation) -> GraphObservation:
@@ -130,13 +140,23 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
     @property
     def objects(self) -> tuple[str, ...]:
         """The objects that nodes 1, 2, ... stand for."""
-        return tuple(o.name for o in (self.task.scene.objects if self._privileged else self.known))
+        return tuple(o.name for o in self._shown(self._privileged))
+
+    def _shown(self, privileged: bool) -> tuple[SceneObject, ...]:
+        return self.backend.scene.objects if privileged else self.backend.belief.objects
 
     def observe(self, *, privileged: bool | None = None) -> GraphObservation:
         """The observation; or the other one, for a teacher that watches a student."""
-        shown = self.task.scene.objects if (self._privileged if privileged is None else privileged) else self.known
-        tried = [step.move for step in self.task.steps]
-        return exploration_graph(shown, self.task.look.observation, tried, self.numbers, self.task.failed, nodes=self._nodes)
+        shown = self._shown(self._privileged if privileged is None else privileged)
+        belief, observation = self.backend.belief, self.backend.look.observation
+        return exploration_graph(
+            shown,
+            observation,
+            belief.history,
+            self.numbers,
+            belief.invalid_moves,
+            nodes=self._nodes,
+        )
 
     def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out; one that is not allowed changes nothing, but counts towards the number of moves."""
@@ -145,9 +165,11 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         if not self._allowed[x, y]:
             self._refused += 1
             return self.observe(), 0.0, False, self._spent, {"end": EpisodeEnd.OUT_OF_MOVES} if self._spent else {}
-        step = self.task.step(Move(names[x - 1], names[y - 1] if y else TRAY), self.np_random)
-        if step.outcome.result is not MoveResult.COLLAPSED:
-            self.known = seen(self.known, self.task.look.observation)
+        move = Move(names[x - 1], names[y - 1] if y else TRAY)
+        outcome = self.backend.step(move)
+        if outcome.result is not MoveResult.COLLAPSED:
+            self.backend.update_belief()
+        step = self.task.note(Attempt(Decision(move), outcome, self.backend.look))
         observation, end = self._noted(self.observe()), self.task.end
         if end is None and self._spent:
             end = EpisodeEnd.OUT_OF_MOVES

@@ -55,9 +55,9 @@ def _overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
 def exploration_graph(
     objects: Sequence[SceneObject],
     observation: Observation,
-    tried: Sequence[Move],
+    history: Sequence[Move],
     numbers: Mapping[str, int],
-    failed: Collection[Move] = (),
+    invalid_moves: Collection[Move] = (),
     nodes: int = 0,
 ) -> GraphObservation:
     """The graph as arrays; node 0 is the tray, node k the k-th object.
@@ -65,9 +65,9 @@ def exploration_graph(
     Args:
         objects: n of them.
         observation: what is in view; those in view must be among the objects.
-        tried: the episode's moves so far.
+        history: the episode's moves so far.
         numbers: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
-        failed: moves that could not be carried out since the scene last changed.
+        invalid_moves: moves that may not be made.
         nodes: N, that there is room for; 0: as many as there are.
 
     Returns:
@@ -96,7 +96,7 @@ def exploration_graph(
             if detection is not None:
                 pixel = (camera.altitude - high[k]) / camera.focal_length
                 share = min(1.0, np.count_nonzero(detection.mask) * pixel**2 / float(extent[0] * extent[1]))
-            picks = sum(move.pick == o.name for move in tried)
+            picks = sum(move.pick == o.name for move in history)
             kind[k + 1] = numbers[o.object_class.name]
             # Of a rotation's two, always the same, also when a component that should be 0 is a little off.
             sign = 1 if next((q for q in o.X_TO.quaternion if abs(q) > 0.01), 1) > 0 else -1
@@ -125,9 +125,9 @@ def exploration_graph(
         allowed[in_view[:, None], in_view] = allowed[in_view, 0] = 1
         np.fill_diagonal(allowed, 0)
         node = {TRAY: 0} | {o.name: k for k, o in enumerate(objects, start=1)}
-        for move in failed:
+        for move in invalid_moves:
             allowed[node[move.pick], node[move.place]] = 0
-    glob = np.array([min(BOUND, len(tried) / _MANY_MOVES)], np.float32)
+    glob = np.array([min(BOUND, len(history) / _MANY_MOVES)], np.float32)
     return {
         "node_kind": kind,
         "feature": feature,
@@ -136,13 +136,3 @@ def exploration_graph(
         "glob": glob,
         "allowed": allowed,
     }
-
-
-def seen(known: Sequence[SceneObject], observation: Observation) -> tuple[SceneObject, ...]:
-    """K_(t+1) from K_t: what is in view as it is seen, the rest as it was seen last; in the order in which it was found."""
-    objects = {o.name: o for o in known}
-    for d in observation.detections:
-        there = objects.get(d.name)
-        if there is None or (there.object_class, there.X_TO) != (d.object_class, d.X_TO):  # else it keeps its corners
-            objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
-    return tuple(objects.values())

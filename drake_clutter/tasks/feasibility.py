@@ -19,12 +19,12 @@ from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.paths import sampled
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
-from drake_clutter.scenes.interfaces import Move
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import Move, PickPlaceCommand
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.plant import rigid_transform
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.tasks.belief import legal_moves
 
 PLANNED = "planned"
 """The result of a move that has a plan; any other is a `PlanFailure`'s value."""
@@ -116,7 +116,14 @@ class FeasibilityStudy:
         """
         observation = self._detector.look(scene).observation
         return [
-            self._row(name, scene, move, choose_placement(observation, move, self._world.exploration, self._rng(number, k)))
+            self._row(
+                name,
+                scene,
+                move,
+                resolve_placement(
+                    move, observation, self._world.exploration, self._rng(number, k)
+                ),
+            )
             for k, move in enumerate(legal_moves(observation))
         ]
 
@@ -129,7 +136,7 @@ class FeasibilityStudy:
             self._planner = PickPlacePlanner(self._world.cell.with_support(support), self._config)
         return self._planner
 
-    def _row(self, name: str, scene: Scene, move: Move, X_TO: Pose | None) -> MoveRow:
+    def _row(self, name: str, scene: Scene, move: Move, command: PickPlaceCommand | None) -> MoveRow:
         picked = scene[move.pick]
         lower, upper = picked.bounds_T
         x, y = (lower[:2] + upper[:2]) / 2
@@ -145,8 +152,9 @@ class FeasibilityStudy:
             round(picked.top, 6),
             len(below(picked, scene.objects)),
         )
-        if X_TO is None:
+        if command is None:
             return replace(row, about=move.place)
+        X_TO = command.X_TO_place
         px, py, pz = (round(v, 6) for v in X_TO.translation)
         row = replace(row, place_x=px, place_y=py, place_z=pz)
         planner = self.planner(scene.support)

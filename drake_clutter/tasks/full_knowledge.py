@@ -15,6 +15,7 @@ import numpy as np
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import CannotJudge, Move, MoveResult, Observation
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.stability.executor import FastExecutor
@@ -101,6 +102,7 @@ class FullKnowledgeSearch:
         self._judge = judge or FastJudge(config)
         self._rays = self._judge.rays
         self._executor = FastExecutor(config, self._judge)
+        self._config = config.exploration
         self._hidden_below = config.cell.camera.visibility_threshold
 
     def solve(
@@ -275,7 +277,10 @@ class FullKnowledgeSearch:
         self._left -= 1
         rng = np.random.default_rng()
         rng.bit_generator.state = dict(state.rng)
-        outcome = self._executor.execute(state.scene, state.observation, move, rng)
+        command = resolve_placement(move, state.observation, self._config, rng)
+        if command is None:
+            return None
+        outcome = self._executor.execute(state.scene, command, rng)
         self._doubts += outcome.result is MoveResult.CANNOT_JUDGE
         if outcome.result is not MoveResult.PLACED:
             return None

@@ -1,0 +1,94 @@
+"""A backend without an arm whose observations come from rendered images."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.geometry import carried, rests_on
+from drake_clutter.scenes.interfaces import (
+    Move,
+    MoveResult,
+    Observation,
+    Outcome,
+    PickPlaceCommand,
+)
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.station.arm_executor import nearest
+from drake_clutter.systems.exploration_agent import in_true_names, infeasible_moves
+from drake_clutter.systems.scene_perception import Perceive, for_who_sees
+from drake_clutter.systems.tracking import tracked
+from drake_clutter.tasks.belief import Belief, Decision
+from drake_clutter.tasks.episode import SteppedBackend
+
+
+class ImageBackend(SteppedBackend):
+    """What a detector sees in rendered images is picked, appears at its place, and Drake settles.
+
+    The policy knows objects by names of its own. What is picked is the true object nearest to
+    where one was seen, and it lands as far off as it was seen.
+    """
+
+    def __init__(self, scene: Scene, perceive: Perceive, *, seed: int, world: ClutterConfig) -> None:
+        """Start on a scene at rest, and observe it.
+
+        Args:
+            scene: The objects, at rest.
+            perceive: The detector.
+            seed: Of all chances.
+            world: The config.
+        """
+        world = for_who_sees(world)
+        self._perceive, self._seed = perceive, seed
+        self._camera = OverheadCamera(world.cell.camera)
+        self._empty = self._camera.render(replace(scene, objects=())).depth
+        super().__init__(
+            SettleExecutor(world, follow_falls=False),
+            LabelDetector(world.cell.camera),
+            world.exploration,
+            scene,
+            item_rng(seed),
+            tracker=tracked,
+            action_filter=self._infeasible_moves,
+        )
+
+    @property
+    def policy_rng(self) -> np.random.Generator:
+        """See `SteppedBackend.policy_rng`."""
+        return item_rng(self._seed, len(self.belief.history) + 1)
+
+    @property
+    def world_rng(self) -> np.random.Generator:
+        """See `SteppedBackend.world_rng`."""
+        return item_rng(self._seed, len(self.belief.history) + 1, 1)
+
+    def observe(self) -> Observation:
+        """See `SteppedBackend.observe`."""
+        images = self._camera.render(self.scene)
+        return self._perceive(images.depth, images.color, ())
+
+    def _infeasible_moves(self, belief: Belief, observation: Observation) -> Sequence[Move]:
+        known = belief.objects
+        free = {o.name for o in known if not rests_on(o, known)}
+        return infeasible_moves(known, observation, free, self._empty, self.config)
+
+    def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
+        """See `SteppedBackend.execute`."""
+        picked = nearest(self.scene.objects, command.X_TO_pick)
+        X_TO_place = carried(command.X_TO_pick, command.X_TO_place, picked.X_TO)
+        move = replace(command.move, pick=picked.name)
+        outcome = super().execute(PickPlaceCommand(move, picked.X_TO, X_TO_place), rng)
+        return replace(outcome, released=command.X_TO_place)
+
+    def known_result(self, outcome: Outcome) -> MoveResult:
+        """Return that the object was placed: what became of it shows when it is seen again."""
+        return MoveResult.PLACED
+
+    def in_true_names(self, decision: Decision) -> Decision:
+        """See `SteppedBackend.in_true_names`."""
+        return in_true_names(decision, self.belief, self.observation, self.scene.objects)
