@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator, wilson_interval
+from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
@@ -29,12 +29,13 @@ from drake_clutter.planning.attempts import NEAR, REPORTED, PlannerConfig
 from drake_clutter.planning.paths import sampled, smooth, timed
 from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.statistics import wilson_interval
+from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
@@ -137,10 +138,10 @@ class Mover:
 
     def _tried(self, scene: Scene, move: Any, rng: np.random.Generator, observation: Any) -> Trial:
         name = scene[move.pick].object_class.name
-        X_TO = choose_placement(observation, move, WORLD.exploration, rng)
-        if X_TO is None:
+        command = resolve_placement(move, observation, WORLD.exploration, rng)
+        if command is None:
             return Trial("no free spot", False, name, 0.0)
-        planner = self._executor.planner(scene.support)
+        planner, X_TO = self._executor.planner(scene.support), command.X_TO_place
         sure = self._sure.planner(scene.support).plan(scene.objects, move.pick, X_TO)
         plan = planner.plan(scene.objects, move.pick, X_TO)
         if isinstance(plan, NoPlan):
@@ -241,9 +242,10 @@ def parts(
         observation = detector.look(scene).observation
         choices = legal_moves(observation)
         move = choices[rng.integers(len(choices))]
-        X_TO = choose_placement(observation, move, WORLD.exploration, rng)
-        if X_TO is None:
+        command = resolve_placement(move, observation, WORLD.exploration, rng)
+        if command is None:
             return False
+        X_TO = command.X_TO_place
         planner, quick = executor.planner(scene.support), sure.planner(scene.support)
         timed_as("scene of distances", lambda: planner.clearance_scene(scene.objects))
         quick.clearance_scene(scene.objects)
@@ -291,7 +293,9 @@ def holds(
             number += 1
             observation = detector.look(scene).observation
             choices = legal_moves(observation)
-            found = executor.plan(scene, observation, choices[rng.integers(len(choices))], rng)
+            move = choices[rng.integers(len(choices))]
+            command = resolve_placement(move, observation, WORLD.exploration, rng)
+            found = executor.plan(scene, command) if command else None
             if isinstance(found, Plan):
                 plans.append((scene, found))
         for hold, jointed in (("JointHold", True), ("HexapodHold", False)):

@@ -206,7 +206,11 @@ def _verdict(judge: str, verdict: Verdict | CannotJudge) -> Line:
     return Line(f"{judge}: {words}", {"poses": poses, "shares": shares})
 
 
-def _episode(task: ExplorationTask, known: Sequence[SceneObject] = (), end: str = EpisodeEnd.GAVE_UP.value) -> list[Line]:
+def _episode(
+    task: ExplorationTask,
+    known: Sequence[SceneObject] = (),
+    end: str = EpisodeEnd.GAVE_UP.value,
+) -> list[Line]:
     """An episode.
 
     Args:

@@ -15,7 +15,6 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
 from drake_clutter.config import ClutterConfig
@@ -23,6 +22,7 @@ from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.full_knowledge import Solvability
 
 OUT = Path(__file__).parent / "results" / "come_apart.json"

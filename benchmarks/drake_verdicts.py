@@ -21,13 +21,13 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.records import recorded
-from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import config_yaml
 from drake_clutter.workers.mapping import map_ordered
 
@@ -173,9 +173,19 @@ class DrakeMoves:
         scene = settled_scene(laid_out(item.batch, item.index)[0], item.record)
         observation = self._detector.look(scene).observation
         move = random_move(observation, item)
-        outcome = self._executor.execute(scene, observation, move, move_rng(item))
+        rng = move_rng(item)
+        command = resolve_placement(move, observation, ClutterConfig().exploration, rng)
+        outcome = (
+            Outcome(MoveResult.NO_FREE_SPOT, scene)
+            if command is None
+            else self._executor.execute(
+                scene,
+                command,
+                rng,
+            )
+        )
         fall = outcome.instability
-        place = choose_placement(observation, move, ClutterConfig().exploration, move_rng(item))
+        place = command.X_TO_place if command else None
         return {
             "index": item.index,
             "draw": item.draw,

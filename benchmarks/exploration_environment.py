@@ -18,9 +18,9 @@ from rich.table import Table
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.resources import git_commit, shipped_path
-from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.tasks import clutter_exploration
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.tasks.episode import SteppedBackend
 
 SCENES = "training/scenes/sg_star_25.json"
 """Whose graphs are laid out anew; this set does not change."""
@@ -28,7 +28,7 @@ MOVE, SCENE = "a move", "a new scene"
 PARTS: dict[str, tuple[Any, str]] = {
     MOVE: (ClutterExploration, "step"),
     SCENE: (ClutterExploration, "reset"),
-    "of both: the move, judged": (FastExecutor, "execute"),
+    "of both: the move, judged": (SteppedBackend, "step"),
     "of both: the look": (RayDetector, "look"),
     "of both: the graph": (clutter_exploration, "exploration_graph"),
 }

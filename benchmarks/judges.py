@@ -32,15 +32,21 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Move, MoveResult
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import (
+    CannotJudge,
+    CannotJudgeReason,
+    Move,
+    MoveResult,
+    Outcome,
+)
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.statistics import wilson_interval
 
 MARGINS = (0.0005, 0.001, 0.0015, 0.00205, 0.0025, 0.003, 0.004)
 FRICTIONS = (0.0, 0.3, 0.5)
@@ -180,15 +186,26 @@ def compare_moves(batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[
         scene = settled_scene(laid_out(batch, item.index)[0], item.record)
         observation, _ = judge.rays.observe(scene)
         pick, place = record["move"]
-        outcome = executor.execute(scene, observation, Move(pick, place), move_rng(item))
+        rng = move_rng(item)
+        command = resolve_placement(Move(pick, place), observation, config.exploration, rng)
+        outcome = (
+            Outcome(MoveResult.NO_FREE_SPOT, scene)
+            if command is None
+            else executor.execute(
+                scene,
+                command,
+                rng,
+            )
+        )
         outcomes[outcome.result.value, record["result"]] += 1
         if outcome.result is not MoveResult.CANNOT_JUDGE and outcome.result.value != record["result"]:
             found = outcome.instability.reason.value if outcome.instability else outcome.result.value
             by_reason[f"fast: {found}"][f"drake: {record['fall'][0] if record['fall'] else record['result']}"] += 1
-        where = choose_placement(observation, Move(pick, place), config.exploration, move_rng(item))
-        if where is not None and record["place"] is not None:
+        if command is not None and record["place"] is not None:
             placed += 1
-            same_place += max(abs(a - b) for a, b in zip(where.translation, record["place"][:3], strict=True)) < 0.001
+            where = command.X_TO_place.translation
+            apart = (abs(a - b) for a, b in zip(where, record["place"][:3], strict=True))
+            same_place += max(apart) < 0.001
     judged = {pair: n for pair, n in outcomes.items() if pair[0] != MoveResult.CANNOT_JUDGE.value}
     equal, count = sum(n for (a, b), n in judged.items() if a == b), sum(judged.values())
     return {

@@ -26,10 +26,13 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def ratio_interval(
-    numerators: Sequence[float], denominators: Sequence[float]
+    numerators: Sequence[float],
+    denominators: Sequence[float],
 ) -> tuple[float, float]:
     """Return the interval of a ratio of sums over scenes, by bootstrap."""
     scenes = np.random.default_rng(0).integers(len(numerators), size=(2000, len(numerators)))
-    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(axis=1)
+    ratios = np.asarray(numerators)[scenes].sum(axis=1) / np.asarray(denominators)[scenes].sum(
+        axis=1,
+    )
     low, high = np.quantile(ratios, _TAILS).tolist()
     return low, high

@@ -17,7 +17,15 @@ from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig, load_config
 from drake_clutter.grammar import NodeBudget, Orientation, SceneGrammar, resting_rotation, uniform_choice
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.interfaces import (
+    Move,
+    MoveExecutor,
+    MoveResult,
+    Observation,
+    Outcome,
+)
 from drake_clutter.scenes.layout import lay_out
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
@@ -90,6 +98,20 @@ def training_script(name: str) -> ModuleType:
     sys.modules[name] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def executed(
+    executor: MoveExecutor,
+    scene: Scene,
+    observation: Observation,
+    move: Move,
+    generator: np.random.Generator,
+) -> Outcome:
+    """What an executor makes of a move, put where the observation shows a free place."""
+    command = resolve_placement(move, observation, WORLD.exploration, generator)
+    if command is None:
+        return Outcome(MoveResult.NO_FREE_SPOT, scene)
+    return executor.execute(scene, command, generator)
 
 
 def rng(seed: int = 0) -> np.random.Generator:

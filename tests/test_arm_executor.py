@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
+from conftest import DEFAULT_CELL, cell_with, executed, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -204,7 +204,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         resting("large_marker", xy=(0.2, 0.2)),
     )
     executor, observation = ArmExecutor(config), detector.look(scene).observation
-    placed = executor.execute(scene, observation, Move("gelatin_box"), rng())
+    placed = executed(executor, scene, observation, Move("gelatin_box"), rng())
     assert placed.result is MoveResult.PLACED
     assert placed.instability is None
     assert "mm" in placed.detail
@@ -212,7 +212,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
     assert placed.scene["pudding_box"].X_TO.p == pytest.approx(scene["pudding_box"].X_TO.p, abs=0.002)
     assert placed.motion
     for name, why in (("large_marker", "no seal"), ("pudding_box", "carries others")):
-        outcome = executor.execute(scene, observation, Move(name), rng())
+        outcome = executed(executor, scene, observation, Move(name), rng())
         assert outcome.result is MoveResult.NOT_PLANNED
         assert outcome.detail.startswith(why)
         assert outcome.scene == scene

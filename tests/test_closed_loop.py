@@ -1,9 +1,8 @@
 """The closed loop: the agent's decisions on scripted answers, and a whole episode in Drake."""
 
 import json
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,26 +10,25 @@ from conftest import DEFAULT_CELL, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from drake_clutter.agents.exploration import LargestClear
+from drake_clutter.agents.exploration import largest_clear
 from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
-from drake_clutter.config import ClutterConfig, upgrade
+from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
 from drake_clutter.files import InputError
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
-from drake_clutter.scenes.placement import choose_placement
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
-from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Finish, Phase, Request
+from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Phase
 from drake_clutter.systems.move_planner import Answer, MovePlanner
 from drake_clutter.systems.scenario import Scenario, policy_of
-from drake_clutter.systems.scene_perception import for_who_sees
-from drake_clutter.tasks.exploration import Decision, EpisodeEnd, legal_moves
-from drake_clutter.tasks.exploration_graph import seen
+from drake_clutter.tasks.belief import Belief, Decision, legal_moves
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.validation import load_typed
 
 COVERED = scene_of(
@@ -43,23 +41,18 @@ NO_SEAL = NoPlan(PlanFailure.NO_SEAL, "it")
 AFTER = RayCaster(ClutterConfig().cell.camera).observe(ASIDE)[0]
 
 
-def first_allowed(
-    known: Sequence[SceneObject],
-    observation: Observation,
-    tried: Sequence[Move],
-    rng: np.random.Generator,
-    failed: Sequence[Move],
-) -> Decision:
+def first_allowed(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
     """The first object in view to the tray, if that has not failed."""
-    moves = [Move(d.name) for d in observation.detections if Move(d.name) not in failed]
+    names = [d.name for d in observation.detections]
+    moves = [Move(name) for name in names if Move(name) not in belief.invalid_moves]
     return Decision(moves[0] if moves else None)
 
 
 class Bench:
     """An agent alone, its inputs given by hand."""
 
-    def __init__(self, max_moves: int = 5) -> None:
-        self.agent = ExplorationAgent(choose=first_allowed, track=None, max_moves=max_moves, seed=0)
+    def __init__(self) -> None:
+        self.agent = ExplorationAgent(policy=first_allowed, config=ExplorationConfig(), seed=0)
         self.simulator = Simulator(self.agent)
         self.time = 0.0
         self.give(BEFORE, Answer(), 0)
@@ -94,17 +87,18 @@ def test_it_looks_waits_rests_and_looks_again() -> None:
     assert state.phase is Phase.WAITING
     assert state.request is not None
     assert (state.request.number, state.request.move) == (1, Move("cracker_box"))
-    assert [o.name for o in state.known] == ["cracker_box"]
+    assert [o.name for o in state.belief.objects] == ["cracker_box"]
     bench.give(AFTER, Answer(1, a_plan()), 0)
     assert bench.after(5.0).phase is Phase.WAITING, "the arm has not come home"
     bench.give(AFTER, Answer(1, a_plan()), 1)
     state = bench.after(0.1)
-    assert (state.phase, state.tried, state.carried_out) == (Phase.LOOKING, (Move("cracker_box"),), 1)
-    assert [o.name for o in state.known] == ["cracker_box"], "it has not looked yet"
+    assert (state.phase, state.carried_out) == (Phase.LOOKING, 1)
+    assert state.belief.history == (Move("cracker_box"),)
+    assert [o.name for o in state.belief.objects] == ["cracker_box"], "it has not looked yet"
     state = bench.after(0.6)
     assert state.request is not None
     assert state.request.number == 2
-    assert {o.name: o.X_TO for o in state.known} == ASIDE.poses
+    assert {o.name: o.X_TO for o in state.belief.objects} == ASIDE.poses
 
 
 def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
@@ -112,11 +106,7 @@ def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
     bench.after(0.1)
     bench.give(BEFORE, Answer(1, NO_SEAL), 0)
     state = bench.after(0.2)
-    assert (state.phase, state.finish, state.failed) == (Phase.DONE, Finish.NOTHING_FEASIBLE, (Move("cracker_box"),))
-    bench = Bench(max_moves=1)
-    bench.after(0.1)
-    bench.give(AFTER, Answer(1, NO_SEAL), 0)
-    assert bench.after(0.2).finish is Finish.OUT_OF_MOVES
+    assert (state.phase, state.belief.invalid_moves) == (Phase.DONE, (Move("cracker_box"),))
 
 
 def test_what_the_cup_did_not_get_is_left_alone() -> None:
@@ -124,20 +114,25 @@ def test_what_the_cup_did_not_get_is_left_alone() -> None:
     bench.after(0.1)
     bench.give(BEFORE, Answer(1, a_plan()), 1)
     state = bench.after(0.8)
-    assert (state.carried_out, state.failed) == (1, (Move("cracker_box"),)), "it is seen where it was"
-    assert state.finish is Finish.NOTHING_FEASIBLE
+    assert state.carried_out == 1
+    assert state.belief.invalid_moves == (Move("cracker_box"),), "it is seen where it was"
+    assert state.phase is Phase.DONE
 
 
-def test_nothing_is_said_of_what_is_lost() -> None:
-    given = list[Sequence[Move]]()
-
-    def choose(known: Any, observation: Any, tried: Any, rng: Any, failed: Sequence[Move]) -> Decision:
-        given.append(failed)
-        return Decision(None)
-
-    agent = ExplorationAgent(choose=choose, track=None, max_moves=3, seed=0)
-    agent.decided(AgentState(failed=(Move("lost"), Move("cracker_box", "lost"), Move("cracker_box"))), BEFORE)
-    assert given == [(Move("cracker_box"),)]
+def test_what_is_lost_is_forgotten() -> None:
+    """And with it what failed: where it is found again, it has another name."""
+    failed = MoveResult.NOT_PLANNED
+    belief = Belief().update(AFTER).record(Move("gelatin_box"), failed)
+    belief = belief.record(Move("cracker_box"), failed)
+    agent = ExplorationAgent(
+        policy=lambda *_: Decision(None),
+        config=ExplorationConfig(),
+        seed=0,
+        tracker=lambda known, observation: (observation, ("gelatin_box",)),
+    )
+    after = agent.decided(AgentState(belief=belief), BEFORE).belief
+    assert [o.name for o in after.objects] == ["cracker_box"]
+    assert after.invalid_moves == (Move("cracker_box"),)
 
 
 def test_a_cloned_agent_goes_on_the_same() -> None:
@@ -152,11 +147,12 @@ def test_a_cloned_agent_goes_on_the_same() -> None:
     assert other.request is not None
     assert other.request.number == state.request.number == 2
     assert other.request.move == state.request.move
-    assert (other.tried, other.failed, other.phase) == (state.tried, state.failed, state.phase)
+    assert (other.belief.history, other.phase) == (state.belief.history, state.phase)
+    assert other.belief.invalid_moves == state.belief.invalid_moves
 
 
 def test_what_was_seen_stays_known() -> None:
-    known = seen(seen((), AFTER), BEFORE)
+    known = Belief().update(AFTER).update(BEFORE).objects
     assert {o.name: o.X_TO for o in known} == COVERED.poses, "the box under the other one is where it was seen"
 
 
@@ -182,7 +178,7 @@ def test_the_planner_answers_each_request_once() -> None:
     assert asked == [1]
     found: Answer = planner.GetOutputPort("answer").Eval(context)
     assert (found.number, found.plan) == (1, plan)
-    planner.GetInputPort("request").FixValue(context, type(request)(2, *(request.move, AFTER, request.known, request.decision)))
+    planner.GetInputPort("request").FixValue(context, replace(request, number=2))
     simulator.AdvanceTo(1.0)
     found = planner.GetOutputPort("answer").Eval(context)
     assert (found.number, found.plan) == (2, NO_SEAL)
@@ -192,32 +188,40 @@ def test_the_planner_answers_each_request_once() -> None:
 def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     """A marker, which no cup can hold, is refused; the cover goes aside, and the box below it is found."""
     scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.support)
-    agent, names = LargestClear(), list[str]()
+    names = list[str]()
 
-    def marker_first(known: Sequence[SceneObject], observation: Observation, tried: Sequence[Move], *others: Any) -> Decision:
-        names.append(",".join(o.name for o in known))
-        return Decision(Move("large_marker")) if not tried else agent.choose(observation, tried, *others)
+    def marker_first(
+        belief: Belief,
+        observation: Observation,
+        rng: np.random.Generator,
+    ) -> Decision:
+        names.append(",".join(o.name for o in belief.objects))
+        if not belief.history:
+            return Decision(Move("large_marker"))
+        return largest_clear(belief, observation, rng)
 
-    loop = ClosedLoop(scene, marker_first, max_moves=4, seed=0, world=config)
-    timing = loop.run(record=True)
-    assert [step.outcome.result for step in loop.task.steps] == [MoveResult.NOT_PLANNED, MoveResult.PLACED]
-    assert loop.task.steps[0].outcome.detail == "no seal: large_marker"
-    placed = loop.task.steps[1]
+    loop = ClosedLoop(scene, seed=0, world=config, record=True)
+    task = run_episode(loop, marker_first, max_moves=4)
+    timing = loop.timing
+    results = [step.outcome.result for step in task.steps]
+    assert results == [MoveResult.NOT_PLANNED, MoveResult.PLACED]
+    assert task.steps[0].outcome.detail == "no seal: large_marker"
+    placed = task.steps[1]
     assert (placed.move, placed.newly_found) == (Move("cracker_box"), ("gelatin_box",))
     assert placed.outcome.motion[0].arm is not None
     assert max(frame.time for frame in placed.outcome.motion) > 2
-    assert loop.task.end is EpisodeEnd.ALL_FOUND
+    assert task.end is EpisodeEnd.ALL_FOUND
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
     assert 3 < timing.robot < 15
-    fields = write(tmp_path, Scenario(agent="largest-clear"), loop.task, timing, "A test")
+    fields = write(tmp_path, Scenario(agent="largest-clear"), task, timing, "A test")
     assert (fields["success"], fields["ended"]) == (True, "all found")
     assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
     assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
 
 
 def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:
-    task, timing = play(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
-    assert (task.end, timing.end) == (EpisodeEnd.ALL_FOUND, "")
+    task, _ = play(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
+    assert task.end is EpisodeEnd.ALL_FOUND
 
 
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
@@ -230,7 +234,7 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
         policy_of("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):
         scenario_scene(Scenario(scene=str(tmp_path / "none.yaml")))
-    move = policy_of("largest-clear", config)((), BEFORE, (), np.random.default_rng(0), ()).move
+    move = policy_of("largest-clear", config)(Belief(), BEFORE, rng(0)).move
     assert move == Move("cracker_box")
 
 
@@ -245,29 +249,31 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
     descent: float, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(closed_loop, "GUARDED", PlannerConfig(descent=descent, above=0.007))
-    loop = ClosedLoop(COVERED, first_allowed, perceive=lambda *_: BEFORE, max_moves=1, seed=0, world=config)
-    move, known = Move("cracker_box"), seen((), BEFORE)
-    plan = loop._plan(Request(1, move, BEFORE, known, Decision(move)), rng(0))
+    loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
+    loop.agent.policy = first_allowed
+    request = loop.agent.decided(AgentState(), BEFORE).request
+    assert request is not None
+    assert request.command is not None
+    plan = loop._plan(request, rng(0))
     assert isinstance(plan, Plan)
-    place = choose_placement(BEFORE, move, for_who_sees(config).exploration, rng(0))
-    assert place is not None
-    above = plan.X_TO_place.translation[2] - place.translation[2]
+    above = plan.X_TO_place.translation[2] - request.command.X_TO_place.translation[2]
     assert above == pytest.approx(0.007 if descent else 0.0)
     assert (plan.depth >= 0.007) == (descent > 0)
 
 
 def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:
     """No cup holds the marker, the gelatin box carries it, and on neither there is room for the can."""
-    given = list[Sequence[Move]]()
+    given = list[Belief]()
 
-    def choose(known: Sequence[SceneObject], _: Observation, tried: Any, rng: Any, failed: Sequence[Move]) -> Decision:
-        given.append(failed)
+    def policy(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+        given.append(belief)
         return Decision(None)
 
     box = resting("gelatin_box", xy=(-0.1, 0.0))
     marker, can = resting("large_marker", xy=(-0.1, 0.0), floor=box.top), resting("tomato_soup_can", xy=(0.2, 0.2))
-    loop = ClosedLoop(scene_of(box, marker, can), choose, max_moves=3, seed=0, world=config)
-    observation = loop.task.first_look.observation
-    assert loop.agent.decided(AgentState(), observation).finish is Finish.NOTHING_FEASIBLE
-    allowed = set(legal_moves(observation)) - set(given[0])
+    loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
+    loop.agent.policy = policy
+    observation = loop.look.observation
+    assert loop.agent.decided(AgentState(), observation).phase is Phase.DONE
+    allowed = set(legal_moves(observation)) - set(given[0].invalid_moves)
     assert allowed == {Move(can.name)}

@@ -16,20 +16,23 @@ from conftest import CATALOGUE, DEFAULT_CELL, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
+from drake_clutter.agents.backends import FIDELITIES, backends
 from drake_clutter.agents.cloning import Cloning, CloningConfig
-from drake_clutter.agents.exploration import make_explorers, play
+from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
-from drake_clutter.scenes.interfaces import Move, MoveResult
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
+from drake_clutter.scenes.placement import free_places
 from drake_clutter.scenes.scene import TRAY, Pose
 from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
+from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd, legal_moves
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.exploration_graph import FEATURES
 
 ROOT = Path(__file__).parents[1]
@@ -90,7 +93,7 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> No
             moves = [Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()]
             legal = set(legal_moves(environment.task.look.observation))
             assert len(moves) == len(set(moves))
-            assert set(moves) == legal - set(environment.task.failed)
+            assert set(moves) == legal - set(environment.backend.belief.invalid_moves)
             shown = environment.task.scene.names if privileged else tuple(sorted(environment.task.known))
             assert (known if privileged else tuple(sorted(known))) == shown
             observation, reward, over, out_of_moves, info = environment.step(random_move(observation, draw))
@@ -128,9 +131,9 @@ def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneSet) -> Non
     assert len(environment.task.steps) == 1
 
 
-@pytest.mark.parametrize("fidelity", sorted(EXECUTORS))
+@pytest.mark.parametrize("fidelity", FIDELITIES)
 def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
-    environment = ClutterExploration(scenes, fidelity=fidelity)
+    environment = ClutterExploration(scenes, fidelity=backends(fidelity, ClutterConfig()))
     before, _ = environment.reset(options={"scene": 2})
     height = before["feature"][:, FEATURES.index("z")]
     highest = max(np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node]))
@@ -159,6 +162,15 @@ def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
         ClutterExploration(scenes, most_objects=2).reset(options={"scene": 0})
     with pytest.raises(InputError, match="scene: 3; allowed is 0 to 2"):
         ClutterExploration(scenes).reset(options={"scene": 3})
+
+
+def test_the_environment_needs_no_arm() -> None:
+    code = "import sys, drake_clutter.tasks.clutter_exploration; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    loaded = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert "drake_clutter.tasks.clutter_exploration" in loaded
+    arm = ("drake_clutter.station", "drake_clutter.planning")
+    assert [name for name in loaded if name.startswith(arm)] == []
 
 
 # --- Learning ---
@@ -283,12 +295,11 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Pa
     # What was written plays.
     environment = ClutterExploration(file, max_moves=4)
     environment.reset(options={"scene": 0})
-    agent = make_explorers(str(tmp_path / "whole" / "explorer.safetensors"), ClutterConfig())(environment.task)
-    play(environment.task, agent, np.random.default_rng(0))
-    decision = environment.task.steps[0].decision
-    assert decision is not None
+    make_policy = make_explorers(str(tmp_path / "whole" / "explorer.safetensors"), ClutterConfig())
+    task = run_episode(environment.backend, make_policy(environment.backend), max_moves=4)
+    decision = task.steps[0].decision
     assert sum(decision.picks.values()) == pytest.approx(1, abs=1e-5)
-    assert set(decision.picks) == {d.name for d in environment.task.first_look.observation.detections}
+    assert set(decision.picks) == {d.name for d in task.first_look.observation.detections}
     everything = set(environment.task.start.names)
     assert (set(decision.known) == everything) == (script == "train_explorer")
 
@@ -328,9 +339,9 @@ def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
     save_checkpoint(path, ExplorerNetwork(2, 8), {"kind": STUDENT, "network": about_explorer({TRAY: 1, "sugar_box": 2}, 8)})
     environment = ClutterExploration(file)
     environment.reset(options={"scene": 0})
-    agent = make_explorers(str(path), ClutterConfig())(environment.task)
+    agent = make_explorers(str(path), ClutterConfig())(environment.backend)
     with pytest.raises(InputError, match="was not trained with"):
-        play(environment.task, agent, np.random.default_rng(0))
+        run_episode(environment.backend, agent, max_moves=1)
 
 
 def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig) -> None:
@@ -338,31 +349,35 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
     scenes = ROOT / "training/scenes/sg_star_40.json"
     environment = ClutterExploration(scenes, config=config, max_moves=20, most_objects=39)
     explorers = make_explorers("student", config)
-    rng, on_the_tray = np.random.default_rng(0), set()
+    on_the_tray = set()
     for number in range(3):
         environment.reset(options={"scene": number})
-        task = environment.task
-        agent = explorers(task)
-        while task.end is None:
-            observation = task.look.observation
-            decision = agent.choose(observation, [step.move for step in task.steps], rng, task.failed)
+        agent = explorers(environment.backend)
+
+        def checked(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+            decision = agent(belief, observation, rng)  # noqa: B023, called in this round
             move = decision.move
-            assert sum(decision.picks.values()) in (0, pytest.approx(1)), "as the network had it, without room or with"
-            room = {m for m in legal_moves(observation) if choose_placement(observation, m, config.exploration, rng)}
+            likelihood = sum(decision.picks.values())
+            assert likelihood in (0, pytest.approx(1)), "as the network had it, with room or not"
+            legal = legal_moves(observation)
+            room = {m for m in legal if free_places(observation, m, config.exploration)}
             if move is None:
                 assert not room
-                break
+                return decision
             assert move in room
             assert move.place == TRAY or Move(move.pick, TRAY) not in room
             on_the_tray.add(move.place == TRAY)
-            task.step(move, rng)
+            return decision
+
+        run_episode(environment.backend, checked, max_moves=20)
     assert on_the_tray == {True, False}
 
 
 def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig) -> None:
     environment = ClutterExploration(scenes, max_moves=20)
     environment.reset(options={"scene": 1})
-    play(environment.task, make_explorers("full-knowledge", config)(environment.task), np.random.default_rng(0))
-    assert environment.task.hidden_at_start
-    assert environment.task.end is EpisodeEnd.ALL_FOUND
-    assert environment.task.steps[-1].newly_found
+    policy = make_explorers("full-knowledge", config)(environment.backend)
+    task = run_episode(environment.backend, policy, max_moves=20)
+    assert task.hidden_at_start
+    assert task.end is EpisodeEnd.ALL_FOUND
+    assert task.steps[-1].newly_found

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of, world_with
+from conftest import executed, resting, rng, scene_of, world_with
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import deepest_penetration
-from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
+from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
@@ -30,7 +30,7 @@ def executor(config: ClutterConfig) -> SettleExecutor:
 
 
 def carried_out(executor: SettleExecutor, detector: LabelDetector, scene: Scene, move: Move, seed: int = 0) -> Outcome:
-    return executor.execute(scene, detector.look(scene).observation, move, rng(seed))
+    return executed(executor, scene, detector.look(scene).observation, move, rng(seed))
 
 
 def how_far(before: Scene, after: Scene, name: str) -> float:
@@ -63,7 +63,9 @@ def test_onto_another_object(executor: SettleExecutor, detector: LabelDetector) 
 def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecutor) -> None:
     """More than the margin within which objects are simulated together."""
     start = STACKS["on the can"].X_TO
-    outcome = executor.put(STACKS, "on the can", start.moved((0.0, 0.0, 0.005)), rng(0))
+    raised = start.moved((0.0, 0.0, 0.005))
+    command = PickPlaceCommand(Move("on the can", "can"), start, raised)
+    outcome = executor.execute(STACKS, command, rng(0))
     assert outcome.result is MoveResult.PLACED
     assert outcome.scene["on the can"].X_TO.p[2] == pytest.approx(start.p[2], abs=0.001)
 
@@ -76,7 +78,10 @@ def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
     scene = scene_of(
         neighbour, resting("tomato_soup_can", xy=(beside, 0.0)), replace(picked, X_TO=picked.X_TO.moved((beside, 0.0, 0.0)))
     )
-    outcome = executor.put(scene, "picked", scene["picked"].X_TO.moved((0.0, 0.0, 0.005)), rng(0))
+    start = scene["picked"].X_TO
+    raised = start.moved((0.0, 0.0, 0.005))
+    command = PickPlaceCommand(Move("picked", "tomato_soup_can"), start, raised)
+    outcome = executor.execute(scene, command, rng(0))
     assert outcome.result is MoveResult.PLACED
     assert outcome.scene["picked"].X_TO.p[2] == pytest.approx(scene["picked"].X_TO.p[2], abs=0.001)
 
@@ -88,7 +93,7 @@ def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExe
     if pick not in {d.name for d in observation.detections}:  # the can is all but covered: seen here by an open-minded detector
         config = world_with("camera.visibility_threshold=0")
         observation = LabelDetector(config.cell.camera).look(STACKS).observation
-    outcome = executor.execute(scene, observation, Move(pick), rng())
+    outcome = executed(executor, scene, observation, Move(pick), rng())
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
     assert outcome.instability.object == falls

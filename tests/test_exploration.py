@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,17 +10,27 @@ from conftest import CLASSES, DEFAULT_CELL, resting, rng, scene_of
 
 from drake_clutter.agents.exploration import (
     BASELINES,
-    Explorer,
-    LargestClear,
-    LargestFirst,
-    RandomExplorer,
+    largest_clear,
+    largest_first,
+    random_explorer,
 )
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.interfaces import Detection, Instability, InstabilityReason, Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.interfaces import (
+    Detection,
+    Instability,
+    InstabilityReason,
+    Move,
+    MoveExecutor,
+    MoveResult,
+    Observation,
+    Outcome,
+    PickPlaceCommand,
+)
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
+from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
+from drake_clutter.tasks.episode import SteppedBackend, run_episode, teleport_backends
+from drake_clutter.tasks.exploration import Attempt, EpisodeEnd, ExplorationTask, Step
 
 # Two covers, one with two objects below it, one with one; and a marker in the open.
 HIDING = scene_of(
@@ -40,38 +51,63 @@ class Scripted:
     def __init__(self, *results: MoveResult) -> None:
         self._results = iter(results)
 
-    def execute(self, scene: Scene, observation: Observation, move: Move, generator: np.random.Generator) -> Outcome:
+    def execute(
+        self,
+        scene: Scene,
+        command: PickPlaceCommand,
+        generator: np.random.Generator,
+    ) -> Outcome:
         result = next(self._results)
-        if result is MoveResult.NO_FREE_SPOT:
+        if not result.carried_out:
             return Outcome(result, scene)
-        moved = scene.at({move.pick: resting("cracker_box", xy=ASIDE[move.pick]).X_TO})
+        pick = command.move.pick
+        moved = scene.at({pick: resting("cracker_box", xy=ASIDE[pick]).X_TO})
         fallen = Instability(InstabilityReason.SLID, "g1", 0.02, 0.0) if result is MoveResult.COLLAPSED else None
         return Outcome(result, moved, fallen)
 
 
-def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) -> ExplorationTask:
-    return ExplorationTask(HIDING, Scripted(*results), detector, REWARDS, max_moves)
+class Episode:
+    """An episode on a backend, move by move."""
+
+    def __init__(
+        self,
+        executor: MoveExecutor,
+        detector: LabelDetector,
+        max_moves: int = 10,
+    ) -> None:
+        self.backend = SteppedBackend(executor, detector, REWARDS, HIDING, rng())
+        self.task = ExplorationTask(HIDING, self.backend.look, REWARDS, max_moves)
+
+    def step(self, move: Move) -> Step:
+        outcome = self.backend.step(move)
+        self.backend.update_belief()
+        return self.task.note(Attempt(Decision(move), outcome, self.backend.look))
+
+
+def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) -> Episode:
+    return Episode(Scripted(*results), detector, max_moves)
 
 
 def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
-    task = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_SPOT, MoveResult.PLACED)
+    game = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_SPOT, MoveResult.PLACED)
+    task = game.task
     at_first = task.known
     assert at_first == ("cover 1", "cover 2", "marker")
     assert task.hidden_at_start == ("g1", "g2", "p")
     assert (task.found, task.end) == ((), None)
 
-    first = task.step(Move("cover 1"), rng())
+    first = game.step(Move("cover 1"))
     assert (first.newly_found, first.reward) == (("g1", "g2"), 4.0)
     assert task.known == (*at_first, "g1", "g2")
     assert (task.found, task.end) == (("g1", "g2"), None)
 
     look = task.look
-    second = task.step(Move("cover 2"), rng())
+    second = game.step(Move("cover 2"))
     assert (second.newly_found, second.reward) == ((), 0.0)
     assert task.look is look
     assert task.end is None
 
-    third = task.step(Move("cover 2"), rng())
+    third = game.step(Move("cover 2"))
     assert (third.newly_found, third.reward) == (("p",), 2.0)
     assert task.end is EpisodeEnd.ALL_FOUND
     assert task.found == task.hidden_at_start
@@ -82,42 +118,46 @@ def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
 
 
 def test_what_a_collapse_uncovers_does_not_count(detector: LabelDetector) -> None:
-    task = episode(detector, MoveResult.PLACED, MoveResult.COLLAPSED)
-    task.step(Move("cover 2"), rng())
+    game = episode(detector, MoveResult.PLACED, MoveResult.COLLAPSED)
+    task = game.task
+    game.step(Move("cover 2"))
     known = task.known
-    step = task.step(Move("cover 1"), rng())
+    step = game.step(Move("cover 1"))
     assert {"g1", "g2"} <= {d.name for d in step.look.observation.detections}
     assert (step.newly_found, step.reward) == ((), -5.0)
     assert task.known == known
     assert task.found == ("p",)
     assert task.end is EpisodeEnd.COLLAPSED
     with pytest.raises(ValueError, match="collapsed"):
-        task.step(Move("marker"), rng())
+        task.note(Attempt(Decision(Move("marker")), step.outcome, step.look))
 
 
 def test_out_of_moves_counts_moves_that_could_not_be_carried_out(detector: LabelDetector) -> None:
-    task = episode(detector, *[MoveResult.NO_FREE_SPOT] * 2, max_moves=2)
+    game = episode(detector, *[MoveResult.NO_FREE_SPOT] * 2, max_moves=2)
+    task = game.task
     for _ in range(2):
         assert task.end is None
-        task.step(Move("cover 1"), rng())
+        game.step(Move("cover 1"))
     assert task.end is EpisodeEnd.OUT_OF_MOVES
 
 
 def test_all_found_on_the_last_move_is_a_success(detector: LabelDetector) -> None:
-    task = episode(detector, MoveResult.PLACED, MoveResult.PLACED, max_moves=2)
-    task.step(Move("cover 1"), rng())
-    task.step(Move("cover 2"), rng())
+    game = episode(detector, MoveResult.PLACED, MoveResult.PLACED, max_moves=2)
+    task = game.task
+    game.step(Move("cover 1"))
+    game.step(Move("cover 2"))
     assert task.end is EpisodeEnd.ALL_FOUND
 
 
 def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
     """The cover is put back over what it hid."""
-    task = episode(detector, MoveResult.PLACED, MoveResult.PLACED)
-    task.step(Move("cover 1"), rng())
+    game = episode(detector, MoveResult.PLACED, MoveResult.PLACED)
+    task = game.task
+    game.step(Move("cover 1"))
     known = task.known
     back = ASIDE | {"cover 1": (-0.2, 0.0)}
-    task.scene = HIDING.at({"cover 2": resting("cracker_box", xy=back["cover 2"]).X_TO})
-    step = task.step(Move("cover 2"), rng())
+    game.backend.scene = HIDING.at({"cover 2": resting("cracker_box", xy=back["cover 2"]).X_TO})
+    step = game.step(Move("cover 2"))
     assert "g1" not in {d.name for d in step.look.observation.detections}
     assert task.known == (*known, "p")
     assert step.newly_found == ("p",)
@@ -125,15 +165,16 @@ def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
 
 def test_nothing_hidden_is_found_at_once(detector: LabelDetector) -> None:
     scene = scene_of(resting("large_marker", name="marker"))
-    task = ExplorationTask(scene, Scripted(), detector, REWARDS, 10)
+    task = ExplorationTask(scene, detector.look(scene), REWARDS, 10)
     assert (task.end, task.hidden_at_start, task.found) == (EpisodeEnd.ALL_FOUND, (), ())
 
 
 def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
-    task = episode(detector)
+    game = episode(detector)
     with pytest.raises(ValueError, match="allowed is to put an object on another one or on tray"):
-        task.step(Move("marker", "marker"), rng())
-    assert task.steps == []
+        game.step(Move("marker", "marker"))
+    assert game.task.steps == []
+    assert game.backend.belief.history == ()
 
 
 def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> None:
@@ -147,19 +188,99 @@ def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> N
     assert legal_moves(replace(observation, detections=())) == []
 
 
-def test_a_real_episode(detector: LabelDetector, config: ClutterConfig) -> None:
-    """Largest-clear takes both covers away, the one nearer to the camera first, and everything is found. Drake settles."""
-    task = ExplorationTask(HIDING, SettleExecutor(config), detector, config.exploration, 4)
-    agent = LargestClear()
-    while task.end is None:
-        move = agent.choose(task.look.observation, [step.move for step in task.steps], rng(1)).move
-        assert move in legal_moves(task.look.observation)
-        before = task.known
-        task.step(move, rng(len(task.steps)))
-        assert task.known[: len(before)] == before
+def test_a_real_episode(config: ClutterConfig) -> None:
+    """Largest-clear takes both covers away, the one nearer to the camera first. Drake settles."""
+    backend, seen = teleport_backends("settle", config)(HIDING, rng(1)), list[tuple[str, ...]]()
+
+    def policy(
+        belief: Belief,
+        observation: Observation,
+        generator: np.random.Generator,
+    ) -> Decision:
+        seen.append(tuple(o.name for o in belief.objects))
+        return largest_clear(belief, observation, generator)
+
+    reported = list[Step]()
+    task = run_episode(backend, policy, max_moves=4, report=reported.append)
     assert task.end is EpisodeEnd.ALL_FOUND
     assert [step.move.pick for step in task.steps] == ["cover 2", "cover 1"]
     assert sum(step.reward for step in task.steps) == 3.0
+    assert reported == task.steps
+    seen.append(tuple(o.name for o in backend.belief.objects))
+    assert set(seen[-1]) == set(task.known) == set(HIDING.names)
+    assert all(after[: len(before)] == before for before, after in pairwise(seen))
+    assert backend.belief.history == tuple(step.move for step in task.steps)
+
+
+def scripted(*moves: Move) -> Policy:
+    """Make these moves, then none."""
+    return lambda belief, *_: Decision(dict(enumerate(moves)).get(len(belief.history)))
+
+
+def test_an_episode_ends_when_the_policy_has_no_move(detector: LabelDetector) -> None:
+    game = episode(detector, MoveResult.NOT_PLANNED)
+    task = run_episode(game.backend, scripted(Move("cover 1")), max_moves=5)
+    assert ([step.move for step in task.steps], task.end) == ([Move("cover 1")], None)
+    assert game.backend.belief.invalid_moves == (Move("cover 1"),)
+
+
+def test_chosen_moves_go_on_when_all_is_found_but_not_after_a_collapse(
+    detector: LabelDetector,
+) -> None:
+    moves = [Move("cover 1"), Move("cover 2"), Move("cover 1"), Move("cover 2")]
+    results = [MoveResult.PLACED] * 2 + [MoveResult.COLLAPSED]
+    for until_all_found, made in ((True, 2), (False, 3)):
+        game = episode(detector, *results)
+        task = run_episode(
+            game.backend,
+            scripted(*moves),
+            max_moves=4,
+            until_all_found=until_all_found,
+        )
+        assert len(task.steps) == made
+
+
+# --- Belief ---
+
+
+def test_invalid_moves_are_those_since_anything_last_changed(detector: LabelDetector) -> None:
+    refused, placed = MoveResult.NOT_PLANNED, MoveResult.PLACED
+    game = episode(detector, refused, refused, placed, refused, MoveResult.DROPPED)
+    one, two = Move("cover 1"), Move("cover 2")
+    invalid = list[tuple[Move, ...]]()
+    for move in (one, two, one, two, two):
+        game.step(move)
+        invalid.append(game.backend.belief.invalid_moves)
+    assert invalid == [(one,), (one, two), (), (two,), ()]
+    assert game.backend.belief.history == (one, two, one, two, two)
+
+
+def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) -> None:
+    """All its moves are invalid then, and what failed before stays so."""
+    before = detector.look(HIDING).observation
+    belief = Belief().update(before).record(Move("marker"), MoveResult.NOT_PLANNED)
+    place = Pose((-0.2, 0.25, 0.1), HIDING["cover 1"].X_TO.quaternion)
+    placed = belief.record(Move("cover 1"), MoveResult.PLACED, place)
+    assert {o.name: o.X_TO for o in placed.objects}["cover 1"] == place, "until it is seen"
+    stuck = placed.update(before)
+    its = tuple(move for move in legal_moves(before) if move.pick == "cover 1")
+    assert stuck.invalid_moves == (Move("marker"), *its)
+    assert stuck.update(before) == stuck
+    aside = HIDING.at({"cover 1": resting("cracker_box", xy=ASIDE["cover 1"]).X_TO})
+    assert placed.update(detector.look(aside).observation).invalid_moves == ()
+    unseen = replace(before, detections=())
+    assert placed.update(unseen).invalid_moves == ()
+    assert {o.name: o.X_TO for o in placed.update(unseen).objects}["cover 1"] == place
+
+
+def test_nothing_is_said_of_what_is_lost(detector: LabelDetector) -> None:
+    belief = Belief().update(detector.look(HIDING).observation)
+    for move in (Move("marker"), Move("cover 1", "marker"), Move("cover 1")):
+        belief = belief.record(move, MoveResult.NOT_PLANNED)
+    left = belief.forget(["marker"])
+    assert {o.name for o in left.objects} == {"cover 1", "cover 2"}
+    assert left.invalid_moves == (Move("cover 1"),)
+    assert left.history == belief.history
 
 
 # --- Agents ---
@@ -177,14 +298,14 @@ def imagined(*detections: tuple[str, str, int]) -> Observation:
     return Observation(depth, tuple(found), camera, DEFAULT_CELL.support)
 
 
-def sweep(agent: Explorer, observation: Observation, count: int) -> list[str]:
-    """The objects that an agent picks one after the other; all go to the tray."""
-    tried: list[Move] = []
+def sweep(policy: Policy, observation: Observation, count: int) -> list[str]:
+    """The objects that a policy picks one after the other; all go to the tray."""
+    tried: tuple[Move, ...] = ()
     for _ in range(count):
-        move = agent.choose(observation, tried, rng()).move
+        move = policy(Belief(history=tried), observation, rng()).move
         assert move is not None
         assert move.place == TRAY
-        tried.append(move)
+        tried = (*tried, move)
     return [move.pick for move in tried]
 
 
@@ -197,19 +318,19 @@ def test_largest_first_goes_by_volume_and_repeats_only_after_a_sweep() -> None:
         ("k", "master_chef_can", 1),
     )
     order = ["c", "k", "a", "b", "m"]  # 2.2, 1.1, 0.59, 0.59 and 0.03 litres; of two alike the first by name
-    assert sweep(LargestFirst(), observation, 12) == [*order, *order, "c", "k"]
+    assert sweep(largest_first, observation, 12) == [*order, *order, "c", "k"]
 
 
 def test_what_comes_into_view_is_picked_before_a_repeat() -> None:
     observation = imagined(("c", "cracker_box", 20), ("k", "master_chef_can", 1), ("m", "large_marker", 900))
-    tried = [Move("c"), Move("k", "c"), Move("gone")]
-    assert LargestFirst().choose(observation, tried, rng()).move == Move("m")
+    tried = (Move("c"), Move("k", "c"), Move("gone"))
+    assert largest_first(Belief(history=tried), observation, rng()).move == Move("m")
 
 
 def test_largest_clear_goes_by_pixels() -> None:
     observation = imagined(("m", "large_marker", 900), ("b", "sugar_box", 10), ("a", "gelatin_box", 10), ("c", "cracker_box", 20))
     order = ["m", "c", "a", "b"]
-    assert sweep(LargestClear(), observation, 6) == [*order, "m", "c"]
+    assert sweep(largest_clear, observation, 6) == [*order, "m", "c"]
 
 
 def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) -> None:
@@ -218,14 +339,14 @@ def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) ->
         resting("pudding_box", xy=(0.2, 0.2), name="aside"),
     )
     observation = detector.look(scene).observation
-    assert sweep(LargestFirst(), observation, 3) == ["below", "aside", "on it"]
-    assert sweep(LargestClear(), observation, 3) == ["aside", "on it", "aside"]
+    assert sweep(largest_first, observation, 3) == ["below", "aside", "on it"]
+    assert sweep(largest_clear, observation, 3) == ["aside", "on it", "aside"]
 
 
 def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> None:
     observation = detector.look(HIDING).observation
     covered = replace(observation, depth=np.full_like(observation.depth, 0.5))
-    move = LargestClear().choose(covered, [], rng()).move
+    move = largest_clear(Belief(), covered, rng()).move
     assert move is not None
     pixels = {d.name: int(d.mask.sum()) for d in observation.detections}
     assert pixels[move.pick] == max(pixels.values())
@@ -234,7 +355,7 @@ def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> 
 def test_random_is_uniform_over_the_legal_moves() -> None:
     observation = imagined(("a", "sugar_box", 1), ("b", "sugar_box", 1), ("c", "sugar_box", 1))
     generator = rng(0)
-    drawn = Counter(RandomExplorer().choose(observation, [], generator).move for _ in range(1800))
+    drawn = Counter(random_explorer(Belief(), observation, generator).move for _ in range(1800))
     moves = legal_moves(observation)
     assert set(drawn) == set(moves)
     expected = 1800 / len(moves)
@@ -245,16 +366,16 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
 def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
     observation = detector.look(HIDING).observation
 
-    def choices(seed: int) -> list[Move]:
-        agent, generator = BASELINES[name](), rng(seed)
-        tried: list[Move] = []
+    def choices(seed: int) -> tuple[Move, ...]:
+        policy, generator = BASELINES[name], rng(seed)
+        tried: tuple[Move, ...] = ()
         for _ in range(8):
-            move = agent.choose(observation, tried, generator).move
+            move = policy(Belief(history=tried), observation, generator).move
             assert move is not None
             assert move in legal_moves(observation)
-            tried.append(move)
+            tried = (*tried, move)
         return tried
 
     assert choices(3) == choices(3)
     nothing = replace(observation, detections=())
-    assert BASELINES[name]().choose(nothing, [], rng()).move is None
+    assert BASELINES[name](Belief(), nothing, rng()).move is None

@@ -13,7 +13,13 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.stability.visibility import RayCaster
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GraphObservation, exploration_graph, seen
+from drake_clutter.tasks.belief import Belief
+from drake_clutter.tasks.exploration_graph import (
+    EDGE_KINDS,
+    FEATURES,
+    GraphObservation,
+    exploration_graph,
+)
 
 NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
 RAYS = RayCaster(ClutterConfig().cell.camera)
@@ -100,7 +106,7 @@ def test_what_has_failed_is_not_tried_again() -> None:
 def test_something_must_carry_a_box_that_floats() -> None:
     """K_t lacks the marker, which has never been in view: the box above it lies 18 mm over the tray."""
     observation = RAYS.observe(SCENE)[0]
-    known = seen((), observation)
+    known = Belief().update(observation).objects
     assert [o.name for o in known] == ["cracker_box", "tomato_soup_can", "close", "far"]
     graph = exploration_graph(known, observation, (), NUMBERS)
     heights = [feature(graph, k, "unexplained_height") for k in range(1, 5)]
@@ -109,7 +115,8 @@ def test_something_must_carry_a_box_that_floats() -> None:
 
 def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
     covered = SCENE.at({"large_marker": resting("large_marker", xy=(0.0, 0.3)).X_TO})
-    known = seen(seen((), RAYS.observe(covered)[0]), RAYS.observe(SCENE)[0])
+    belief = Belief().update(RAYS.observe(covered)[0]).update(RAYS.observe(SCENE)[0])
+    known = belief.objects
     assert known[0].name == "large_marker"
     assert {o.name: o.X_TO for o in known}["large_marker"] == covered["large_marker"].X_TO
     graph = exploration_graph(known, RAYS.observe(SCENE)[0], (), NUMBERS)

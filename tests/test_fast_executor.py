@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of
+from conftest import executed, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
 from test_executor import STACKS
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.interfaces import (
     CannotJudge,
     CannotJudgeReason,
@@ -22,12 +23,13 @@ from drake_clutter.scenes.interfaces import (
     Observation,
     Outcome,
 )
-from drake_clutter.scenes.placement import choose_placement
+from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.fallback import FastOrDrakeExecutor
 from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.stability.judge import FastJudge
+from drake_clutter.tasks.episode import SteppedBackend
 
 CONFIG = ClutterConfig()
 JUDGE = FastJudge(CONFIG)
@@ -39,7 +41,7 @@ def seen(scene: Scene) -> Observation:
 
 
 def carried_out(scene: Scene, move: Move, seed: int = 0, executor: MoveExecutor = EXECUTOR) -> Outcome:
-    return executor.execute(scene, seen(scene), move, rng(seed))
+    return executed(executor, scene, seen(scene), move, rng(seed))
 
 
 def lowest(o: SceneObject) -> float:
@@ -68,8 +70,9 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
     assert (outcome.result, outcome.instability, outcome.cannot_judge, outcome.motion) == (MoveResult.PLACED, None, None, ())
     after = outcome.scene
     assert lowest(after[move.pick]) == pytest.approx(floor, abs=1e-9)
-    place = choose_placement(seen(STACKS), move, CONFIG.exploration, rng())
-    assert place is not None
+    command = resolve_placement(move, seen(STACKS), CONFIG.exploration, rng())
+    assert command is not None
+    place = command.X_TO_place
     assert after[move.pick].X_TO.quaternion == place.quaternion
     assert np.hypot(*(after[move.pick].X_TO.p - place.p)[:2]) <= CONFIG.settle.jitter
     assert after.names == STACKS.names
@@ -83,7 +86,7 @@ def test_the_same_rng_gives_the_same_outcome() -> None:
     one = carried_out(STACKS, Move("marker"), 7)
     carried_out(STACKS, Move("above"), 1)
     assert carried_out(STACKS, Move("marker"), 7) == one
-    assert FastExecutor(CONFIG).execute(STACKS, seen(STACKS), Move("marker"), rng(7)) == one
+    assert carried_out(STACKS, Move("marker"), 7, FastExecutor(CONFIG)) == one
     assert carried_out(STACKS, Move("marker"), 8).scene != one.scene
 
 
@@ -218,9 +221,11 @@ def test_drake_lets_it_go_at_the_same_place(move: Move, result: MoveResult, dete
     """From the ray caster's observation as from the rendered one. A box then creeps by less than 0.1 mm; a fall goes on in Drake,
     whose motion begins where the object was let go, 1 mm higher."""
     rendered, cast = detector.look(STACKS).observation, seen(STACKS)
-    mine, same = (EXECUTOR.execute(STACKS, observation, move, rng(3)) for observation in (rendered, cast))
+    mine = executed(EXECUTOR, STACKS, rendered, move, rng(3))
+    same = executed(EXECUTOR, STACKS, cast, move, rng(3))
     assert mine == same
-    drakes = SettleExecutor(CONFIG, follow_falls=False).execute(STACKS, rendered, move, rng(3))
+    executor = SettleExecutor(CONFIG, follow_falls=False)
+    drakes = executed(executor, STACKS, rendered, move, rng(3))
     assert mine.result is drakes.result is result
     let_go = drakes.motion[0].poses[move.pick]
     down = np.array([0.0, 0.0, CONFIG.exploration.release_height])
@@ -237,8 +242,9 @@ def test_drake_lets_it_go_at_the_same_place(move: Move, result: MoveResult, dete
 def test_drake_is_asked_about_what_cannot_be_judged() -> None:
     """It draws what it would have drawn, had it been asked first."""
     generator, other = rng(5), rng(5)
-    outcome = FastOrDrakeExecutor(CONFIG).execute(LEANS, seen(LEANS), Move("leaning"), generator)
-    assert outcome == SettleExecutor(CONFIG).execute(LEANS, seen(LEANS), Move("leaning"), other)
+    outcome = executed(FastOrDrakeExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), generator)
+    drakes = executed(SettleExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), other)
+    assert outcome == drakes
     assert outcome.result is MoveResult.PLACED
     assert outcome.motion
     assert generator.random() == other.random()
@@ -248,16 +254,22 @@ def test_drake_is_asked_about_what_cannot_be_judged() -> None:
 def test_drake_is_not_asked_about_the_rest(move: Move) -> None:
     """Not even about a collapse, of which it would show the motion."""
     generator, other = rng(5), rng(5)
-    outcome = FastOrDrakeExecutor(CONFIG).execute(STACKS, seen(STACKS), move, generator)
-    assert outcome == EXECUTOR.execute(STACKS, seen(STACKS), move, other)
+    outcome = executed(FastOrDrakeExecutor(CONFIG), STACKS, seen(STACKS), move, generator)
+    assert outcome == executed(EXECUTOR, STACKS, seen(STACKS), move, other)
     assert outcome.motion == ()
     assert generator.random() == other.random()
 
 
-def test_no_free_spot_is_no_question_for_drake() -> None:
+def test_no_free_spot_is_no_question_for_an_executor() -> None:
+    class Unasked:
+        def execute(self, *arguments: object) -> Outcome:
+            raise AssertionError("there is nothing to carry out")
+
     scene = scene_of(leaning(resting("gelatin_box", name="box")), side=0.12)
-    outcome = carried_out(scene, Move("box"), executor=FastOrDrakeExecutor(CONFIG))
-    assert outcome == Outcome(MoveResult.NO_FREE_SPOT, scene)
+    detector = RayDetector(CONFIG.cell.camera)
+    backend = SteppedBackend(Unasked(), detector, CONFIG.exploration, scene, rng())
+    assert backend.step(Move("box")) == Outcome(MoveResult.NO_FREE_SPOT, scene)
+    assert backend.belief.invalid_moves == backend.belief.history == (Move("box"),)
 
 
 # --- What it promises ---
@@ -283,7 +295,7 @@ def test_no_moves_ever_take_what_can_never_be_moved(seed: int) -> None:
         names = [d.name for d in observation.detections]
         pick = names[generator.integers(len(names))]
         place = [name for name in (*names, "tray") if name != pick][generator.integers(len(names))]
-        outcome = EXECUTOR.execute(scene, observation, Move(pick, place), generator)
+        outcome = executed(EXECUTOR, scene, observation, Move(pick, place), generator)
         if outcome.result is MoveResult.PLACED:
             assert pick not in FIXED
             scene = outcome.scene

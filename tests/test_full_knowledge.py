@@ -2,20 +2,21 @@
 
 import numpy as np
 import pytest
-from conftest import CLASSES, random_scene, resting, rng, scene_of
+from conftest import CLASSES, executed, random_scene, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, legal_moves
+from drake_clutter.tasks.belief import Decision, legal_moves
+from drake_clutter.tasks.episode import run_episode, teleport_backends
+from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solution, Solvability
 
 CONFIG = ClutterConfig()
@@ -98,7 +99,7 @@ def replayed(scene: Scene, solution: Solution, seed: int) -> set[str]:
     for move in solution.plan:
         observation = JUDGE.rays.observe(scene)[0]
         assert move in legal_moves(observation)
-        outcome = EXECUTOR.execute(scene, observation, move, generator)
+        outcome = executed(EXECUTOR, scene, observation, move, generator)
         assert outcome.result is MoveResult.PLACED
         scene = outcome.scene
         known |= {d.name for d in JUDGE.rays.observe(scene)[0].detections}
@@ -182,7 +183,8 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix()
     leaning = SceneObject("leaning", CLASSES["gelatin_box"], Pose.of(R_TO, (0.1335, 0.0, 0.0372)))
     scene = scene_of(*covered(), leaning)
-    outcome = SettleExecutor(CONFIG).execute(scene, JUDGE.rays.observe(scene)[0], Move("cover"), rng())
+    observation = JUDGE.rays.observe(scene)[0]
+    outcome = executed(SettleExecutor(CONFIG), scene, observation, Move("cover"), rng())
     if outcome.result is not MoveResult.PLACED or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3:
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
@@ -230,7 +232,7 @@ def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
             for move in legal_moves(observation):
                 generator = np.random.default_rng()
                 generator.bit_generator.state = state
-                outcome = EXECUTOR.execute(scene, observation, move, generator)
+                outcome = executed(EXECUTOR, scene, observation, move, generator)
                 if outcome.result is MoveResult.PLACED:
                     look = JUDGE.rays.observe(outcome.scene)[0]
                     seen = known | {d.name for d in look.detections}
@@ -277,14 +279,13 @@ def test_the_plan_holds_for_its_seed(seed: int) -> None:
         assert replayed(scene, solution, seed) == set(scene.names)
 
 
-def test_drake_confirms_a_plan(detector: LabelDetector) -> None:
+def test_drake_confirms_a_plan() -> None:
     scene = scene_of(*covered(), *covered(0.2, 0.25, " 2"))
     solution = SEARCH.solve(scene, seed=4)
-    task = ExplorationTask(scene, SettleExecutor(CONFIG), detector, CONFIG.exploration, len(solution.plan))
+    backend = teleport_backends("settle", CONFIG)(scene, item_rng(4))
+    moves = iter(solution.plan)
+    task = run_episode(backend, lambda *_: Decision(next(moves)), max_moves=2)
     assert task.hidden_at_start == ("small", "small 2")
-    generator = item_rng(4)
-    for move in solution.plan:
-        assert task.end is None
-        assert task.step(move, generator).outcome.result is MoveResult.PLACED
+    assert [step.outcome.result for step in task.steps] == [MoveResult.PLACED] * 2
     assert task.end is EpisodeEnd.ALL_FOUND
     assert len(solution.plan) == 2

@@ -15,9 +15,7 @@ from drake_clutter.agents.generation import (
     RandomGenerator,
     SceneGenerator,
     make_generation_agent,
-    mean_interval,
     summarise,
-    wilson_interval,
 )
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -26,6 +24,7 @@ from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verd
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import scene_fields
+from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 from drake_clutter.workers.mapping import map_ordered
@@ -123,29 +122,6 @@ def test_an_unknown_agent_is_refused() -> None:
 
 
 # --- Figures ---
-
-
-@pytest.mark.parametrize(
-    ("successes", "count", "low", "high"),
-    [
-        # Published examples of the score interval (Newcombe 1998, table I, method 3) and the closed forms at the ends.
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-        (20, 20, 0.8389, 1.0),
-        (0, 0, 0.0, 1.0),
-    ],
-)
-def test_wilson_interval(successes: int, count: int, low: float, high: float) -> None:
-    assert wilson_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
-
-
-def test_mean_interval() -> None:
-    """Standard deviation 2, so the mean of four is known to 1.96 * 2 / 2."""
-    assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx((2.7320508 - 1.959964, 2.7320508 + 1.959964))
-    assert mean_interval([3.0]) is None
-    assert mean_interval([]) is None
 
 
 def laid_out(*rules: str) -> Scene:

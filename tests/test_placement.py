@@ -13,9 +13,15 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import penetration
 from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import CELL, choose_placement, has_clear_top, top_height
+from drake_clutter.scenes.placement import (
+    CELL,
+    free_places,
+    has_clear_top,
+    resolve_placement,
+    top_height,
+)
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.tasks.belief import legal_moves
 
 CONFIG = ExplorationConfig()
 UPRIGHT = Orientation.UPRIGHT_0
@@ -26,7 +32,12 @@ def seen(detector: LabelDetector, scene: Scene) -> Observation:
 
 
 def placement(detector: LabelDetector, scene: Scene, pick: str, place: str = TRAY, seed: int = 0) -> Pose | None:
-    return choose_placement(seen(detector, scene), Move(pick, place), CONFIG, rng(seed))
+    return placed_at(seen(detector, scene), Move(pick, place), rng(seed))
+
+
+def placed_at(observation: Observation, move: Move, generator: np.random.Generator) -> Pose | None:
+    command = resolve_placement(move, observation, CONFIG, generator)
+    return command.X_TO_place if command else None
 
 
 def carried_by(scene: Scene, name: str) -> set[str]:
@@ -66,6 +77,26 @@ def test_the_same_seed_gives_the_same_place_and_chance_breaks_ties(detector: Lab
     assert len({round(abs(pose.p[:2]).max(), 9) for pose in places if pose}) == 1
 
 
+def test_a_draw_takes_one_of_the_free_places(detector: LabelDetector) -> None:
+    """They are searched for once; asking whether there are any draws nothing."""
+    observation, move = seen(detector, scene_of(resting("sugar_box", name="box"))), Move("box")
+    generator = rng(3)
+    places = free_places(observation, move, CONFIG)
+    assert places is not None
+    assert generator.bit_generator.state == rng(3).bit_generator.state
+    command = resolve_placement(move, observation, CONFIG, generator)
+    assert command is not None
+    assert (command.move, command.X_TO_pick) == (move, observation["box"].X_TO)
+    assert list(command.X_TO_place.translation) in places.translations.tolist()
+    assert free_places(observation, move, CONFIG) is places
+
+
+def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
+    observation = seen(detector, scene_of(resting("sugar_box", name="box")))
+    with pytest.raises(ValueError, match="allowed is to put an object on another one or on tray"):
+        placed_at(observation, Move("box", "box"), rng())
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) -> None:
     """Free of what is seen and of what is hidden, inside the tray, and with the centre of mass over the support."""
@@ -75,7 +106,7 @@ def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) ->
     moves = legal_moves(observation)
     checked = 0
     for move in [moves[i] for i in generator.permutation(len(moves))[:25]] + [m for m in moves if m.place == TRAY]:
-        X_TO = choose_placement(observation, move, CONFIG, generator)
+        X_TO = placed_at(observation, move, generator)
         if X_TO is None:
             continue
         checked += 1
@@ -146,7 +177,7 @@ def test_no_room_on_an_occupied_top(detector: LabelDetector) -> None:
     )
     observation = seen(detector, scene)
     assert observation["below"].mask.any()
-    assert choose_placement(observation, Move("picked", "below"), CONFIG, rng()) is None
+    assert placed_at(observation, Move("picked", "below"), rng()) is None
 
 
 def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
@@ -176,12 +207,12 @@ def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) 
     scene = scene_of(hidden, resting("cracker_box", xy=(0.05, 0.05), floor=0.028, name="below"))
     name = move.pick if move.pick != "below" else move.place
     with pytest.raises(KeyError, match=f"object '{name}' is not in view; in view are below"):
-        choose_placement(seen(detector, scene), move, CONFIG, rng())
+        placed_at(seen(detector, scene), move, rng())
 
 
 def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> None:
     scene = scene_of(resting("tomato_soup_can", name="can"), resting("gelatin_box", xy=(0.0805, 0.0), name="picked"))
-    X_TO = choose_placement(detector.look(scene).observation, Move("picked", "can"), CONFIG, rng())
+    X_TO = placed_at(detector.look(scene).observation, Move("picked", "can"), rng())
     assert X_TO is not None
     assert X_TO.p[:2] == pytest.approx([0.0, 0.0], abs=0.0075)
 
@@ -192,7 +223,7 @@ def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
     scene = scene_of(*wall, resting("tomato_soup_can", xy=(-0.2, 0.0), name="picked"))
     observation = seen(detector, scene)
     for seed in range(10):
-        X_TO = choose_placement(observation, Move("picked"), CONFIG, rng(seed))
+        X_TO = placed_at(observation, Move("picked"), rng(seed))
         assert X_TO is not None
         # The ray over the wall's top at x = 0.22 + 0.0325 meets the floor 300 / 1300 further out.
         in_shadow = 0.2525 < X_TO.p[0] < 0.2525 * 1.60 / 1.30 and abs(X_TO.p[1]) < 0.19

@@ -22,8 +22,9 @@ from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
 from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.tasks.exploration import Decision, ExplorationTask, Step
+from drake_clutter.tasks.belief import Decision
+from drake_clutter.tasks.episode import run_episode, teleport_backends
+from drake_clutter.tasks.exploration import ExplorationTask, Step
 
 GELATIN = resting("gelatin_box", xy=(-0.15, 0.1), name="gelatin_box_1")
 SCENE = scene_of(
@@ -58,10 +59,10 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def task(config: ClutterConfig, detector: LabelDetector) -> ExplorationTask:
+def task(config: ClutterConfig) -> ExplorationTask:
     """An episode of one real move, which uncovers the gelatin box."""
-    task = ExplorationTask(SCENE, SettleExecutor(config), detector, config.exploration, 1)
-    task.step(UNCOVER, rng())
+    backend = teleport_backends("settle", config, follow_falls=True)(SCENE, rng())
+    task = run_episode(backend, lambda *_: Decision(UNCOVER), max_moves=1)
     assert task.found == ("gelatin_box_1",)
     return task
 
@@ -71,9 +72,11 @@ def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> P
     """The episode's page; after the real move come one that found no spot and one that made the sugar box fall."""
     out = tmp_path_factory.mktemp("page")
     step = task.steps[0]
-    stuck = Step(Move("sugar_box_3", "gelatin_box_1"), Outcome(MoveResult.NO_FREE_SPOT, task.scene), step.look, (), 0.0)
+    onto_gelatin = Decision(Move("sugar_box_3", "gelatin_box_1"))
+    stuck = Step(onto_gelatin, Outcome(MoveResult.NO_FREE_SPOT, task.scene), step.look, (), 0.0)
     fallen = Instability(InstabilityReason.TOPPLED, "sugar_box_3", 0.1, 1.5)
-    collapse = Step(Move("cracker_box_2"), Outcome(MoveResult.COLLAPSED, task.scene, fallen), step.look, (), -1.0)
+    outcome = Outcome(MoveResult.COLLAPSED, task.scene, fallen)
+    collapse = Step(Decision(Move("cracker_box_2")), outcome, step.look, (), -1.0)
     summary = {"agent": HOSTILE, "seed": 3, "success": True, "moves": [{"move": HOSTILE}]}
     write_episode_page(out, f"Episode {HOSTILE}", task.start, task.first_look, [step, stuck, collapse], summary, DEFAULT_CELL)
     return out

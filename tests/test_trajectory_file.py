@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, resting, rng, scene_of
+from conftest import DEFAULT_CELL, executed, resting, rng, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.catalogue import load_catalogue
@@ -27,7 +27,7 @@ MOVES = (Move("gelatin_box"), Move("large_marker"))
 @pytest.fixture(scope="module")
 def outcomes(config: ClutterConfig, detector: LabelDetector) -> list[tuple[Move, Outcome]]:
     observation, executor = detector.look(SCENE).observation, ArmExecutor(config)
-    return [(move, executor.execute(SCENE, observation, move, rng())) for move in MOVES]
+    return [(move, executed(executor, SCENE, observation, move, rng())) for move in MOVES]
 
 
 @pytest.fixture

@@ -26,7 +26,6 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.exploration import TRAINED
-from drake_clutter.agents.generation import mean_interval, wilson_interval
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import upgrade_head
 from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
@@ -36,11 +35,13 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.statistics import mean_interval, wilson_interval
 from drake_clutter.systems.closed_loop import ClosedLoop
+from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
-from drake_clutter.systems.teleported_loop import explore_images
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
+from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
@@ -110,27 +111,33 @@ class Player:
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
         told["arm_can"] = not self._ceiling.never_found(scene)
         try:
-            task, known, robot, end = self._played(scene, scenario, row.motion)
+            task, known, robot = self._played(scene, scenario, row.motion)
         except Exception as error:  # whatever it is, it is a result
             told |= {"ended": "exception", "exception": repr(error)}
         else:
             told |= told_of(task, known) | {
                 "robot": robot,
-                "ended": task.end.value if task.end else end or EpisodeEnd.GAVE_UP.value,
+                "ended": (task.end or EpisodeEnd.GAVE_UP).value,
             }
         return told | {"wall": time.perf_counter() - begun}
 
     def _played(
-        self, scene: Scene, scenario: Scenario, motion: str
-    ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float, str]:
-        perceive, choose = perception_of(scenario, scene.support), self._policy(scenario.agent)
-        options: dict[str, Any] = {"max_moves": scenario.max_moves, "seed": scenario.seed, "world": scenario.world}
+        self,
+        scene: Scene,
+        scenario: Scenario,
+        motion: str,
+    ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float]:
+        perceive, policy = perception_of(scenario, scene.support), self._policy(scenario.agent)
+        seed, world = scenario.seed, scenario.world
+        backend: ClosedLoop | ImageBackend
         if motion == "arm":
-            loop = ClosedLoop(scene, choose, perceive=perceive, **options)
-            timing = loop.run()
-            return loop.task, loop.known, timing.robot, timing.end
-        assert perceive is not None, "labels with settle are not in the rows"
-        return *explore_images(scene, choose, perceive, **options), 0.0, ""
+            backend = ClosedLoop(scene, perceive=perceive, seed=seed, world=world)
+        else:
+            assert perceive is not None, "labels with settle are not in the rows"
+            backend = ImageBackend(scene, perceive, seed=seed, world=world)
+        task = run_episode(backend, policy, max_moves=scenario.max_moves)
+        robot = backend.timing.robot if isinstance(backend, ClosedLoop) else 0.0
+        return task, backend.belief.objects, robot
 
 
 def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str, Any]]:

@@ -18,7 +18,6 @@ from rich.console import Console
 from rich.progress import track
 from scipy.optimize import linear_sum_assignment
 
-from drake_clutter.agents.generation import wilson_interval
 from drake_clutter.catalogue import Catalogue, load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
@@ -32,6 +31,7 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
 
 SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)

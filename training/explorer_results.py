@@ -17,16 +17,24 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, in_words, ratio_interval, summarise_episodes
+from drake_clutter.agents.backends import FIDELITIES
+from drake_clutter.agents.evaluation import (
+    Episode,
+    EpisodePlayer,
+    EpisodeResult,
+    summarise_episodes,
+)
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, upgrade_head
 from drake_clutter.files import InputError, told_in_one_line, write_json
 from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import recorded
+from drake_clutter.reports.in_words import in_words
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.tasks.exploration import EXECUTORS, EpisodeEnd
+from drake_clutter.statistics import ratio_interval
+from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.mapping import map_ordered
 
@@ -147,8 +155,8 @@ def main(
         raise InputError(
             "--out: is missing; the published tables are all agents' on all scenes under settle: give a file for others"
         )
-    if fidelity not in EXECUTORS:
-        raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(EXECUTORS)}")
+    if fidelity not in FIDELITIES:
+        raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(FIDELITIES)}")
     folder.mkdir(parents=True, exist_ok=True)
     catalogue, shown = load_catalogue(), list[dict[str, Any]]()
     names = [name for name in TABLES if only is None or only in name]

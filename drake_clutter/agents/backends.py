@@ -16,9 +16,7 @@ FIDELITIES = (*TELEPORT_FIDELITIES, "arm")
 """How moves are carried out: by teleport, or planned and simulated with the arm."""
 
 
-def backends(
-    fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
-) -> BackendFactory:
+def backends(fidelity: str, config: ClutterConfig, *, follow_falls: bool = False) -> BackendFactory:
     """Return what starts episodes.
 
     Args:

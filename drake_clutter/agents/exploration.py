@@ -15,16 +15,16 @@ from drake_clutter.tasks.episode import Backend
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
 
 
-def random_explorer(
-    belief: Belief, observation: Observation, rng: np.random.Generator
-) -> Decision:
+def random_explorer(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
     """Choose uniformly among the legal moves (RE)."""
     moves = legal_moves(observation)
     return Decision(moves[rng.integers(len(moves))] if moves else None)
 
 
 def _least_picked_then_largest(
-    candidates: Sequence[Detection], belief: Belief, size: Callable[[Detection], float]
+    candidates: Sequence[Detection],
+    belief: Belief,
+    size: Callable[[Detection], float],
 ) -> Decision:
     """Choose the largest candidate, to the tray.
 
@@ -42,7 +42,9 @@ def largest_first(belief: Belief, observation: Observation, rng: np.random.Gener
     Nearest to the paper's. See `_least_picked_then_largest`.
     """
     return _least_picked_then_largest(
-        observation.detections, belief, lambda d: d.object_class.volume
+        observation.detections,
+        belief,
+        lambda d: d.object_class.volume,
     )
 
 
@@ -53,7 +55,9 @@ def largest_clear(belief: Belief, observation: Observation, rng: np.random.Gener
     """
     clear = [d for d in observation.detections if has_clear_top(observation, d)]
     return _least_picked_then_largest(
-        clear or observation.detections, belief, lambda d: float(d.mask.sum())
+        clear or observation.detections,
+        belief,
+        lambda d: float(d.mask.sum()),
     )
 
 
@@ -73,14 +77,21 @@ class FullKnowledge:
         self._plan: list[Move] = []
 
     def __call__(
-        self, belief: Belief, observation: Observation, rng: np.random.Generator
+        self,
+        belief: Belief,
+        observation: Observation,
+        rng: np.random.Generator,
     ) -> Decision:
         """Follow the plan; search for another when a move did not go as it was meant."""
         in_view, failed = {TRAY, *(d.name for d in observation.detections)}, belief.invalid_moves
         if not self._plan or failed or not {self._plan[0].pick, self._plan[0].place} <= in_view:
             known = [o.name for o in belief.objects]
             found = self._search.solve(
-                self._backend.scene, budget=self.BUDGET, known=known, rng=rng, failed=failed
+                self._backend.scene,
+                budget=self.BUDGET,
+                known=known,
+                rng=rng,
+                failed=failed,
             )
             self._plan = list(found.plan)
         return Decision(self._plan.pop(0) if self._plan else None)

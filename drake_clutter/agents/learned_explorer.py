@@ -85,7 +85,10 @@ class LearnedExplorer:
         self._config, self._backend = config, backend
 
     def __call__(
-        self, belief: Belief, observation: Observation, rng: np.random.Generator
+        self,
+        belief: Belief,
+        observation: Observation,
+        rng: np.random.Generator,
     ) -> Decision:
         """Choose the next move.
 
@@ -95,7 +98,11 @@ class LearnedExplorer:
         shown = belief.objects if self._backend is None else self._backend.scene.objects
         _refuse_unknown({o.object_class.name for o in shown}, self._numbers, self._path)
         graph = exploration_graph(
-            shown, observation, belief.history, self._numbers, belief.invalid_moves
+            shown,
+            observation,
+            belief.history,
+            self._numbers,
+            belief.invalid_moves,
         )
         allowed, names = graph["allowed"], tuple(o.name for o in shown)
         chances: dict[str, float] = {}

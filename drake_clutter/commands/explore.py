@@ -80,7 +80,9 @@ def carry_out(
     backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
 
     def next_of_list(
-        belief: Belief, observation: Observation, rng: np.random.Generator
+        belief: Belief,
+        observation: Observation,
+        rng: np.random.Generator,
     ) -> Decision:
         number = len(belief.history)
         if number == len(moves):
@@ -89,7 +91,11 @@ def carry_out(
         return Decision(moves[number])
 
     return run_episode(
-        backend, next_of_list, max_moves=len(moves), report=report, until_all_found=False
+        backend,
+        next_of_list,
+        max_moves=len(moves),
+        report=report,
+        until_all_found=False,
     )
 
 
@@ -107,7 +113,10 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
         found = (
             NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
             if command is None
-            else executor.plan(scene, command)
+            else executor.plan(
+                scene,
+                command,
+            )
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
     write_json(out / "plan.json", {"seed": seed, "plans": plans})

@@ -49,7 +49,11 @@ def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationT
     policy = policy_of(scenario.agent, scenario.world)
     perceive = perception_of(scenario, scene.support)
     loop = ClosedLoop(
-        scene, perceive=perceive, seed=scenario.seed, world=scenario.world, record=True
+        scene,
+        perceive=perceive,
+        seed=scenario.seed,
+        world=scenario.world,
+        record=True,
     )
     task = run_episode(loop, policy, max_moves=scenario.max_moves, report=report)
     return task, loop.timing

@@ -28,7 +28,10 @@ def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
         move = f"{plan['move']['pick']} to {plan['move']['place']}"
         if plan["planned"]:
             parts = [f"{phase['name']} {phase['duration']:.2f} s" for phase in plan["phases"]]
-            nearest = min((phase["clearance"] for phase in plan["phases"] if phase["clearance"] is not None), default=None)
+            nearest = min(
+                (phase["clearance"] for phase in plan["phases"] if phase["clearance"] is not None),
+                default=None,
+            )
             clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
             words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['seconds']:.2f} s"
         else:

@@ -261,9 +261,7 @@ class Observation:
 class MoveExecutor(Protocol):
     """Carries out commands in a scene at rest."""
 
-    def execute(
-        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
-    ) -> Outcome:
+    def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """Return the outcome of a command.
 
         Args:

@@ -201,14 +201,15 @@ class FreePlaces(NamedTuple):
     quaternion: tuple[float, float, float, float]
 
 
-_FREE_PLACES: WeakKeyDictionary[
-    Observation, dict[tuple[Move, ExplorationConfig], FreePlaces | None]
-] = WeakKeyDictionary()
+_Found = dict[tuple[Move, ExplorationConfig], FreePlaces | None]
+_FREE_PLACES: WeakKeyDictionary[Observation, _Found] = WeakKeyDictionary()
 """Places that have been searched for, by observation: action filters and commands ask alike."""
 
 
 def free_places(
-    observation: Observation, move: Move, config: ExplorationConfig
+    observation: Observation,
+    move: Move,
+    config: ExplorationConfig,
 ) -> FreePlaces | None:
     """Return the equally good places for a move, or None if no place is known to be free.
 
@@ -234,7 +235,9 @@ def free_places(
 
 
 def _search_places(
-    observation: Observation, move: Move, config: ExplorationConfig
+    observation: Observation,
+    move: Move,
+    config: ExplorationConfig,
 ) -> FreePlaces | None:
     picked = observation[move.pick]
     if move.place == TRAY:

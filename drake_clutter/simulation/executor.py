@@ -35,9 +35,7 @@ class SettleExecutor:
         """
         self._config, self._follow_falls = config, follow_falls
 
-    def execute(
-        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
-    ) -> Outcome:
+    def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`. Random offsets are added to the pose of release."""
         pick, X_TO = command.move.pick, command.X_TO_place
         # What is let go sinks by the height of release; else it would never count as calm.

@@ -3,7 +3,13 @@
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.interfaces import CannotJudge, MoveResult, Outcome, PickPlaceCommand, Verdict
+from drake_clutter.scenes.interfaces import (
+    CannotJudge,
+    MoveResult,
+    Outcome,
+    PickPlaceCommand,
+    Verdict,
+)
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
@@ -30,9 +36,7 @@ class FastOrDrakeExecutor:
         """Makes both; `follow_falls` is Drake's, see `SettleExecutor`."""
         self._fast, self._settle = FastExecutor(config), SettleExecutor(config, follow_falls=follow_falls)
 
-    def execute(
-        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
-    ) -> Outcome:
+    def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         state = rng.bit_generator.state
         outcome = self._fast.execute(scene, command, rng)

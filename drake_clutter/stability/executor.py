@@ -31,9 +31,7 @@ class FastExecutor:
         self._config = config
         self._judge = judge or FastJudge(config)
 
-    def execute(
-        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
-    ) -> Outcome:
+    def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         (x, y, _) = random_offsets(1, self._config.settle.jitter, rng)[0]
         resting = command.X_TO_place.moved((x, y, -self._config.exploration.release_height))

@@ -18,7 +18,13 @@ from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried, touching_groups
-from drake_clutter.scenes.interfaces import Frame, Instability, MoveResult, Outcome, PickPlaceCommand
+from drake_clutter.scenes.interfaces import (
+    Frame,
+    Instability,
+    MoveResult,
+    Outcome,
+    PickPlaceCommand,
+)
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import fallen, settle
@@ -223,9 +229,7 @@ class ArmExecutor:
             self._planner = PickPlacePlanner(self._config.cell.with_support(support), self._planner_config)
         return self._planner
 
-    def execute(
-        self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator
-    ) -> Outcome:
+    def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         plan = self.plan(scene, command)
         if isinstance(plan, NoPlan):
@@ -234,7 +238,14 @@ class ArmExecutor:
         told = simulation.run(record=True)
         came_off = not told.sealed or not math.isnan(told.dropped)
         X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulation.running.lowered))
-        outcome = judged(scene, scene.at(told.poses), command.move.pick, X_TO_place, came_off, self._config.settle)
+        outcome = judged(
+            scene,
+            scene.at(told.poses),
+            command.move.pick,
+            X_TO_place,
+            came_off,
+            self._config.settle,
+        )
         return replace(outcome, motion=told.motion, detail=str(told))
 
 

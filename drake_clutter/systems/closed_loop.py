@@ -217,7 +217,8 @@ class ClosedLoop:
             freedom.update(root, wanted, must_hold=must_hold)
             k += 1
             self.simulator.AdvanceTo(k * LOOK + TIME_STEP / 2)
-            if self._record and running.schedule is not None and now - running.begun < running.schedule.end:
+            moving = running.schedule is not None and now - running.begun < running.schedule.end
+            if self._record and moving:
                 context = self.station.plant_context(root)
                 arm = self.station.arm_state(context, self._suction(root))
                 motion.append(Frame(root.get_time() - running.begun, self.station.scene.poses(context), arm))
@@ -233,14 +234,18 @@ class ClosedLoop:
     def _objects(self, root: Context) -> tuple[SceneObject, ...]:
         return self.scene.at(self.station.scene.poses(self.station.plant_context(root))).objects
 
-    def _judged(self, root: Context, request: Request, answer: Answer, motion: tuple[Frame, ...]) -> Attempt:
+    def _judged(
+        self,
+        root: Context,
+        request: Request,
+        answer: Answer,
+        motion: tuple[Frame, ...],
+    ) -> Attempt:
         """How a move went, by the truth, once the agent has looked again."""
         before, plan, decision = self.scene, answer.plan, request.decision
         assert plan is not None
         if self._tracks:
-            decision = in_true_names(
-                decision, request.belief, request.observation, before.objects
-            )
+            decision = in_true_names(decision, request.belief, request.observation, before.objects)
         move = decision.move
         assert move is not None
         if isinstance(plan, NoPlan):

@@ -51,18 +51,19 @@ def infeasible_moves(
         empty: Depth of the empty cell [m], see `under_nameless`. Shape (height, width).
         config: Of the task.
     """
-    free = [
-        move
-        for move in legal_moves(observation)
-        if move.pick in pickable and free_places(observation, move, config) is not None
-    ]
+    legal = legal_moves(observation)
+    can_be_picked = [move for move in legal if move.pick in pickable]
+    free = [move for move in can_be_picked if free_places(observation, move, config) is not None]
     risky = under_nameless(known, observation, empty)
     worth_trying = {move for move in free if move.pick not in risky} or set(free)
-    return [move for move in legal_moves(observation) if move not in worth_trying]
+    return [move for move in legal if move not in worth_trying]
 
 
 def in_true_names(
-    decision: Decision, belief: Belief, observation: Observation, objects: Sequence[SceneObject]
+    decision: Decision,
+    belief: Belief,
+    observation: Observation,
+    objects: Sequence[SceneObject],
 ) -> Decision:
     """Return a decision in the names of what is really there.
 
@@ -193,9 +194,7 @@ class ExplorationAgent(LeafSystem):
     ) -> "ExplorationAgent":
         """Add one."""
         system: ExplorationAgent = builder.AddSystem(
-            ExplorationAgent(
-                config=config, seed=seed, tracker=tracker, action_filter=action_filter
-            )
+            ExplorationAgent(config=config, seed=seed, tracker=tracker, action_filter=action_filter)
         )
         system.set_name("exploration_agent")
         return system

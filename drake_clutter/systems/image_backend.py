@@ -34,7 +34,14 @@ class ImageBackend(SteppedBackend):
     where one was seen, and it lands as far off as it was seen.
     """
 
-    def __init__(self, scene: Scene, perceive: Perceive, *, seed: int, world: ClutterConfig) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        perceive: Perceive,
+        *,
+        seed: int,
+        world: ClutterConfig,
+    ) -> None:
         """Start on a scene at rest, and observe it.
 
         Args:

@@ -110,7 +110,9 @@ ActionFilter = Callable[[Belief, Observation], Sequence[Move]]
 
 
 def update_belief(
-    belief: Belief, observation: Observation, tracker: Tracker | None = None
+    belief: Belief,
+    observation: Observation,
+    tracker: Tracker | None = None,
 ) -> tuple[Belief, Observation]:
     """Return the belief after an observation, and the observation in the belief's names.
 

@@ -123,7 +123,10 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.backend, self._refused = self._start_backend(scene, self.np_random), 0
         self.task = ExplorationTask(
-            scene, self.backend.look, self._config.exploration, self._max_moves
+            scene,
+            self.backend.look,
+            self._config.exploration,
+            self._max_moves,
         )
         return self._noted(self.observe())
 

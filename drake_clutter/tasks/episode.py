@@ -189,7 +189,11 @@ class SteppedBackend:
         """See `Backend.rollout`."""
         while True:
             decision = select_move(
-                policy, self.belief, self.observation, self.policy_rng, self._action_filter
+                policy,
+                self.belief,
+                self.observation,
+                self.policy_rng,
+                self._action_filter,
             )
             if decision.move is None:
                 return
@@ -209,7 +213,10 @@ about one move in a hundred would take half the time."""
 
 
 def teleport_backends(
-    fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
+    fidelity: str,
+    config: ClutterConfig,
+    *,
+    follow_falls: bool = False,
 ) -> BackendFactory:
     """Return what starts episodes in which objects are teleported.
 

@@ -33,26 +33,24 @@ class Attempt:
     outcome: Outcome
     look: Look
 
+    @property
+    def move(self) -> Move:
+        """What was tried."""
+        assert self.decision.move is not None
+        return self.decision.move
+
 
 @dataclass(frozen=True)
-class Step:
+class Step(Attempt):
     """An attempt, and what it was worth.
 
     Attributes:
-        move: What was tried.
-        outcome: How it went.
-        look: What a perfect detector sees afterwards.
         newly_found: Objects detected for the first time, in the scene's order.
         reward: r_d per newly found object, plus the penalty if the scene collapsed.
-        decision: Of which the move is part.
     """
 
-    move: Move
-    outcome: Outcome
-    look: Look
     newly_found: tuple[str, ...]
     reward: float
-    decision: Decision
 
 
 class ExplorationTask:
@@ -72,7 +70,11 @@ class ExplorationTask:
     """
 
     def __init__(
-        self, scene: Scene, first_look: Look, config: ExplorationConfig, max_moves: int
+        self,
+        scene: Scene,
+        first_look: Look,
+        config: ExplorationConfig,
+        max_moves: int,
     ) -> None:
         """Start the record of an episode on a scene at rest."""
         self._config, self._max_moves = config, max_moves
@@ -97,11 +99,15 @@ class ExplorationTask:
         return tuple(name for name in self.hidden_at_start if name in self.known)
 
     def note(self, attempt: Attempt) -> Step:
-        """Take in an attempt."""
-        decision, outcome = attempt.decision, attempt.outcome
-        assert decision.move is not None, "an attempt has a move"
-        collapsed = outcome.result is MoveResult.COLLAPSED
-        self.scene, self.look = outcome.scene, attempt.look
+        """Take in an attempt.
+
+        Raises:
+            ValueError: The scene has collapsed; after any other end an episode may go on.
+        """
+        if self.end is EpisodeEnd.COLLAPSED:
+            raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
+        collapsed = attempt.outcome.result is MoveResult.COLLAPSED
+        self.scene, self.look = attempt.outcome.scene, attempt.look
         seen = {d.name for d in self.look.observation.detections}
         newly = tuple(n for n in self.scene.names if n in seen and n not in self.known)
         if collapsed:
@@ -109,6 +115,6 @@ class ExplorationTask:
         self.known += newly
         reward = self._config.detection_reward * len(newly)
         reward += self._config.collapse_penalty if collapsed else 0.0
-        step = Step(decision.move, outcome, attempt.look, newly, reward, decision)
+        step = Step(attempt.decision, attempt.outcome, attempt.look, newly, reward)
         self.steps.append(step)
         return step

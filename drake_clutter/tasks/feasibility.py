@@ -120,9 +120,7 @@ class FeasibilityStudy:
                 name,
                 scene,
                 move,
-                resolve_placement(
-                    move, observation, self._world.exploration, self._rng(number, k)
-                ),
+                resolve_placement(move, observation, self._world.exploration, self._rng(number, k)),
             )
             for k, move in enumerate(legal_moves(observation))
         ]
@@ -136,7 +134,13 @@ class FeasibilityStudy:
             self._planner = PickPlacePlanner(self._world.cell.with_support(support), self._config)
         return self._planner
 
-    def _row(self, name: str, scene: Scene, move: Move, command: PickPlaceCommand | None) -> MoveRow:
+    def _row(
+        self,
+        name: str,
+        scene: Scene,
+        move: Move,
+        command: PickPlaceCommand | None,
+    ) -> MoveRow:
         picked = scene[move.pick]
         lower, upper = picked.bounds_T
         x, y = (lower[:2] + upper[:2]) / 2

@@ -1,24 +1,26 @@
-"""The loop without an arm, with a detector whose every answer is given."""
+"""The backend without an arm, with a detector whose every answer is given."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import resting, scene_of, training_script
 
-from drake_clutter.agents.exploration import LargestClear
+from drake_clutter.agents.exploration import largest_clear
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.systems.teleported_loop import explore_images
+from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.tracking import recognised
 from drake_clutter.tasks.arm_ceiling import ArmCeiling
-from drake_clutter.tasks.exploration import Decision, EpisodeEnd
+from drake_clutter.tasks.belief import Belief, Decision
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd
 
 COVERED = scene_of(resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028))
 
@@ -33,13 +35,15 @@ def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Obser
 @pytest.mark.parametrize("shift", [0.0, 0.004])
 def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: float) -> None:
     """And it lands as far off as it was seen."""
-    sees, agent, names = seen_but_shifted(COVERED, config, shift), LargestClear(), list[str]()
+    sees, names = seen_but_shifted(COVERED, config, shift), list[str]()
 
-    def choose(known: Sequence[Any], observation: Observation, *others: Any) -> Decision:
-        names.extend(o.name for o in known)
-        return agent.choose(observation, *others)
+    def policy(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+        names.extend(o.name for o in belief.objects)
+        return largest_clear(belief, observation, rng)
 
-    task, known = explore_images(COVERED, choose, lambda *_: sees, max_moves=3, seed=0, world=config)
+    backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
+    task = run_episode(backend, policy, max_moves=3)
+    known = backend.belief.objects
     (step,) = task.steps
     assert names == ["cracker_box_1"], "a name of its own"
     assert (step.move.pick, task.end) == ("cracker_box", EpisodeEnd.ALL_FOUND)
@@ -51,7 +55,8 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
 
 def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
     sees = seen_but_shifted(COVERED, config, 0.0)
-    task, _ = explore_images(COVERED, lambda *_: Decision(None), lambda *_: sees, max_moves=3, seed=0, world=config)
+    backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
+    task = run_episode(backend, lambda *_: Decision(None), max_moves=3)
     assert (task.steps, task.end) == ([], None)
 
 
@@ -64,7 +69,7 @@ def test_rows_of_the_results() -> None:
         episode | {"ended": "all found", "arm_can": False},
         episode | {"ended": "collapsed", "found": 1, "results": {MoveResult.DROPPED.value: 1}},
         episode | {"ended": "out of moves", "found": 0, "not_planned": {"no seal": 3}},
-        episode | {"ended": "nothing feasible", "found": 0, "arm_can": False},
+        episode | {"ended": "gave up", "found": 0, "arm_can": False},
         {"ended": "exception", "wall": 1.0, "arm_can": True, "commit": "def"},
     ]
     row = script.row_of(script.ROWS[0], episodes)

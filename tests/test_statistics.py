@@ -1,0 +1,35 @@
+"""Confidence intervals."""
+
+import pytest
+
+from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "low", "high"),
+    [
+        # Published examples of the score interval (Newcombe 1998, table I, method 3) and the closed forms at the ends.
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (20, 20, 0.8389, 1.0),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_wilson_interval(successes: int, count: int, low: float, high: float) -> None:
+    assert wilson_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_mean_interval() -> None:
+    """Standard deviation 2, so the mean of four is known to 1.96 * 2 / 2."""
+    assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx((2.7320508 - 1.959964, 2.7320508 + 1.959964))
+    assert mean_interval([3.0]) is None
+    assert mean_interval([]) is None
+
+
+def test_ratio_interval() -> None:
+    """A ratio that is the same in every scene is known for sure; else it lies within."""
+    assert ratio_interval([1, 2, 3], [2, 4, 6]) == (0.5, 0.5)
+    low, high = ratio_interval([1, 2, 3, 0], [2, 2, 3, 2])
+    assert 0 < low < 6 / 9 < high <= 1
