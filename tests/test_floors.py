@@ -10,13 +10,16 @@ import drake_clutter
 
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
-    0: {"assets", "catalogue", "files", "learning", "records", "resources", "seeding", "statistics", "validation", "workers", "yaml_text"},
+    0: {
+        *("assets", "catalogue", "files", "learning", "records", "resources", "seeding"),
+        *("statistics", "validation", "workers", "yaml_text"),
+    },
     1: {"cell", "config", "grammar"},
     2: {"scenes", "stability"},
     3: {"export", "simulation"},
     4: {"perception", "planning"},
-    5: {"station"},
-    6: {"tasks"},
+    5: {"tasks"},
+    6: {"station"},
     7: {"agents"},
     8: {"systems"},
     9: {"cli", "commands", "doctor", "reports"},
