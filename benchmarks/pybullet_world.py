@@ -13,7 +13,9 @@ from drake_clutter.scenes.scene import Pose, Scene
 def label_image() -> Any:
     """The body that the overhead camera sees in each pixel of PyBullet's world."""
     camera = default_cell().camera
-    view = pybullet.computeViewMatrix([0, 0, camera.altitude], [0, 0, 0], [0, 1, 0])
+    X_TC = camera.X_TC
+    eye, ahead, up = (X_TC @ p for p in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
+    view = pybullet.computeViewMatrix(eye, ahead, up - eye)
     projection = pybullet.computeProjectionMatrixFOV(camera.fov_y_deg, camera.width / camera.height, 0.05, 20)
     engine = pybullet.ER_TINY_RENDERER
     return pybullet.getCameraImage(camera.width, camera.height, view, projection, shadow=0, renderer=engine)[4]

@@ -119,6 +119,9 @@ def upgrade(given: Any) -> Any:
     if isinstance(arm := made.get("arm"), dict):
         del made["arm"]
         made["world"] = _over({"cell": upgrade_cell(arm)}, made.get("world", {}))
+    if "camera_noise" in made:
+        noise = {"overhead": {"depth_noise": made.pop("camera_noise")}}
+        made["world"] = _over({"cell": {"cameras": noise}}, made.get("world", {}))
     if cell:
         made["cell"] = _over(cell, made.get("cell", {}))
     return made

@@ -82,6 +82,15 @@ def allowed(what: str) -> PydanticCustomError:
     return PydanticCustomError("allowed", "{what}", {"what": what})
 
 
+def refused(what: str) -> PydanticCustomError:
+    """Return the error that a validator raises.
+
+    Args:
+        what: Which part of the field, what is wrong with it, and what is allowed.
+    """
+    return PydanticCustomError("refused", "{what}", {"what": what})
+
+
 Finite = Annotated[float, Between(-math.inf, math.inf)]
 """Any finite number."""
 NonNegative = Annotated[float, Between(0.0, math.inf)]
@@ -155,6 +164,8 @@ def _message(schema: Any, error: ErrorDetails) -> str:
         needed = ", ".join(node.get("required", {}))
         return f"{_joined(owner, loc[-1])}: is missing; needed are {needed}"
     field, node = _place(schema, loc)
+    if kind == "refused":
+        return f"{field}.{error['msg']}"
     if kind in ("union_tag_not_found", "union_tag_invalid"):
         tag = error["input"].get(node["discriminator"]["propertyName"])
         field = _joined(field, node["discriminator"]["propertyName"])

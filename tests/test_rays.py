@@ -97,7 +97,7 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     assert np.quantile(error, 0.99) < 1.5e-6
     assert error.max() < 1e-4
     nothing = (rendered == -1) & (cast == -1)
-    assert (observation.depth[nothing] == np.float32(CAMERA.altitude)).all()
+    assert (observation.depth[nothing] == np.float32(CAMERA.X_TC.translation()[2])).all()
 
 
 @pytest.mark.parametrize(
@@ -128,11 +128,11 @@ def test_a_box_from_straight_above_covers_its_top(
     """Only its top is seen, as large as the pinhole makes it. Pixels at its outline count or not: less than half its length in
     pixels is right."""
     scene = scene_of(resting(name, orientation, name="box"))
-    scale = CAMERA.focal_length / (CAMERA.altitude - height)
+    scale = CAMERA.focal_length / (CAMERA.X_TC.translation()[2] - height)
     pixels = int((labels(scene) == 0).sum())
     assert pixels == pytest.approx(length * width * scale**2, abs=(length + width) * scale)
     depth = RAYS.observe(scene)[0].depth[labels(scene) == 0]
-    assert depth == pytest.approx(np.full(pixels, CAMERA.altitude - height), abs=1e-6)
+    assert depth == pytest.approx(np.full(pixels, CAMERA.X_TC.translation()[2] - height), abs=1e-6)
 
 
 def test_a_box_in_a_corner_shows_its_sides() -> None:
@@ -206,7 +206,7 @@ def test_out_of_the_frame_nothing_is_hidden() -> None:
     assert RAYS.visible_shares(FAR.objects) == {"near": 1.0, "far": 1.0}
     assert RAYS.visible_shares([FAR["far"]]) == {"far": 1.0}
     assert RAYS.cover(FAR, "far") == {}
-    assert (RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.altitude)).all()
+    assert (RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.X_TC.translation()[2])).all()
 
 
 def test_only_what_a_ray_meets_is_detected() -> None:
@@ -258,7 +258,7 @@ def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> 
 
 def test_cover_of_a_lone_cover() -> None:
     scene = scene_of(resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover"))
-    pixels = 0.085 * 0.073 * (CAMERA.focal_length / (CAMERA.altitude - 0.028)) ** 2
+    pixels = 0.085 * 0.073 * (CAMERA.focal_length / (CAMERA.X_TC.translation()[2] - 0.028)) ** 2
     cover = RAYS.cover(scene, "box")
     assert cover == {frozenset({"cover"}): pytest.approx(pixels, rel=0.05)}
     assert set(RAYS.cover(scene, "cover")) == {frozenset()}

@@ -22,7 +22,7 @@ def at(x: float, y: float, name: str = CAN) -> SceneObject:
 
 def image(*objects: SceneObject, top: float = 0.1) -> Observation:
     """Of objects whose names say nothing; everywhere is seen what is `top` high, m."""
-    depth = np.full((CAMERA.height, CAMERA.width), CAMERA.altitude - top, np.float32)
+    depth = np.full((CAMERA.height, CAMERA.width), CAMERA.X_TC.translation()[2] - top, np.float32)
     nothing = np.zeros(depth.shape, bool)
     detections = [Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)]
     return Observation(depth, tuple(detections), CAMERA, TRAY)

@@ -4,22 +4,31 @@ Frames: T the support's frame; C the camera, z along the optical axis, x to the 
 """
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from drake_clutter.cell.pinhole import NEAREST, Floats, Pinhole
 from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.support import Support
 from drake_clutter.validation import Between, Flag, Model
-
-Floats = NDArray[np.float64]
-
 
 D435_FOV_Y_DEG = 42.5
 """Vertical field of view of the color stream of an Intel RealSense D435 [deg] (data sheet)."""
 D435_FOCAL_LENGTH = 480 / 2 / math.tan(math.radians(D435_FOV_Y_DEG) / 2)
 """Its focal length at 640 x 480 [px]."""
+_PARALLEL = 1e-3
+"""Of a ray of length 1 along the optical axis, the part down to the floor with which it is taken to be parallel."""
+
+
+def pixel_grid(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return column and row of each pixel of an image of a shape (height, width). Shape (height, width, 2)."""
+    row, column = np.indices(shape)
+    return np.stack([column, row], axis=-1)
 
 
 class Camera(Model):
@@ -59,11 +68,6 @@ class Camera(Model):
         return self.pose.transform
 
     @property
-    def altitude(self) -> float:
-        """Height above the support's floor [m]."""
-        return float(self.pose.translation[2])
-
-    @property
     def focal_length(self) -> float:
         """Focal length, the same along rows and columns [px]."""
         return self.height / 2 / math.tan(math.radians(self.fov_y_deg) / 2)
@@ -77,30 +81,117 @@ class Camera(Model):
         """
         return self.width / 2 - 1, self.height / 2 - 1
 
+    @property
+    def vertical(self) -> bool:
+        """Whether the optical axis is."""
+        return self.pinhole.X_CT[8:10] == (0.0, 0.0)
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The same model for compiled loops."""
+        return _pinhole(self)
+
     def to_camera(self, p_T: Floats) -> Floats:
         """Return points given in T [m] in C [m]. Shapes (N, 3)."""
-        X_CT = self.X_TC.inverse()
-        return np.asarray(p_T @ X_CT.rotation().matrix().T + X_CT.translation())
+        X_CT = _X_CT(self)
+        return np.asarray(p_T @ X_CT[:, :3].T + X_CT[:, 3])
+
+    def depth(self, p_T: Floats) -> Floats:
+        """Return how far points (N, 3) [m] are along the optical axis [m]. Shape (N,)."""
+        return self.to_camera(p_T)[:, 2]
 
     def project(self, p_T: Floats) -> Floats:
         """Return column and row of the pixels on which points fall. Shapes (N, 3) [m] to (N, 2) [px]."""
-        p_C = self.to_camera(p_T)
-        return np.asarray(self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point))
+        return self.project_with_depth(p_T)[0]
 
-    def backproject(self, pixels: Floats, depth: Floats) -> Floats:
-        """Return the points at pixels and depths.
+    def project_with_depth(self, p_T: Floats) -> tuple[Floats, Floats]:
+        """Return what `project` and `depth` do."""
+        p_C = self.to_camera(p_T)
+        return np.asarray(self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point)), p_C[:, 2]
+
+    def backproject(self, pixels: NDArray[Any], depth: NDArray[Any]) -> NDArray[Any]:
+        """Return the points at pixels and depths, in the images' type.
 
         Args:
-            pixels: Column and row [px]. Shape (N, 2).
-            depth: Along the optical axis [m]. Shape (N,).
+            pixels: Column and row [px]. Shape (..., 2).
+            depth: Along the optical axis [m]. Shape (...).
 
         Returns:
-            p_T [m]. Shape (N, 3).
+            p_T [m]. Shape (..., 3).
         """
-        p_C = self.rays(pixels) * np.asarray(depth, float)[:, None]
-        return np.asarray(p_C @ self.X_TC.rotation().matrix().T + self.X_TC.translation())
+        u0, v0 = self.principal_point
+        x = (pixels[..., 0] - u0) * depth / self.focal_length
+        y = (pixels[..., 1] - v0) * depth / self.focal_length
+        R_TC, p_TC = self.X_TC.rotation().matrix().tolist(), self.X_TC.translation().tolist()
+        return np.stack([_along(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)], axis=-1)
 
-    def rays(self, pixels: Floats) -> Floats:
-        """Return directions in C through pixels (N, 2), with z = 1. Shape (N, 3)."""
+    def rays(self, pixels: NDArray[Any]) -> Floats:
+        """Return directions in C through pixels (..., 2) [px], with z = 1. Shape (..., 3)."""
         along = (np.asarray(pixels, float) - np.array(self.principal_point)) / self.focal_length
-        return np.column_stack([along, np.ones(len(along))])
+        return np.concatenate([along, np.ones((*along.shape[:-1], 1))], axis=-1)
+
+    @property
+    def floor_depth(self) -> NDArray[np.float32]:
+        """What the camera would see of the plane of the support's floor alone.
+
+        Along the optical axis [m], infinite where the plane is not met. Shape (height, width); not to be written to.
+        """
+        return _floor_depth(self)
+
+    def support_bounds(self, support: Support, height: float) -> tuple[Floats, float] | None:
+        """Return where the support is in the image, with all that stands on it.
+
+        Args:
+            support: What the objects stand on; it is taken to be as wide as long.
+            height: Of what stands on it [m].
+
+        Returns:
+            Column and row of the middle (2,) and side [px] of the upright square that holds it; None if a part of it is
+            not before the camera.
+        """
+        half = max(support.half_size)
+        corners = np.array([[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, height)])
+        if (self.depth(corners) < NEAREST).any():
+            return None
+        pixels = self.project(corners)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        return (low + high) / 2, float((high - low).max())
+
+    def sees(self, support: Support) -> bool:
+        """Return whether any part of the support's floor is in the image."""
+        x, y = (np.linspace(-half, half, 41) for half in support.half_size)
+        p_T = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
+        p_T = p_T[self.depth(p_T) > NEAREST]
+        if self.X_TC.translation()[2] <= 0 or not len(p_T):
+            return False
+        pixels = self.project(p_T)
+        return bool(((pixels >= -0.5) & (pixels < [self.width - 0.5, self.height - 0.5])).all(axis=1).any())
+
+
+def _along(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return the sum of components by a row of a rotation; what counts for nothing is left out, also where it is infinite."""
+    terms = [factor * component for factor, component in zip(row, components, strict=True) if factor]
+    return np.asarray(sum(terms[1:], terms[0]))
+
+
+@lru_cache(maxsize=64)
+def _X_CT(camera: Camera) -> Floats:
+    return np.asarray(camera.X_TC.inverse().GetAsMatrix34())
+
+
+@lru_cache(maxsize=64)
+def _pinhole(camera: Camera) -> Pinhole:
+    x, y, z = camera.X_TC.translation().tolist()
+    return Pinhole(camera.focal_length, *camera.principal_point, tuple(_X_CT(camera).ravel().tolist()), (x, y, z))
+
+
+@lru_cache(maxsize=16)
+def _floor_depth(camera: Camera) -> NDArray[np.float32]:
+    rays = camera.rays(pixel_grid((camera.height, camera.width)))
+    down = rays @ camera.X_TC.rotation().matrix()[2]
+    height = camera.X_TC.translation()[2]
+    depth = np.full(down.shape, np.inf)
+    np.divide(-height, down, out=depth, where=down * height < -_PARALLEL * abs(height))
+    found = depth.astype(np.float32)
+    found.setflags(write=False)
+    return found

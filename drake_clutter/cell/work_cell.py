@@ -15,7 +15,7 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
 from drake_clutter.resources import shipped_path
-from drake_clutter.validation import Model, Text, allowed, load_typed, validate
+from drake_clutter.validation import Model, Text, allowed, load_typed, refused, validate
 from drake_clutter.yaml_text import read_yaml
 
 GripperSpec = SuctionGripper
@@ -52,6 +52,16 @@ class WorkCell(Model):
                 raise allowed(f"fixtures with names that differ, also from {', '.join(taken)}")
             taken.append(fixture.name)
         return fixtures
+
+    @field_validator("cameras")
+    @classmethod
+    def _first_sees_support(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
+        if unfit := [name for name in cameras if not name.isidentifier()]:
+            raise refused(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
+        name, camera = next(iter(cameras.items()))
+        if "support" in info.data and not camera.sees(info.data["support"]):
+            raise refused(f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image")
+        return cameras
 
     @property
     def camera(self) -> Camera:

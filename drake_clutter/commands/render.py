@@ -1,10 +1,11 @@
-"""`drake-clutter render`: what the overhead camera sees of a scene."""
+"""`drake-clutter render`: what the cameras of the cell see of a scene."""
 
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
@@ -16,17 +17,27 @@ DEPTH_UNIT = 1e-4
 
 
 def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, float]:
-    """Writes the images of a scene at rest; returns the visible share of each object.
+    """Writes the images of a scene at rest, with a camera's name before theirs if there are several.
 
     `label.png` holds 0 for what is no object and k for the k-th object of the scene.
+
+    Returns:
+        The visible share of each object, of the camera that an explorer sees through.
     """
-    camera = OverheadCamera(config.cell.camera)
+    cameras = config.cell.cameras
+    shares = [_render(scene, camera, out, f"{name}_" if len(cameras) > 1 else "") for name, camera in cameras.items()]
+    Image.fromarray(PictureCamera().oblique(scene)).save(out / "picture.png")
+    return shares[0]
+
+
+def _render(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
+    """Writes what one camera sees; returns the visible share of each object."""
+    camera = OverheadCamera(config)
     images, shares = camera.render(scene), camera.visible_shares(scene)
     depth = np.where(np.isfinite(images.depth), images.depth / DEPTH_UNIT, 0)
-    Image.fromarray(images.color).save(out / "color.png")
-    Image.fromarray(np.rint(depth).astype(np.uint16)).save(out / "depth.png")
-    Image.fromarray((images.label + 1).astype(np.uint8)).save(out / "label.png")
-    Image.fromarray(PictureCamera().oblique(scene)).save(out / "picture.png")
+    Image.fromarray(images.color).save(out / f"{prefix}color.png")
+    Image.fromarray(np.rint(depth).astype(np.uint16)).save(out / f"{prefix}depth.png")
+    Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
     hidden = list(camera.hidden(shares))
-    write_json(out / "visible.json", {"visible_share": shares, "hidden": hidden, "names": list(scene.names)})
+    write_json(out / f"{prefix}visible.json", {"visible_share": shares, "hidden": hidden, "names": list(scene.names)})
     return shares

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
-from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds
+from drake_clutter.cell.pinhole import pose_in_camera
+from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds, rays_of_row
 from drake_clutter.scenes.scene import Pose
 
 _AGREES = 0.008
@@ -62,17 +63,19 @@ class Explanation:
 
 
 @njit(cache=True, error_model="numpy")
-def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ignore[no-untyped-def]
-    """(rows, columns) int8 what the pixels within bounds say of a pose, how far away it is (m), and how many it covers."""
-    top, bottom, left, right = bounds
-    middle_u, middle_v = depth.shape[1] / 2 - 1, depth.shape[0] / 2 - 1
+def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-def]
+    """First row and column of a rectangle that holds a pose; what its pixels say of it, int8, and how far away it is there, m.
+
+    Last the number of pixels that it covers.
+    """
+    R, p = pose_in_camera(camera, R, p)
+    top, bottom, left, right = image_bounds(half, R, p, depth.shape, camera)
     said, far = np.zeros((bottom - top, right - left), np.int8), np.zeros((bottom - top, right - left), np.float32)
-    e, h, alone = eye_in(R, p, altitude), (half[0], half[1], half[2]), 0
-    step, distances = (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal), np.empty(right - left)
+    e, h, alone = eye_in(R, p), (half[0], half[1], half[2]), 0
+    distances = np.empty(right - left)
     for v in range(top, bottom):
-        y = (middle_v - v) / focal
-        ray = (R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2])
-        distances_along(cylinder, h, e, ray, step, left - middle_u, 1, distances)
+        ray, step = rays_of_row(R, v, camera)
+        distances_along(cylinder, h, e, ray, step, left - camera.u0, 1, distances)
         for u in range(left, right):
             away = distances[u - left]
             if away == np.inf:
@@ -86,17 +89,15 @@ def _compared(cylinder, half, R, p, depth, bounds, altitude, focal):  # type: ig
                 said[v - top, u - left] = _SEEN_PAST
             elif seen > away - _AGREES:
                 said[v - top, u - left] = _SEEN
-    return said, far, alone
+    return top, left, said, far, alone
 
 
 def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera) -> Explanation:
     """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
     half, R, p = np.asarray(object_class.size) / 2, np.ascontiguousarray(X_TO.rotation), np.asarray(X_TO.p, float)
-    depth = np.ascontiguousarray(depth, np.float32)
-    bounds = image_bounds(half, R, p, depth.shape, camera.altitude, camera.focal_length)
-    cylinder = object_class.shape is Shape.CYLINDER
-    said, away, alone = _compared(cylinder, half, R, p, depth, bounds, camera.altitude, camera.focal_length)
-    return Explanation(bounds[0], bounds[2], said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
+    depth, cylinder = np.ascontiguousarray(depth, np.float32), object_class.shape is Shape.CYLINDER
+    top, left, said, away, alone = _compared(cylinder, half, R, p, depth, camera.pinhole)
+    return Explanation(top, left, said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
 
 
 def chosen(

@@ -36,7 +36,6 @@ MOST_INSTANCES = 255
 _NO_INSTANCE = 255
 _DEPTH_UNIT = 1e-4
 """m."""
-_R_TC = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -76,17 +75,21 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: Camera, 
     Args:
         folder: not there yet; what an interrupted run left of it is replaced.
         images: of the scene, with at most 255 instances each.
-        camera: the overhead camera that took them.
+        camera: what took them.
         class_names: of the catalogue, in its order.
     """
     temporary = folder.with_name(f".{folder.name}")
     shutil.rmtree(temporary, ignore_errors=True)
     for kind in (COLOR, DEPTH, LABEL):
         (temporary / kind).mkdir(parents=True)
-    p_CT = [0.0, 0.0, 1000 * camera.altitude]
-    middle = (camera.width / 2 - 1, camera.height / 2 - 1)  # see Camera.project
-    K = [camera.focal_length, 0.0, middle[0], 0.0, camera.focal_length, middle[1], 0.0, 0.0, 1.0]
-    eye = {"cam_K": K, "depth_scale": 1000 * _DEPTH_UNIT, "cam_R_w2c": _R_TC.T.ravel().tolist(), "cam_t_w2c": p_CT}
+    X_CT, (u0, v0) = camera.X_TC.inverse(), camera.principal_point
+    K = [camera.focal_length, 0.0, u0, 0.0, camera.focal_length, v0, 0.0, 0.0, 1.0]
+    eye = {
+        "cam_K": K,
+        "depth_scale": 1000 * _DEPTH_UNIT,
+        "cam_R_w2c": X_CT.rotation().matrix().ravel().tolist(),
+        "cam_t_w2c": (1000 * X_CT.translation() + 0.0).tolist(),  # without -0.0
+    }
     eyes, poses, infos = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     coco: dict[str, Any] = {"images": [], "annotations": []}
     coco["categories"] = [{"id": k, "name": name} for k, name in enumerate(class_names, start=1)]
@@ -133,8 +136,8 @@ def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
 
 
 def _in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
-    R_CO = _R_TC.T @ X_TO.rotation
-    p_CO = _R_TC.T @ (X_TO.p - [0.0, 0.0, camera.altitude])
+    R_CT = camera.X_TC.rotation().matrix().T
+    R_CO, p_CO = R_CT @ X_TO.rotation, R_CT @ (X_TO.p - camera.X_TC.translation())
     return {"cam_R_m2c": R_CO.round(9).ravel().tolist(), "cam_t_m2c": (1000 * p_CO).round(6).tolist()}
 
 

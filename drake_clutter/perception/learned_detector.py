@@ -82,7 +82,11 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
 
 
 class LearnedDetector:
-    """Detects objects of some classes in depth, or in depth and colour."""
+    """Detects objects of some classes in depth, or in depth and colour.
+
+    The shipped networks learned from the default cell's camera: from above the tray's middle, straight down. What another
+    one shows them is not rectified; the poses are fitted to any.
+    """
 
     def __init__(self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: Camera, support: Support) -> None:
         """With a trained network, for objects of these classes, of which it must know all."""
@@ -125,7 +129,9 @@ class LearnedDetector:
             poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
         clean = without_holes(np.where(depth > 0, depth, np.nan))
-        clean[np.abs(clean - self._camera.altitude) < FLOOR_WITHIN] = self._camera.altitude
+        floor = self._camera.floor_depth
+        at_floor = np.abs(clean - floor) < FLOOR_WITHIN
+        clean[at_floor] = floor[at_floor]
         for candidate in _best(poses, depth.shape):
             name, e = candidate.object_class.name, candidate.explains
             mask = e.mask(depth.shape)

@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, Floats, View, worth
+from drake_clutter.cell.pinhole import Floats, backproject
+from drake_clutter.perception.pose_score import COARSE_RAYS, WITHIN, View, worth
 
 FEWEST_POINTS = 12
 _COARSE_WITHIN = 0.015
@@ -15,21 +16,31 @@ _FIRST_RAYS, _PROMISING = 60, 10
 _ON_PLANE = 0.004
 _PLANE_TRIES = 120
 _SECOND_PLANE_SHARE = 0.1
+_BELOW_FLOOR = 0.05
+"""m below the floor, where nothing is that was measured rightly."""
 _PLANE_LEVEL_WITHIN = math.radians(4.0)
 SLACKS = (0.012, 0.048)
 """m, by which points may reach past the face that they are said to lie on; the second where the first leaves nothing good."""
 
 
 @njit(cache=True, nogil=True)
+def _point(camera, u, v, z):  # type: ignore[no-untyped-def]
+    """p_TP, m, of what is seen at a pixel at a depth, m; infinitely deep if nothing is measured there."""
+    if not 0.05 < z < np.inf:
+        return np.inf, np.inf, -np.inf
+    return backproject(camera, u, v, z)
+
+
+@njit(cache=True, nogil=True)
 def spread_points(view, most):  # type: ignore[no-untyped-def]
     """The object's measured points (N, 3) m in T, at most so many, and those at its own edges, (M, 3)."""
     height, width = view.depth.shape
-    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    camera = view.camera
     row, row_end, column, column_end = view.window
     total = 0
     for v in range(row, row_end):
         for u in range(column, column_end):
-            if view.mask[v, u] and 0.05 < view.depth[v, u] < view.altitude + 0.05:
+            if view.mask[v, u] and _point(camera, u, v, view.depth[v, u])[2] > -_BELOW_FLOOR:
                 total += 1
     every = max(1, (total + most - 1) // most)
     points, edges = np.empty((total // every + 1, 3)), np.empty((total + 1, 3))
@@ -37,18 +48,20 @@ def spread_points(view, most):  # type: ignore[no-untyped-def]
     for v in range(row, row_end):
         for u in range(column, column_end):
             z = view.depth[v, u]
-            if not (view.mask[v, u] and 0.05 < z < view.altitude + 0.05):
+            if not view.mask[v, u]:
                 continue
-            x, y = (u - middle_u) / view.focal_length * z, (middle_v - v) / view.focal_length * z
+            point = _point(camera, u, v, z)
+            if not point[2] > -_BELOW_FLOOR:
+                continue
             if count % every == 0:
-                points[found, 0], points[found, 1], points[found, 2] = x, y, view.altitude - z
+                points[found, 0], points[found, 1], points[found, 2] = point
                 found += 1
             count += 1
             for dv, du in ((0, 1), (1, 0), (0, -1), (-1, 0)):
                 j, i = v + dv, u + du
                 beside = 0 <= j < height and 0 <= i < width
                 if beside and not view.mask[j, i] and not view.depth[j, i] < z - WITHIN:
-                    edges[at_edge, 0], edges[at_edge, 1], edges[at_edge, 2] = x, y, view.altitude - z
+                    edges[at_edge, 0], edges[at_edge, 1], edges[at_edge, 2] = point
                     at_edge += 1
                     break
     return points[:found], edges[:at_edge]
@@ -103,7 +116,7 @@ def _on_plane(points, n, p):  # type: ignore[no-untyped-def]
     return member, total, mean, scatter
 
 
-def _plane(points: Floats, altitude: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _plane(points: Floats, p_TC: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
     n, p = _fullest_plane(points)
     for _ in range(2):
@@ -111,7 +124,7 @@ def _plane(points: Floats, altitude: float) -> tuple[Floats, Floats, NDArray[np.
         if total < 3:
             break
         n, p = np.linalg.eigh(scatter)[1][:, 0].copy(), mean
-    return (n if n[2] * altitude >= n @ p else -n), p, member
+    return (n if n @ p_TC >= n @ p else -n), p, member
 
 
 @njit(cache=True)
@@ -253,10 +266,11 @@ def candidates(
     """
     R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0
     guess, given = view.p_TO_guess, (slack, R, p_TO)
-    n, p, member = _plane(points, view.altitude)
+    p_TC = np.array(view.camera.p_TC)
+    n, p, member = _plane(points, p_TC)
     planes, rest = [(n, p, points[member])], points[~member]
     if len(rest) > max(FEWEST_POINTS, _SECOND_PLANE_SHARE * len(points)):
-        second_n, second_p, second_member = _plane(rest, view.altitude)
+        second_n, second_p, second_member = _plane(rest, p_TC)
         if abs(n @ second_n) < 0.2 and second_member.sum() > _SECOND_PLANE_SHARE * len(points):
             planes.append((second_n, second_p, rest[second_member]))
     normals = [np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(_PLANE_LEVEL_WITHIN) else n for n, _, _ in planes]

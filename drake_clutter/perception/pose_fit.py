@@ -81,7 +81,7 @@ def _surface(object_class: ObjectClass) -> Floats:
 
 
 class PoseFitter:
-    """Fits boxes and cylinders to what the overhead camera sees of them."""
+    """Fits boxes and cylinders to what a camera sees of them."""
 
     def __init__(self, config: Camera) -> None:
         """Makes a fitter for the camera's images."""
@@ -112,7 +112,7 @@ class PoseFitter:
         if window is None:
             return None
         depth, mask = np.ascontiguousarray(depth, np.float32), np.ascontiguousarray(mask, bool)
-        view = View(depth, mask, window, guess, self.config.altitude, self.config.focal_length)
+        view = View(depth, mask, window, guess, self.config.pinhole)
         points, edges = spread_points(view, _MOST_POINTS)
         if len(points) < FEWEST_POINTS:
             return None
@@ -132,7 +132,7 @@ class PoseFitter:
     def _window(self, object_class: ObjectClass, mask: NDArray[np.bool_], p_TO_guess: Floats) -> tuple[int, int, int, int] | None:
         """First row, end row, first column, end column of the mask near the guess; None if it is empty there."""
         reach = float(np.linalg.norm(object_class.size)) / 2 + _GUESS_WITHIN
-        radius = self.config.focal_length * reach / max(self.config.altitude - p_TO_guess[2] - reach, 0.1)
+        radius = self.config.focal_length * reach / max(self.config.depth(p_TO_guess[None])[0] - reach, 0.1)
         u, v = self.config.project(p_TO_guess[None])[0]
         top, bottom = max(0, math.floor(v - radius)), max(0, math.ceil(v + radius) + 1)
         left, right = max(0, math.floor(u - radius)), max(0, math.ceil(u + radius) + 1)

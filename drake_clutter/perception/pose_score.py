@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from drake_clutter.cell.pinhole import Floats, Pinhole, pose_in_camera, project
 
 WITHIN = 0.006
 """m along the optical axis, within which what is seen agrees with a pose."""
@@ -34,16 +34,14 @@ class View(NamedTuple):
         mask: (height, width) bool.
         window: first row, end row, first column, end column of the mask.
         p_TO_guess: (3,) m.
-        altitude: m.
-        focal_length: pixels.
+        camera: what it is seen by.
     """
 
     depth: NDArray[np.float32]
     mask: NDArray[np.bool_]
     window: tuple[int, int, int, int]
     p_TO_guess: Floats
-    altitude: float
-    focal_length: float
+    camera: Pinhole
 
 
 @njit(cache=True, error_model="numpy")
@@ -96,60 +94,69 @@ def distances_along(cylinder, h, e, ray, step, first, stride, away):  # type: ig
 
 
 @njit(cache=True)
-def eye_in(R, p, altitude):  # type: ignore[no-untyped-def]
-    """Where the camera is in O, of a pose R (3, 3), p (3,) m."""
+def eye_in(R, p):  # type: ignore[no-untyped-def]
+    """Where the camera is in O, of a pose R_CO (3, 3), p_CO (3) m."""
     return (
-        -R[0, 0] * p[0] - R[1, 0] * p[1] + R[2, 0] * (altitude - p[2]),
-        -R[0, 1] * p[0] - R[1, 1] * p[1] + R[2, 1] * (altitude - p[2]),
-        -R[0, 2] * p[0] - R[1, 2] * p[1] + R[2, 2] * (altitude - p[2]),
+        -R[0, 0] * p[0] - R[1, 0] * p[1] - R[2, 0] * p[2],
+        -R[0, 1] * p[0] - R[1, 1] * p[1] - R[2, 1] * p[2],
+        -R[0, 2] * p[0] - R[1, 2] * p[1] - R[2, 2] * p[2],
     )
 
 
 @njit(cache=True, error_model="numpy")
-def image_bounds(half, R, p, shape, altitude, focal):  # type: ignore[no-untyped-def]
-    """First row, end row, first column, end column of the pixels that a box of half sizes (3,) m falls on; none if too close."""
+def image_bounds(half, R, p, shape, camera):  # type: ignore[no-untyped-def]
+    """First row, end row, first column, end column of the pixels that a box of half sizes (3,) m falls on; none if too close.
+
+    Its pose is given in C, R_CO (3, 3) and p_CO (3) m.
+    """
     height, width = shape
-    middle_u, middle_v = width / 2 - 1, height / 2 - 1
     top, bottom, left, right = height, 0, width, 0
     for corner in range(8):
         x = half[0] if corner & 1 else -half[0]
         y = half[1] if corner & 2 else -half[1]
         z = half[2] if corner & 4 else -half[2]
-        away = altitude - p[2] - R[2, 0] * x - R[2, 1] * y - R[2, 2] * z
+        away = p[2] + R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         if away < 0.05:
             return 0, 0, 0, 0
-        u = middle_u + focal * (p[0] + R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / away
-        v = middle_v - focal * (p[1] + R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / away
+        right_of = p[0] + R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        below = p[1] + R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        u, v = project(camera, right_of, below, away)
         top, bottom = min(top, math.floor(v)), max(bottom, math.ceil(v) + 1)
         left, right = min(left, math.floor(u)), max(right, math.ceil(u) + 1)
     top, left = min(max(top, 0), height), min(max(left, 0), width)
     return top, max(top, min(bottom, height)), left, max(left, min(right, width))
 
 
+@njit(cache=True)
+def rays_of_row(R, v, camera):  # type: ignore[no-untyped-def]
+    """In O, of a pose R_CO (3, 3): the ray at the optical axis' column of row v, and the step from column to column."""
+    y, focal = (v - camera.v0) / camera.focal_length, camera.focal_length
+    ray = (R[1, 0] * y + R[2, 0], R[1, 1] * y + R[2, 1], R[1, 2] * y + R[2, 2])
+    return ray, (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
-    height, width = view.depth.shape
-    middle_u, middle_v, focal, window = width / 2 - 1, height / 2 - 1, view.focal_length, view.window
-    top, bottom, left, right = image_bounds(half, R, p, view.depth.shape, view.altitude, focal)
+    camera, window = view.camera, view.window
+    R, p = pose_in_camera(camera, R, p)
+    top, bottom, left, right = image_bounds(half, R, p, view.depth.shape, camera)
     if top == bottom or left == right:
         return 0.0
     row, row_end = min(window[0], top), max(window[1], bottom)
     column, column_end = min(window[2], left), max(window[3], right)
     stride = max(1, round(math.sqrt((window[1] - window[0]) * (window[3] - window[2]) / rays)))
-    e = eye_in(R, p, view.altitude)
+    e = eye_in(R, p)
     h = (half[0], half[1], half[2])
-    step = (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal)
     speaks_for, against = 0.0, 0.0
     row_of_rays = np.empty((column_end - column) // stride + 2)
     for v in range(row - row % stride, row_end, stride):
         if v < row:
             continue
-        y = (middle_v - v) / focal
-        ray = (R[1, 0] * y - R[2, 0], R[1, 1] * y - R[2, 1], R[1, 2] * y - R[2, 2])
+        ray, step = rays_of_row(R, v, camera)
         first = column - column % stride + (v // stride) % stride
         distances = row_of_rays[: max(0, (column_end - first + stride - 1) // stride)]
-        distances_along(cylinder, h, e, ray, step, first - middle_u, stride, distances)
+        distances_along(cylinder, h, e, ray, step, first - camera.u0, stride, distances)
         for k in range(len(distances)):
             u, away = first + k * stride, distances[k]
             seen, ours = view.depth[v, u], view.mask[v, u]

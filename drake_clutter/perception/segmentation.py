@@ -44,7 +44,7 @@ _PIXEL = 0.0025
 
 @dataclass(frozen=True)
 class Window:
-    """The square part of the image that holds the tray, about its middle.
+    """The square part of the image that holds the tray.
 
     Attributes:
         rows, columns: of the image.
@@ -55,10 +55,13 @@ class Window:
 
     @staticmethod
     def of(camera: Camera, support: Support) -> "Window":
-        """Of a camera over a tray."""
-        reach = camera.focal_length * max(support.half_size) / (camera.altitude - _HIGHEST)
-        side = min(_MULTIPLE * math.ceil(2 * reach / _MULTIPLE), min(camera.width, camera.height) // _MULTIPLE * _MULTIPLE)
-        top, left = (camera.height - side) // 2, (camera.width - side) // 2
+        """Of a camera that looks at a support."""
+        size = np.array([camera.width, camera.height])
+        middle, wanted = camera.support_bounds(support, _HIGHEST) or (np.array(camera.principal_point), math.inf)
+        side = min(size) // _MULTIPLE * _MULTIPLE
+        if wanted < side:
+            side = _MULTIPLE * math.ceil(wanted / _MULTIPLE)
+        left, top = np.clip(np.floor(middle + 1 - side / 2 + 1e-6).astype(int), 0, size - side).tolist()
         return Window(slice(top, top + side), slice(left, left + side))
 
     @property
@@ -75,9 +78,7 @@ def points(depth: NDArray[np.float32], camera: Camera, window: Window) -> NDArra
     """
     z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[window.rows, window.columns]
     row, column = np.mgrid[window.rows, window.columns].astype(np.float32)
-    x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
-    y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length
-    return np.stack([x, y, camera.altitude - z], axis=-1).astype(np.float32)
+    return camera.backproject(np.stack([column, row], axis=-1), z).astype(np.float32)
 
 
 def coarse(array: NDArray[Element]) -> NDArray[Element]:

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from drake_clutter.cell.camera import pixel_grid
 from drake_clutter.reports.drawing import Canvas, Label, middle
 from drake_clutter.reports.pictures import humanised
 from drake_clutter.scenes.interfaces import Observation
@@ -19,12 +20,18 @@ _INK = "#d7263d"
 
 
 def detections_picture(observation: Observation) -> NDArray[np.uint8]:
-    """(720, 720, 3) the middle of the image, the brighter, the higher above the tray; with outlines of what was recognised."""
+    """(720, 720, 3) where the tray is in the image, the brighter, the higher above it; with outlines of what was recognised."""
     camera, depth = observation.camera, observation.depth
-    reach = camera.focal_length * max(observation.support.size) / (camera.altitude - _TALL)
-    side = min(round(reach), camera.width, camera.height)
-    rows, columns = (slice((n - side) // 2, (n - side) // 2 + side) for n in (camera.height, camera.width))
-    height = camera.altitude - np.where(np.isfinite(depth) & (depth > 0), depth, camera.altitude)[rows, columns]
+    size_px = np.array([camera.width, camera.height])
+    middle_px, wanted = camera.support_bounds(observation.support, _TALL) or (np.array(camera.principal_point), np.inf)
+    side = int(min(np.round(wanted), *size_px))
+    left, top = np.clip(np.floor(middle_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side).tolist()
+    rows, columns = slice(top, top + side), slice(left, left + side)
+    pixels = pixel_grid(depth.shape)[rows, columns]
+    measured = np.isfinite(depth) & (depth > 0)
+    height = np.where(
+        measured[rows, columns], camera.backproject(pixels, np.where(measured, depth, 1.0)[rows, columns])[..., 2], 0.0
+    )
     shades = matplotlib.colormaps["viridis"](np.clip(height / _HIGHEST, 0, 1))[..., :3]
     size = (_OVERSAMPLING * SIDE, _OVERSAMPLING * SIDE)
     canvas = Canvas(Image.fromarray((255 * shades).astype(np.uint8)).resize(size, Image.Resampling.NEAREST))

@@ -12,9 +12,12 @@ from pydrake.geometry import LightParameter, RenderEngineVtkParams
 from scipy.ndimage import find_objects
 
 from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.support import Support
+from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.reports.drawing import Canvas, Label, Rectangle, middle
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.camera import Images, OverheadCamera
+from drake_clutter.simulation.plant import pose_of
 
 OVERHEAD_SIZE = (720, 720)
 OBLIQUE_SIZE = (960, 720)
@@ -23,7 +26,7 @@ OBLIQUE_SIZE = (960, 720)
 _OVERSAMPLING = 2
 _FOV_Y_DEG = 30.0
 # For a tray of 0.7 m, that is, with room for a stack at its rim; pictures of other trays are taken from farther or nearer.
-_ALTITUDE, _TRAY_SIDE = 1.60, 0.70
+_ABOVE, _TRAY_SIDE = 1.60, 0.70
 _EYE, _TARGET = (0.45, -1.30, 1.05), (0.0, -0.02, 0.08)
 
 
@@ -176,33 +179,29 @@ class PictureCamera:
 
     @cached_property
     def _overhead(self) -> OverheadCamera:
-        return _camera(OVERHEAD_SIZE)
+        return OverheadCamera(_over(default_cell().support, OVERHEAD_SIZE), ENGINE)
 
     @cached_property
     def _oblique(self) -> OverheadCamera:
-        return _camera(OBLIQUE_SIZE)
+        return OverheadCamera(_over(default_cell().support, OBLIQUE_SIZE), ENGINE)
 
     def _from_above(self, scene: Scene) -> Images:
         # One move's picture "after" shows the same scene as the next one's "before".
         if self._latest is None or self._latest[0] is not scene:
-            altitude = _ALTITUDE * max(scene.support.size) / _TRAY_SIDE
-            self._latest = scene, self._overhead.render(scene, Pose((0.0, 0.0, altitude), (0.0, 1.0, 0.0, 0.0)))
+            self._latest = scene, self._overhead.render(scene, pose_of(_over(scene.support).X_TC))
         return self._latest[1]
 
     def _project(self, scene: Scene, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (N, 2) in the picture from above, before it is scaled down, of points (N, 3) m in the tray frame."""
-        config = self._overhead.config
+        camera = _over(scene.support)
         # Nothing reaches the camera, save what a collapse has flung there.
-        distance = np.maximum(_ALTITUDE * max(scene.support.size) / _TRAY_SIDE - p_T[:, 2:], 0.05)
-        centre = (np.array([config.width, config.height]) - 1) / 2
-        return np.asarray(centre + config.focal_length * p_T[:, :2] * [1, -1] / distance)
+        return camera.project(np.minimum(p_T, [np.inf, np.inf, camera.X_TC.translation()[2] - 0.05]))
 
 
-def _camera(size: tuple[int, int]) -> OverheadCamera:
-    width, height = size
-    return OverheadCamera(
-        Camera.over(_ALTITUDE, width=_OVERSAMPLING * width, height=_OVERSAMPLING * height, fov_y_deg=_FOV_Y_DEG), ENGINE
-    )
+def _over(support: Support, size: tuple[int, int] = OVERHEAD_SIZE) -> Camera:
+    """A camera for pictures of a size from above a support."""
+    width, height = (_OVERSAMPLING * pixels for pixels in size)
+    return Camera.over(_ABOVE * max(support.size) / _TRAY_SIDE, width=width, height=height, fov_y_deg=_FOV_Y_DEG)
 
 
 def _bounds(points: NDArray[np.float64]) -> Rectangle:

@@ -237,7 +237,7 @@ class Observation:
     Attributes:
         depth: (height, width) m along the camera's axis, inf where nothing is seen.
         detections: V_t, the objects that can be detected now.
-        camera: intrinsics and altitude.
+        camera: what has seen it.
         support: what the objects stand on.
     """
 

@@ -12,6 +12,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalogue import ObjectClass
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.pinhole import NEAREST, in_camera, project
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
@@ -59,17 +61,19 @@ class _Grid:
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
 
 
-def _pixels(observation: Observation, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the pixel that points (N, 3) m fall on; points out of the frame fall on its edge."""
-    camera = observation.camera
-    columns, rows = np.rint(camera.project(p_T)).astype(np.int64).T
-    return np.clip(rows, 0, camera.height - 1), np.clip(columns, 0, camera.width - 1)
+def _pixels(camera: Camera, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Row and column of the pixel that each of points (N, 3) m falls on, and how deep it is, m; NaN if out of the frame."""
+    pixels, depth = camera.project_with_depth(p_T)
+    columns, rows = np.rint(pixels).astype(np.int64).T
+    within = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width) & (depth > NEAREST)
+    rows, columns = np.clip(rows, 0, camera.height - 1), np.clip(columns, 0, camera.width - 1)
+    return rows, columns, np.where(within, depth, np.nan)
 
 
 def seen_through(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(N,) whether the camera sees past each point (N, 3) m in the tray frame, so that it is known to be free."""
-    rows, columns = _pixels(observation, p_T)
-    return np.asarray(observation.depth[rows, columns] >= observation.camera.altitude - p_T[:, 2])
+    rows, columns, depth = _pixels(observation.camera, p_T)
+    return np.asarray(observation.depth[rows, columns] >= depth)
 
 
 class _Turned(NamedTuple):
@@ -124,8 +128,9 @@ def _top_places(observation: Observation, target: Detection) -> tuple[NDArray[np
     x0, y0 = (max(int(np.searchsorted(axis, low)) - 1, 0) for axis, low in zip(axes, lower, strict=True))
     x1, y1 = (int(np.searchsorted(axis, high)) + 1 for axis, high in zip(axes, upper, strict=True))
     x, y = np.meshgrid(grid.x[x0:x1], grid.y[y0:y1], indexing="ij")
-    rows, columns = _pixels(observation, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)]))
-    at_top = np.abs(observation.depth[rows, columns] - (observation.camera.altitude - floor)) < _DEPTH_TOLERANCE
+    p_T = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)])
+    rows, columns, depth = _pixels(observation.camera, p_T)
+    at_top = np.abs(observation.depth[rows, columns] - depth) < _DEPTH_TOLERANCE
     top = (at_top & target.mask[rows, columns]).reshape(x.shape)
     if not top.any():
         return np.empty((0, 2), np.int64), np.empty(0)
@@ -139,7 +144,7 @@ def _top_places(observation: Observation, target: Detection) -> tuple[NDArray[np
 
 
 @njit(cache=True)
-def _first_fits(depth, altitude, focal_length, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
+def _first_fits(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
     """The first of the cells over which the footprint is free at all levels (m), and those of the same cost: their positions."""
     height, width = depth.shape
     n, m = len(x), len(y)
@@ -158,10 +163,13 @@ def _first_fits(depth, altitude, focal_length, x, y, levels, footprint, cells, c
             if known[i, j] == 0:
                 known[i, j] = 1
                 for level in levels:
-                    distance = altitude - level
-                    column = int(np.rint(focal_length * x[i] / distance + (width / 2 - 1)))
-                    row = int(np.rint(-focal_length * y[j] / distance + (height / 2 - 1)))
-                    if depth[min(max(row, 0), height - 1), min(max(column, 0), width - 1)] < distance:
+                    p_x, p_y, away = in_camera(camera, x[i], y[j], level)
+                    seen = False
+                    if away > NEAREST:
+                        u, v = project(camera, p_x, p_y, away)
+                        column, row = int(np.rint(u)), int(np.rint(v))
+                        seen = 0 <= row < height and 0 <= column < width and depth[row, column] >= away
+                    if not seen:
                         known[i, j] = 2
                         break
             if known[i, j] == 2:
@@ -246,12 +254,14 @@ def _search_places(
         target = observation[move.place]
         floor, (cells, cost) = top_height(target), _top_places(observation, target)
     grid = _Grid.over(observation.support)
-    camera = observation.camera
+    camera = observation.camera.pinhole
     for yaw in _YAWS:
         turned = _turned(picked.object_class, picked.X_TO.quaternion, yaw, config.clearance)
         levels = floor + _DEPTH_TOLERANCE + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
+        if not observation.camera.vertical:  # nothing that is seen through below speaks for what is above
+            levels = np.append(levels, floor + turned.height + config.release_height)
         arguments = (grid.x, grid.y, levels, turned.footprint, cells, cost)
-        best = _first_fits(observation.depth, camera.altitude, camera.focal_length, *arguments)
+        best = _first_fits(observation.depth, camera, *arguments)
         if len(best):
             # In the order of the cells, so that a draw does not depend on how they were sorted.
             best = best[np.lexsort(cells[best].T[::-1])]

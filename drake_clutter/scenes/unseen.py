@@ -3,12 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, minimum_filter
+from scipy.ndimage import label, maximum_filter, minimum_filter
 from trimesh.bounds import oriented_bounds_2D
 
+from drake_clutter.cell.camera import pixel_grid
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import SceneObject
 
@@ -26,6 +28,9 @@ _HIGHEST = 0.98
 """Quantile of the heights of what is seen of something nameless: single pixels beyond are noise."""
 _EVERY = 2
 """Pixels, each way, of which one is looked at."""
+_CELL, _LEVEL, _STEP = 0.02, 0.01, 0.03
+"""m, side of the columns into which the space behind objects is cut, how fine their heights are, and by how much the heights of
+one block differ."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,37 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
     """
     lower = [float(o.bounds_T[0][2]) for o in known]
     shadows = [UnseenBlock.under(o.corners_T, z - _GAP) for o, z in zip(known, lower, strict=True) if z > _FLAT]
-    return (*shadows, *_nameless(known, observation, empty))
+    behind = [] if observation.camera.vertical else _behind(known, observation)
+    return (*shadows, *behind, *_nameless(known, observation, empty))
+
+
+def _behind(known: Sequence[SceneObject], observation: Observation) -> list[UnseenBlock]:
+    """What a camera that looks at an angle cannot see behind known objects; beside them nothing is thick enough to matter."""
+    eye, top = observation.camera.X_TC.translation(), max((o.top for o in known), default=0.0)
+    x, y = (np.arange(-count, count + 1) * (_CELL / 2) for count in (int(side / _CELL) for side in observation.support.size))
+    z = np.arange(_FLAT, top, _LEVEL)
+    p_TP = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)  # corners of the columns, and in between their middles
+    shadow, own = np.zeros(p_TP.shape[:3], bool), np.zeros(p_TP.shape[:3], bool)
+    for o in known:
+        half, R = np.asarray(o.object_class.size) / 2, o.X_TO.rotation
+        p_OP, p_OC = (p_TP - o.X_TO.p) @ R, (eye - o.X_TO.p) @ R
+        ray = np.where(np.abs(p_OP - p_OC) > 1e-12, p_OP - p_OC, 1e-12)
+        middle, reach = -p_OC / ray, half / np.abs(ray)
+        enters, leaves = (middle - reach).max(axis=-1), (middle + reach).min(axis=-1)
+        shadow |= (enters < leaves) & (enters < 1)
+        own |= (np.abs(p_OP) < half + _CELL / 2 + _NEAR_KNOWN).all(axis=-1)
+    full = maximum_filter(shadow, (3, 3, 1))[1::2, 1::2] & ~own[1::2, 1::2]
+    heights = np.where(full, np.minimum(z + _LEVEL, top), 0.0).max(axis=2, initial=0.0)
+    x, y = x[1::2], y[1::2]
+    blocks = []
+    for row, across in zip(heights, x, strict=True):
+        ends = np.flatnonzero(np.diff(np.ceil(row / _STEP), prepend=0, append=0))
+        for begin, end in pairwise(ends.tolist()):
+            if row[begin] > 0:
+                height, along = float(row[begin:end].max()), (y[begin] + y[end - 1]) / 2
+                size = (_CELL, _CELL * (end - begin), height)
+                blocks.append(UnseenBlock((float(across), float(along), height / 2), size, 0.0))
+    return blocks
 
 
 def under_nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> frozenset[str]:
@@ -89,7 +124,11 @@ def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDA
     for k in np.unique(part):
         mine = p_TP[part == k]
         if len(mine) >= _FEWEST and np.ptp(mine[:, :2], axis=0).min() > 0:
-            blocks.append(UnseenBlock.under(mine, float(np.quantile(mine[:, 2], _HIGHEST))))
+            top = float(np.quantile(mine[:, 2], _HIGHEST))
+            if not observation.camera.vertical:  # down to the floor along the rays
+                eye = observation.camera.X_TC.translation()
+                mine = np.vstack([mine, eye + (mine - eye) * (eye[2] / (eye[2] - mine[:, 2:]))])
+            blocks.append(UnseenBlock.under(mine, top))
     return blocks
 
 
@@ -98,15 +137,14 @@ def _nameless_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """p_TP (N, 3) m of what is seen and belongs to nothing known, and (N,) the number of the patch of the image it is in."""
     camera = observation.camera
-    z, floor = observation.depth[::_EVERY, ::_EVERY], minimum_filter(empty, _BESIDE)[::_EVERY, ::_EVERY]
-    row, column = (_EVERY * index for index in np.indices(z.shape))
+    plane = np.where(np.isfinite(camera.floor_depth), camera.floor_depth, 0)
+    z, floor = observation.depth[::_EVERY, ::_EVERY], (minimum_filter(empty - plane, _BESIDE) + plane)[::_EVERY, ::_EVERY]
+    pixels = _EVERY * pixel_grid(z.shape)
     measured = np.isfinite(z) & (z > 0) & np.isfinite(floor)  # where nothing can be measured, a detector may have filled holes
-    z = np.where(measured, z, floor)
-    x = (column - (camera.width / 2 - 1)) * z / camera.focal_length
-    y = -(row - (camera.height / 2 - 1)) * z / camera.focal_length
+    z = np.where(measured, z, np.nan)
+    x, y, height = np.moveaxis(camera.backproject(pixels, z), -1, 0)
     half_x, half_y = observation.support.half_size
     left = measured & (z < floor - _FLAT) & (np.abs(x) < half_x) & (np.abs(y) < half_y)
-    height = camera.altitude - z
     for o in known:
         where = np.nonzero(left)
         p_TP = np.column_stack([x[where], y[where], height[where]])

@@ -1,4 +1,4 @@
-"""The overhead camera: rendered images of a scene, and the share of each object that it sees."""
+"""A camera of the cell in Drake: rendered images of a scene, and the share of each object that it sees."""
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
@@ -19,7 +19,7 @@ from pydrake.geometry import (
     RenderCameraCore,
     RenderEngineVtkParams,
 )
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -58,11 +58,11 @@ class Images:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The overhead camera for Drake: what it renders with, and where it is.
+    """A camera for Drake: what it renders with, and where it is.
 
     Attributes:
         color, depth, label: cameras.
-        X_TC: its pose; C: z down along the optical axis, x along the tray's x.
+        X_TC: its pose.
     """
 
     color: ColorRenderCamera
@@ -75,26 +75,24 @@ class Intrinsics:
         """Of a config."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
-        over_tray = RenderCameraCore(RENDERER, info, _clipping_over_tray(config.altitude), RigidTransform())
-        X_TC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.0, 0.0, config.altitude])
+        over_tray = RenderCameraCore(RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform())
         depth = DepthRenderCamera(anywhere, DepthRange(0.1, 10.0))
-        return Intrinsics(ColorRenderCamera(anywhere, False), depth, ColorRenderCamera(over_tray, False), X_TC)
+        return Intrinsics(ColorRenderCamera(anywhere, False), depth, ColorRenderCamera(over_tray, False), config.X_TC)
 
 
-def _clipping_over_tray(altitude: float) -> ClippingRange:
+def _clipping_over_tray(X_TC: RigidTransform) -> ClippingRange:
     """Tight about whatever stands on the tray.
 
     Where two surfaces meet at the middle of a pixel, the engine lets the one win that it draws first, and its order changes
     with every engine. The tighter the range, the finer the depth, the rarer such a tie: 0.1 um instead of 3.
     """
-    return ClippingRange(max(0.05, altitude - 0.7), altitude + 0.5)
+    X_CT = X_TC.inverse()
+    middle, tilt = X_CT.translation()[2], float(np.hypot(*X_CT.rotation().matrix()[2, :2]))
+    return ClippingRange(max(0.05, middle - 0.7 - tilt), max(0.1, middle + 0.5 + tilt))
 
 
 class OverheadCamera:
-    """Renders scenes with one rendering engine that is kept alive, its objects moved from scene to scene.
-
-    Camera frame C: origin at the config's altitude over the tray's centre, z down along the optical axis, x along the tray's x.
-    """
+    """Renders scenes with one rendering engine that is kept alive, its objects moved from scene to scene."""
 
     def __init__(self, config: Camera, engine: RenderEngineVtkParams = ENGINE) -> None:
         """Makes a camera; `engine` sets light, background and shadows."""
@@ -105,7 +103,7 @@ class OverheadCamera:
         eye = Intrinsics.of(config)
         self._color_camera, self._depth_camera, self._label_camera, self._X_TC = eye.color, eye.depth, eye.label, eye.X_TC
         # Behind the camera.
-        self._X_T_parked = RigidTransform([0.0, 0.0, config.altitude + 5.0])
+        self._X_T_parked = RigidTransform(eye.X_TC @ [0.0, 0.0, -5.0])
 
     def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
         builder = DiagramBuilder()
@@ -162,7 +160,7 @@ class OverheadCamera:
 
         Args:
             scene: what to render.
-            X_TC: another place to look from, for pictures; None for the overhead camera's own.
+            X_TC: another place to look from, for pictures; None for the camera's own.
         """
         labels = self._show(scene, scene.names)
         X = self._X_TC if X_TC is None else rigid_transform(X_TC)

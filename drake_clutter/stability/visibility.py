@@ -1,8 +1,9 @@
 """Which object each of the camera's rays meets first, by compiled loops over the faces of convex objects.
 
-The rays go through the pixels' middles, with the intrinsics of `Camera`. The rays that meet a face fill a convex polygon
-of the image, row by row, and along a face the inverse distance is linear in the pixel: so a ray costs one addition and one
-comparison. Nothing but the floor of the tray is seen beside the objects; its rim stands behind them.
+The rays go through the pixels' middles, as `Camera` has them. The rays that meet a face fill a convex polygon of the
+image, row by row, and along a face the inverse depth is linear in the pixel: so a ray costs one addition and one comparison.
+Nothing but the plane of the support's floor is seen beside the objects; walls are not cast. An object that reaches behind
+the camera is out of its sight.
 """
 
 import math
@@ -13,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.pinhole import NEAREST, in_camera, project, turned_to_camera
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shapes import Floats, Ints, Shapes
@@ -20,15 +22,27 @@ from drake_clutter.stability.shapes import Floats, Ints, Shapes
 _MOST_COVERED = 64
 
 
+@njit(cache=True, inline="always")
+def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
+    """Of a plane's inverse depth, 1/m, the slopes along a row and down a column, and the value at pixel (0, 0).
+
+    The plane: its normal in T, and how far it is along that from the camera, m.
+    """
+    nx, ny, nz = turned_to_camera(camera, nx, ny, nz)
+    along, down = nx / camera.focal_length / k, ny / camera.focal_length / k
+    return along, down, nz / k - along * camera.u0 - down * camera.v0
+
+
 @njit(cache=True)
-def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  # type: ignore[no-untyped-def]
+def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
     """Casts all rays that may meet one object; where it is nearer than what is known, it is written down.
 
     Returns:
         The number of rays that meet it, whatever is before it.
     """
     height, width = hit.shape
-    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    eye = camera.p_TC
+    p_x, p_y, p_z = turned_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
     begin, end = np.zeros(height, np.int64), np.zeros(height, np.int64)  # columns of a face, row by row
     rays = 0
@@ -36,7 +50,7 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
         first, last = table.first_corner[face], table.first_corner[face + 1]
         nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
         corner = table.corner[first]
-        k = nx * (corner[0] + p_TO[0]) + ny * (corner[1] + p_TO[1]) + nz * (corner[2] + p_TO[2] - altitude)
+        k = nx * (corner[0] + p_TO[0] - eye[0]) + ny * (corner[1] + p_TO[1] - eye[1]) + nz * (corner[2] + p_TO[2] - eye[2])
         if k > -1e-9:
             continue  # turned away from the camera
         count = last - first
@@ -44,13 +58,11 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
             u, v = np.empty(count), np.empty(count)
         top, bottom = np.inf, -np.inf
         for c in range(count):
-            scale = focal_length / (altitude - table.corner[first + c, 2] - p_TO[2])
-            u[c] = middle_u + scale * (table.corner[first + c, 0] + p_TO[0])
-            v[c] = middle_v - scale * (table.corner[first + c, 1] + p_TO[1])
+            x, y, z = in_camera(camera, table.corner[first + c, 0], table.corner[first + c, 1], table.corner[first + c, 2])
+            u[c], v[c] = project(camera, x + p_x, y + p_y, z + p_z)
             top, bottom = min(top, v[c]), max(bottom, v[c])
-        # Inverse distance: its slope along a row and down a column, and its value at pixel (0, 0).
-        along, down = nx / focal_length / k, -ny / focal_length / k
-        start = -nz / k - along * middle_u - down * middle_v
+        # Inverse depth: its slope along a row and down a column, and its value at pixel (0, 0).
+        along, down, start = _inverse_depth(camera, nx, ny, nz, k)
         first_row, last_row = max(0, math.ceil(top)), min(height - 1, math.floor(bottom))
         for c in range(count):
             d = c + 1 if c + 1 < count else 0
@@ -81,33 +93,52 @@ def _cast_at(table, shape, p_TO, altitude, focal_length, label, nearest, hit):  
 
 
 @njit(cache=True)
-def _window(posed, p_TO, altitude, focal_length, image_shape):  # type: ignore[no-untyped-def]
-    """First row, last row, first column and last column (ends excluded) of a rectangle that holds an object's box."""
+def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
+    """First row, last row, first column and last column (ends excluded) of a rectangle that holds an object's box.
+
+    All are 0 if nothing of it is in the image.
+    """
     height, width = image_shape
-    middle_u, middle_v = width / 2 - 1, height / 2 - 1
+    p_x, p_y, p_z = turned_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     top, bottom, left, right = np.inf, -np.inf, np.inf, -np.inf
-    for z in (posed.lower[2], posed.upper[2]):
-        scale = focal_length / (altitude - z - p_TO[2])
-        left, right = min(left, scale * (posed.lower[0] + p_TO[0])), max(right, scale * (posed.upper[0] + p_TO[0]))
-        top, bottom = min(top, -scale * (posed.upper[1] + p_TO[1])), max(bottom, -scale * (posed.lower[1] + p_TO[1]))
-    row_begin, row_end = max(0, math.floor(middle_v + top)), min(height, math.ceil(middle_v + bottom) + 1)
-    column_begin, column_end = max(0, math.floor(middle_u + left)), min(width, math.ceil(middle_u + right) + 1)
+    for corner in range(8):
+        x, y, z = in_camera(
+            camera,
+            posed.upper[0] if corner & 1 else posed.lower[0],
+            posed.upper[1] if corner & 2 else posed.lower[1],
+            posed.upper[2] if corner & 4 else posed.lower[2],
+        )
+        if z + p_z < NEAREST:
+            return 0, 0, 0, 0
+        u, v = project(camera, x + p_x, y + p_y, z + p_z)
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    row_begin, row_end = max(0, math.floor(top)), min(height, math.ceil(bottom) + 1)
+    column_begin, column_end = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
     if row_end <= row_begin or column_end <= column_begin:
         return 0, 0, 0, 0
     return row_begin, row_end, column_begin, column_end
 
 
 @njit(cache=True)
-def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen):  # type: ignore[no-untyped-def]
+def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
+    """The floor of a camera that looks at an angle: its inverse depth, of which both slopes and the first value are given."""
+    for row in range(nearest.shape[0]):
+        inverse, step, here = np.float32(start + down * row), np.float32(along), nearest[row]
+        for k in range(len(here)):
+            value = inverse + step * np.float32(k)
+            here[k] = value if value > 0 else np.float32(0)
+
+
+@njit(cache=True)
+def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignore[no-untyped-def]
     """Finds what every ray that may meet an object meets first, and counts.
 
     Args:
         table: of the shapes.
         shapes: (n,) rows of the table.
         p_T: (n, 3) m.
-        altitude: m, of the camera above the origin of T.
-        focal_length: pixels.
-        nearest: (height, width) float32, becomes the inverse distance along the optical axis, 1/m.
+        camera: a `Pinhole`.
+        nearest: (height, width) float32, becomes the inverse depth of what is seen, 1/m; 0 where nothing is.
         hit: (height, width) int16, becomes the index of the object, -1 where no object is.
         alone: (n,) zeros; becomes the number of rays that meet the object if nothing is before it.
         seen: (n,) zeros; becomes the number of rays that meet the object first.
@@ -118,16 +149,21 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
     windows = np.zeros((len(shapes), 4), np.int64)
     row_begin, row_end, column_begin, column_end = hit.shape[0], 0, hit.shape[1], 0
     for i in range(len(shapes)):
-        window = _window(table.posed[shapes[i]], p_T[i], altitude, focal_length, hit.shape)
+        window = _window(table.posed[shapes[i]], p_T[i], camera, hit.shape)
         windows[i, 0], windows[i, 1], windows[i, 2], windows[i, 3] = window
         if window[1] > 0:
             row_begin, row_end = min(row_begin, window[0]), max(row_end, window[1])
             column_begin, column_end = min(column_begin, window[2]), max(column_end, window[3])
+    along, down, start = _inverse_depth(camera, 0.0, 0.0, 1.0, -camera.p_TC[2])
     for row in range(row_begin, row_end):
-        nearest[row, column_begin:column_end] = 1 / altitude
+        nearest[row, column_begin:column_end] = start
         hit[row, column_begin:column_end] = -1
+    if along != 0 or down != 0:
+        first = start + down * row_begin + along * column_begin
+        _cast_floor(nearest[row_begin:row_end, column_begin:column_end], along, down, first)
     for i in range(len(shapes)):
-        alone[i] = _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(i), nearest, hit)
+        if windows[i, 1] > 0:
+            alone[i] = _cast_at(table, shapes[i], p_T[i], camera, np.int16(i), nearest, hit)
     for i in range(len(shapes)):
         label, total = np.int16(i), 0
         for row in range(windows[i, 0], windows[i, 1]):
@@ -140,23 +176,24 @@ def _cast(table, shapes, p_T, altitude, focal_length, nearest, hit, alone, seen)
 
 
 @njit(cache=True)
-def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  # type: ignore[no-untyped-def]
+def _cover(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
     """(rays,) for every ray that would meet the target, the objects before it, as bits."""
-    window = _window(table.posed[shapes[target]], p_T[target], altitude, focal_length, hit.shape)
+    window = _window(table.posed[shapes[target]], p_T[target], camera, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
-    _cast_at(table, shapes[target], p_T[target], altitude, focal_length, np.int16(0), nearest, hit)
+    if window[1] > 0:
+        _cast_at(table, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
     rows, columns = np.nonzero(hit[window[0] : window[1], window[2] : window[3]] == 0)
     rows, columns = rows + window[0], columns + window[2]
     own, before = np.empty(len(rows), np.float32), np.zeros(len(rows), np.uint64)
     for k in range(len(rows)):
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
-        other = _window(table.posed[shapes[i]], p_T[i], altitude, focal_length, hit.shape)
+        other = _window(table.posed[shapes[i]], p_T[i], camera, hit.shape)
         apart = other[0] >= window[1] or window[0] >= other[1] or other[2] >= window[3] or window[2] >= other[3]
         if i == target or apart:
             continue
-        _cast_at(table, shapes[i], p_T[i], altitude, focal_length, np.int16(1), nearest, hit)
+        _cast_at(table, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
         for k in range(len(rows)):
             if hit[rows[k], columns[k]] == 1:
                 before[k] |= np.uint64(1) << np.uint64(i)
@@ -165,11 +202,12 @@ def _cover(table, shapes, p_T, altitude, focal_length, target, nearest, hit):  #
 
 
 class RayCaster:
-    """Casts the overhead camera's rays at scenes of convex objects."""
+    """Casts a camera's rays at scenes of convex objects."""
 
     def __init__(self, config: Camera, shapes: Shapes | None = None) -> None:
         """Makes a caster; `shapes` may be shared with a judge."""
         self.config = config
+        self._pinhole = config.pinhole
         self._shapes = shapes or Shapes()
         self._nearest = np.empty((config.height, config.width), np.float32)
         self._hit = np.empty((config.height, config.width), np.int16)
@@ -179,7 +217,7 @@ class RayCaster:
         if not len(shapes):
             return [], (slice(0, 0), slice(0, 0))
         alone, seen = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
-        arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length)
+        arguments = (self._shapes.table, shapes, p_T, self._pinhole)
         row, row_end, column, column_end = _cast(*arguments, self._nearest, self._hit, alone, seen)
         shares = [s / a if a else 1.0 for s, a in zip(seen.tolist(), alone.tolist(), strict=True)]
         return shares, (slice(row, row_end), slice(column, column_end))
@@ -214,7 +252,7 @@ class RayCaster:
         if len(scene.objects) > _MOST_COVERED:
             raise ValueError(f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most")
         shapes, p_T = self._shapes.arrays(scene.objects)
-        arguments = (self._shapes.table, shapes, p_T, self.config.altitude, self.config.focal_length, scene.names.index(name))
+        arguments = (self._shapes.table, shapes, p_T, self._pinhole, scene.names.index(name))
         sets, counts = np.unique(_cover(*arguments, self._nearest, self._hit), return_counts=True)
         names = scene.names
         members = [frozenset(names[i] for i in range(len(names)) if bits >> i & 1) for bits in sets.tolist()]
@@ -223,8 +261,9 @@ class RayCaster:
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
         """What the camera shows of a scene, and the visible shares; as `LabelDetector` has it, but with the floor all around."""
         shares, rectangle = self._cast(*self._shapes.arrays(scene.objects))
-        depth = np.full(self._nearest.shape, self.config.altitude, np.float32)
-        depth[rectangle] = 1 / self._nearest[rectangle]
+        depth = self.config.floor_depth.copy()
+        with np.errstate(divide="ignore"):
+            depth[rectangle] = 1 / self._nearest[rectangle]
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))

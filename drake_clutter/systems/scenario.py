@@ -10,9 +10,10 @@ from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.perception.depth_noise import DepthNoise
 from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
-from drake_clutter.validation import Between, Flag, config_class
+from drake_clutter.validation import Between, config_class
 
 
 @config_class
@@ -26,7 +27,6 @@ class Scenario:
         agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
         perception: what sees: labels, the perfect detector; depth or depth-color, trained ones; or the file of a checkpoint.
             A trained one recognises classes of `objects`.
-        camera_noise: whether what a trained network is given has a depth camera's noise.
         max_moves: after which it ends.
         seed: of everything that is left to chance.
         world: config.
@@ -39,7 +39,6 @@ class Scenario:
     nodes: Annotated[int, Between(3, 1000)] = 25
     agent: str = "student"
     perception: str = "labels"
-    camera_noise: Flag = True
     max_moves: Annotated[int, Between(1)] = 20
     seed: Annotated[int, Between(0)] = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)
@@ -68,8 +67,10 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
     classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(scenario.objects)
-    detector = LearnedDetector(SegmentationNetwork.load(path), classes, scenario.world.cell.camera, support)
-    return LearnedPerception(detector.detect, noise=scenario.camera_noise, seed=scenario.seed)
+    camera = scenario.world.cell.camera
+    detector = LearnedDetector(SegmentationNetwork.load(path), classes, camera, support)
+    noise = DepthNoise(focal_length=camera.focal_length) if camera.depth_noise else None
+    return LearnedPerception(detector.detect, noise=noise, seed=scenario.seed)
 
 
 def policy_of(name: str, config: ClutterConfig) -> Policy:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.perception.depth_noise import noisy_depth
+from drake_clutter.perception.depth_noise import DepthNoise, noisy_depth
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Scene
@@ -68,14 +68,14 @@ class ScenePerception(LeafSystem):
 class LearnedPerception:
     """A detector in the loop that is given images as a depth camera takes them."""
 
-    def __init__(self, detect: Detect, *, noise: bool, seed: int) -> None:
-        """`noise`: whether the rendered depth gets the camera's noise, by a seed."""
+    def __init__(self, detect: Detect, *, noise: DepthNoise | None, seed: int) -> None:
+        """`noise`: what the rendered depth gets, by a seed."""
         self._detect, self._noise, self._seed = detect, noise, seed
 
     def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
         """See `Perceive`; the same image gets the same noise."""
         if self._noise:
-            depth = noisy_depth(depth, item_rng(self._seed, zlib.crc32(depth.tobytes())))
+            depth = noisy_depth(depth, item_rng(self._seed, zlib.crc32(depth.tobytes())), self._noise)
         return self._detect(depth, color)
 
 

@@ -88,14 +88,14 @@ def exploration_graph(
         above = (overlap > _OVERLAP) & (low[None] > high[:, None] - _TOUCHING)  # [lower, upper]
         np.fill_diagonal(above, False)
         floor = np.where(above, high[:, None], 0.0).max(axis=0)
-        camera = observation.camera
+        tops = np.column_stack([bounds[:, :, :2].mean(axis=1), high])
+        pixel = observation.camera.depth(tops) / observation.camera.focal_length
         for k, o in enumerate(objects):
             extent = bounds[k, 1] - bounds[k, 0]
             detection = seen.get(o.name)
             share = 0.0
             if detection is not None:
-                pixel = (camera.altitude - high[k]) / camera.focal_length
-                share = min(1.0, np.count_nonzero(detection.mask) * pixel**2 / float(extent[0] * extent[1]))
+                share = min(1.0, np.count_nonzero(detection.mask) * pixel[k] ** 2 / float(extent[0] * extent[1]))
             picks = sum(move.pick == o.name for move in history)
             kind[k + 1] = numbers[o.object_class.name]
             # Of a rotation's two, always the same, also when a component that should be 0 is a little off.

@@ -1,0 +1,313 @@
+"""Cameras at any pose: the model itself, against Drake's images, and what is known of space from what they see."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import DEFAULT_CELL, random_scene, resting, rng, scene_of, tray, world_with
+from scipy.ndimage import binary_erosion
+from scipy.spatial.transform import Rotation
+from test_camera import SCATTERED, outline
+from test_placement import CONFIG, carried_by, deepest_with
+from test_rays import SCENES, labels
+
+from drake_clutter.cell.camera import Camera, pixel_grid
+from drake_clutter.cell.pinhole import backproject, in_camera, pose_in_camera, project
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.commands.render import render_scene
+from drake_clutter.config import upgrade
+from drake_clutter.files import InputError
+from drake_clutter.grammar import Orientation
+from drake_clutter.perception.explaining import explanation
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.perception.pose_fit import PoseFitter, pose_error
+from drake_clutter.perception.segmentation import Window
+from drake_clutter.reports.detections_picture import SIDE, detections_picture
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.placement import choose_placement, has_clear_top, seen_through
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.unseen import unseen_blocks
+from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.validation import load_typed
+
+CELL = load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml"))
+CAMERA = CELL.camera
+RAYS = RayCaster(CAMERA)
+OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))
+
+
+@pytest.fixture(scope="module")
+def tilted() -> LabelDetector:
+    """One detector for all tests."""
+    return LabelDetector(CAMERA)
+
+
+def anywhere(seed: int) -> Camera:
+    """A camera at a random pose."""
+    generator = rng(seed)
+    translation, rpy_deg = (tuple(generator.uniform(-most, most, 3).tolist()) for most in (2.0, 180.0))
+    return Camera(pose=PoseSpec(translation=translation, rpy_deg=rpy_deg), width=320 + seed, height=240 - seed, fov_y_deg=50.0)
+
+
+# --- The model ---
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_points_are_found_again(seed: int) -> None:
+    """From pixels and depths to points and back, along the rays, by the compiled model as by the other."""
+    camera, generator = anywhere(seed), rng(seed)
+    pixels, depth = generator.uniform(-50.0, 400.0, (40, 2)), generator.uniform(0.1, 5.0, 40)
+    p_T = camera.backproject(pixels, depth)
+    assert camera.project(p_T) == pytest.approx(pixels, abs=1e-8)
+    assert camera.depth(p_T) == pytest.approx(depth, abs=1e-12)
+    p_C = camera.rays(pixels) * depth[:, None]
+    assert camera.to_camera(p_T) == pytest.approx(p_C, abs=1e-12)
+    by_pose = camera.X_TC.multiply(p_C.T).T
+    assert by_pose == pytest.approx(p_T, abs=1e-12)
+    assert np.array([in_camera(camera.pinhole, *p) for p in p_T]) == pytest.approx(p_C, abs=1e-12)
+    assert np.array([project(camera.pinhole, *p) for p in p_C]) == pytest.approx(pixels, abs=1e-8)
+    again = [backproject(camera.pinhole, u, v, d) for (u, v), d in zip(pixels, depth, strict=True)]
+    assert np.array(again) == pytest.approx(p_T, abs=1e-12)
+    as_image = camera.backproject(pixels.reshape(5, 8, 2), depth.reshape(5, 8))
+    assert np.array_equal(as_image.reshape(40, 3), p_T)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pose_in_the_camera_s_frame(seed: int) -> None:
+    camera, generator = anywhere(seed), rng(seed)
+    R, p = Rotation.random(rng=generator).as_matrix(), generator.uniform(-1, 1, 3)
+    R_CO, p_CO = pose_in_camera(camera.pinhole, R, p)
+    corner = generator.uniform(-0.1, 0.1, 3)
+    assert R_CO @ corner + p_CO == pytest.approx(camera.to_camera((R @ corner + p)[None])[0], abs=1e-12)
+
+
+def test_a_camera_that_looks_straight_down_is_exact() -> None:
+    """Not a bit is lost to its rotation: x, -y and the difference of heights, also in 32 bit."""
+    camera, p_T = DEFAULT_CELL.camera, rng(0).uniform(-0.5, 0.5, (100, 3))
+    assert camera.vertical
+    assert not CAMERA.vertical
+    assert np.array_equal(camera.to_camera(p_T), np.column_stack([p_T[:, 0], -p_T[:, 1], 1.6 - p_T[:, 2]]))
+    depth = rng(1).uniform(1.0, 1.6, 100).astype(np.float32)
+    pixels = rng(2).integers(0, 400, (100, 2)).astype(np.float32)
+    assert camera.backproject(pixels, depth).dtype == np.dtype(np.float32)
+    assert np.array_equal(camera.backproject(pixels, depth)[:, 2], np.float32(1.6) - depth)
+    assert (camera.floor_depth == np.float32(1.6)).all()
+
+
+def test_the_floor_s_depth_and_its_horizon() -> None:
+    pixels = pixel_grid((480, 640))
+    assert CAMERA.backproject(pixels, CAMERA.floor_depth.astype(float))[..., 2] == pytest.approx(0.0, abs=1e-6)
+    level = Camera(pose=PoseSpec(translation=(0.0, -2.0, 0.4), rpy_deg=(-90.0, 0.0, 0.0)))
+    row = level.principal_point[1]
+    assert np.isinf(level.floor_depth[: int(row) + 1]).all()
+    below = np.arange(480) > row + 1
+    assert level.floor_depth[below, 0] == pytest.approx(0.4 * level.focal_length / (np.arange(480)[below] - row), rel=1e-5)
+    assert np.array_equal(RayCaster(level).observe(scene_of())[0].depth, level.floor_depth)
+
+
+# --- Against Drake's images ---
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
+def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: LabelDetector) -> None:
+    """As `test_rays.py` has it for a vertical one, by the same tolerances."""
+    look, rendered = tilted.look(scene), tilted.camera.label(scene)
+    observation, shares = RAYS.observe(scene)
+    assert shares == pytest.approx(look.visible_share, abs=0.003)
+    assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
+    cast = labels(scene, OPEN_MINDED)
+    assert (cast == rendered).mean() >= 0.9999
+    errors = [
+        np.abs(observation.depth - look.observation.depth)[binary_erosion((rendered == k) & (cast == k))]
+        for k in range(len(scene.objects))
+    ]
+    error = np.concatenate(errors)
+    assert error.size > 5000
+    assert np.quantile(error, 0.99) < 1.5e-6
+    assert error.max() < 1e-4
+
+
+def test_the_floor_of_a_tilted_camera_is_the_rendered_one(tilted: LabelDetector) -> None:
+    rendered = tilted.camera.render(scene_of()).depth
+    pixels = pixel_grid(rendered.shape)
+    inside = (np.abs(CAMERA.backproject(pixels, CAMERA.floor_depth)[..., :2]) < 0.30).all(axis=-1)
+    assert rendered[inside] == pytest.approx(CAMERA.floor_depth[inside], abs=2e-6)
+
+
+@pytest.mark.parametrize("rpy_deg", [(215.0, 10.0, 70.0), (170.0, -20.0, -130.0)])
+def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]) -> None:
+    """Each at 1.3 m from a point above the tray's middle; some objects are cut off by the frame."""
+    axis = Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()[:, 2]
+    pose = PoseSpec(translation=tuple((np.array([0.0, 0.0, 0.1]) - 1.3 * axis).tolist()), rpy_deg=rpy_deg)
+    config = Camera(pose=pose, width=320, height=240, visibility_threshold=1e-9)
+    scene, camera, caster = SCENES["tumbled 0"], OverheadCamera(config), RayCaster(config)
+    assert caster.visible_shares(scene.objects) == pytest.approx(camera.visible_shares(scene), abs=0.02)
+    assert (labels(scene, caster) == camera.label(scene)).mean() >= 0.9995
+
+
+def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDetector) -> None:
+    """As `test_camera.py` has it for a vertical one; a corner that comes to a tip may be two pixels' middles short."""
+    label, shifts = tilted.camera.label(SCATTERED), []
+    for index, o in enumerate(SCATTERED.objects):
+        corners, centroid = outline(tilted.camera, o)
+        rows, columns = np.nonzero(label == index)
+        assert np.array([columns.mean(), rows.mean()]) == pytest.approx(centroid, abs=1.0)
+        assert np.array([columns.min(), rows.min()]) == pytest.approx(corners.min(axis=0), abs=1.5)
+        assert np.array([columns.max(), rows.max()]) == pytest.approx(corners.max(axis=0), abs=1.5)
+        shifts.append(np.array([columns.mean(), rows.mean()]) - centroid)
+    assert np.abs(np.mean(shifts, axis=0)).max() < 0.25  # pixels
+
+
+def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(detector: LabelDetector, tilted: LabelDetector) -> None:
+    """What stands close behind a high box, from where the camera is."""
+    scene = scene_of(resting("cracker_box", Orientation.UPRIGHT_0, (0.0, 0.0), name="wall"), resting("gelatin_box", xy=(0, 0.08)))
+    assert tilted.look(scene).visible_share["gelatin_box"] < 0.3
+    assert detector.look(scene).visible_share["gelatin_box"] == 1.0
+
+
+def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
+    low = Camera(pose=PoseSpec(translation=(0.0, 0.0, 0.3), rpy_deg=(-100.0, 0.0, 0.0)))
+    beneath = scene_of(resting("sugar_box", xy=(0.0, -0.05), name="beneath"), resting("gelatin_box", xy=(0.0, 0.9)))
+    assert RayCaster(low).visible_shares(beneath.objects) == {"beneath": 1.0, "gelatin_box": 1.0}
+    assert [d.name for d in RayCaster(low).observe(beneath)[0].detections] == ["gelatin_box"]
+
+
+# --- Poses ---
+
+
+@pytest.mark.parametrize("name", ["cracker_box", "sugar_box", "tomato_soup_can", "gelatin_box"])
+def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelDetector) -> None:
+    """By the tolerances of `test_pose_fit.py` for rendered depth, and what is fitted explains the object's own pixels."""
+    scene = scene_of(
+        resting(name, Orientation.FLAT_30, (-0.15, 0.1), name="it"),
+        resting("pudding_box", xy=(0.2, -0.1), name="another"),
+    )
+    depth, label = tilted.camera.depth_and_label(scene)
+    true = scene["it"]
+    guess = true.X_TO.p + np.array([0.006, -0.006, 0.005])
+    found = PoseFitter(CAMERA).fit(true.object_class, label == 0, depth, guess)
+    assert found is not None
+    p_error, angle = pose_error(true.object_class, found.X_TO, true.X_TO)
+    assert p_error < 0.003
+    assert angle < math.radians(2.0)
+    explained = explanation(true.object_class, true.X_TO, depth, CAMERA)
+    assert (explained.mask(depth.shape) != (label == 0)).sum() <= 0.02 * explained.alone
+    assert explained.past <= 0.02 * explained.alone
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DEFAULT_CELL.camera], ids=["tilted", "vertical"])
+def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
+    window = Window.of(camera, tray(0.70))
+    corners = camera.project(np.array([[x, y, z] for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)]))
+    assert (corners >= [window.columns.start, window.rows.start]).all()
+    assert (corners < [window.columns.stop, window.rows.stop]).all()
+    assert window.side % 16 == 0
+
+
+def test_detections_are_drawn(tilted: LabelDetector) -> None:
+    picture = detections_picture(tilted.look(SCENES["laid out"]).observation)
+    assert picture.shape == (SIDE, SIDE, 3)
+
+
+# --- What is free, and what is unseen ---
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetector) -> None:
+    """Free of what is seen and of what is hidden."""
+    scene = random_scene(seed)
+    observation, generator = tilted.look(scene).observation, rng(seed)
+    moves = legal_moves(observation)
+    checked = 0
+    for move in [moves[i] for i in generator.permutation(len(moves))[:40]]:
+        X_TO = choose_placement(observation, move, CONFIG, generator)
+        if X_TO is not None:
+            checked += 1
+            assert deepest_with(scene, move.pick, X_TO, tuple(carried_by(scene, move.pick))) <= 0
+    assert checked >= 5
+
+
+def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
+    """Behind a wall the air is unseen although nothing is above it; before it, it is seen; out of the frame it is not."""
+    observation = tilted.look(scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))).observation
+    points = np.array(
+        [[0.0, 0.06, 0.05], [0.0, -0.06, 0.05], [0.0, 0.30, 0.05], [0.0, 0.0, 0.24], [0.0, 3.0, 0.0], [0.0, -2.0, 2.0]]
+    )
+    assert seen_through(observation, points).tolist() == [False, True, True, True, False, False]
+    assert has_clear_top(observation, observation["wall"])
+
+
+def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
+    """All that a hidden object fills, but for what is too near to the known one to matter, is in a block; nothing before is."""
+    wall = resting("cracker_box", Orientation.UPRIGHT_0, name="wall")
+    hidden = resting("gelatin_box", xy=(0.0, 0.072), name="hidden")
+    empty = tilted.look(scene_of()).observation.depth
+    observation = tilted.look(scene_of(wall, hidden)).observation
+    assert [d.name for d in observation.detections] == ["wall"]
+    blocks = unseen_blocks([wall], observation, empty)
+    grid = np.stack(np.meshgrid(*(np.linspace(-0.9, 0.9, 9) for _ in range(3))), axis=-1).reshape(-1, 3)
+    p_T = hidden.X_TO.apply(grid * np.asarray(hidden.object_class.size) / 2)
+    beside = (np.abs(p_T - wall.X_TO.p) < np.ptp(wall.corners_T, axis=0) / 2 + 0.03).all(axis=1)
+    unseen = p_T[~seen_through(observation, p_T) & ~beside & (p_T[:, 2] > 0.012)]
+    full = np.zeros(len(unseen), bool)
+    for block in blocks:
+        c, s = math.cos(block.yaw), math.sin(block.yaw)
+        p_B = (unseen - block.middle) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        full |= (np.abs(p_B) <= np.array(block.size) / 2 + 1e-9).all(axis=1)
+    assert len(unseen) > 100
+    assert full.all()
+    assert all(block.middle[1] > 0.03 for block in blocks)
+
+
+def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
+    """Something nameless of 28 mm is a block, the floor and the rim, whose depth changes from pixel to pixel, are none."""
+    empty = tilted.look(scene_of()).observation.depth
+    assert unseen_blocks([], tilted.look(scene_of()).observation, empty) == ()
+    stranger = resting("gelatin_box", xy=(0.1, 0.1), name="stranger")
+    (block,) = unseen_blocks([], tilted.look(scene_of(stranger)).observation, empty)
+    assert block.top == pytest.approx(0.028, abs=2e-3)
+    assert np.hypot(block.middle[0] - 0.1, block.middle[1] - 0.1) < 0.02
+
+
+# --- Cells ---
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("cameras.overhead.pose.roll=0", r"cameras\.overhead: sees nothing of the support; allowed is a pose"),
+        ("cameras.overhead.pose.x=5", r"cameras\.overhead: sees nothing of the support; allowed is a pose"),
+    ],
+)
+def test_a_camera_that_sees_nothing_of_the_support_is_refused(setting: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        load_typed(DEFAULT_CELL, settings=[setting])
+    assert "\n" not in str(raised.value)
+
+
+def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
+    """Every camera of a cell is rendered, the names of its files begin with its own."""
+    aside = "{pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}, width: 64, height: 48}"
+    world = world_with(f"cell.cameras.aside={aside}")
+    assert world.cell.camera == DEFAULT_CELL.camera
+    scene = scene_of(resting("sugar_box"))
+    shares = render_scene(scene, world, tmp_path)
+    assert shares == {"sugar_box": 1.0}
+    files = {
+        f"{name}_{kind}" for name in ("overhead", "aside") for kind in ("color.png", "depth.png", "label.png", "visible.json")
+    }
+    assert {path.name for path in tmp_path.iterdir()} == {*files, "picture.png"}
+    with pytest.raises(InputError, match="a camera's name"):
+        world_with(f"cell.cameras={{a/b: {aside}}}")
+
+
+def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
+    scenario = load_typed(Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], convert=upgrade)
+    assert not scenario.world.cell.camera.depth_noise
+    assert scenario.world.cell.camera.pose == DEFAULT_CELL.camera.pose
+    assert Scenario().world.cell.camera.depth_noise

@@ -1,0 +1,41 @@
+"""A cell whose camera is tilted, from a generated scene to the closed loop."""
+
+import pytest
+
+from drake_clutter.agents.exploration import LargestClear, play
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.commands.run import play as play_loop
+from drake_clutter.commands.run import scene_of
+from drake_clutter.config import ClutterConfig
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.interfaces import MoveResult
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.seeding import item_rng
+from drake_clutter.systems.scenario import Scenario
+from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
+
+WORLD = ClutterConfig(cell=load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml")))
+SCENARIO = Scenario(generator="random", nodes=8, agent="largest-clear", max_moves=4, world=WORLD)
+
+
+@pytest.fixture(scope="module")
+def generated() -> Scene:
+    """A scene at rest in which the tilted camera does not see something."""
+    return scene_of(SCENARIO)[0]
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "settle", "arm"])
+def test_scenes_are_explored(fidelity: str, generated: Scene) -> None:
+    """The moves that are offered can be made, and what they uncover is found."""
+    task = ExplorationTask(generated, EXECUTORS[fidelity](WORLD), DETECTORS[fidelity](WORLD.cell.camera), WORLD.exploration, 4)
+    assert task.look.observation.camera == WORLD.cell.camera
+    play(task, LargestClear(), item_rng(0))
+    assert task.steps
+    assert task.steps[0].outcome.result is MoveResult.PLACED
+    assert task.end is EpisodeEnd.ALL_FOUND
+
+
+def test_the_closed_loop(generated: Scene) -> None:
+    task, _ = play_loop(SCENARIO, generated, lambda _: None)
+    assert task.steps
+    assert task.end is EpisodeEnd.ALL_FOUND
