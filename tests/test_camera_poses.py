@@ -1,4 +1,4 @@
-"""Cameras at any pose: the model itself, against Drake's images, and what is known of space from what they see."""
+"""Cameras at any pose: the model, against Drake's images, and what they tell of free space."""
 
 import math
 from pathlib import Path
@@ -59,7 +59,7 @@ def anywhere(seed: int) -> Camera:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_points_are_found_again(seed: int) -> None:
-    """From pixels and depths to points and back, along the rays, by the compiled model as by the other."""
+    """From pixels and depths to points and back, and by the compiled model as by the other."""
     camera, generator = anywhere(seed), rng(seed)
     pixels, depth = generator.uniform(-50.0, 400.0, (40, 2)), generator.uniform(0.1, 5.0, 40)
     p_T = camera.backproject(pixels, depth)
@@ -151,7 +151,7 @@ def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]
 
 
 def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDetector) -> None:
-    """As `test_camera.py` has it for a vertical one; a corner that comes to a tip may be two pixels' middles short."""
+    """As `test_camera.py` has it; where a corner comes to a tip, no pixel's middle may be in it."""
     label, shifts = tilted.camera.label(SCATTERED), []
     for index, o in enumerate(SCATTERED.objects):
         corners, centroid = outline(tilted.camera, o)
@@ -182,7 +182,7 @@ def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
 
 @pytest.mark.parametrize("name", ["cracker_box", "sugar_box", "tomato_soup_can", "gelatin_box"])
 def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelDetector) -> None:
-    """By the tolerances of `test_pose_fit.py` for rendered depth, and what is fitted explains the object's own pixels."""
+    """As well as from above, and the true pose explains the object's own pixels."""
     scene = scene_of(
         resting(name, Orientation.FLAT_30, (-0.15, 0.1), name="it"),
         resting("pudding_box", xy=(0.2, -0.1), name="another"),
@@ -233,7 +233,7 @@ def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetecto
 
 
 def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
-    """Behind a wall the air is unseen although nothing is above it; before it, it is seen; out of the frame it is not."""
+    """Behind a wall the air is unseen although nothing is above it, and so it is out of the frame."""
     observation = tilted.look(scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))).observation
     points = np.array(
         [[0.0, 0.06, 0.05], [0.0, -0.06, 0.05], [0.0, 0.30, 0.05], [0.0, 0.0, 0.24], [0.0, 3.0, 0.0], [0.0, -2.0, 2.0]]
@@ -243,7 +243,7 @@ def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
 
 
 def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
-    """All that a hidden object fills, but for what is too near to the known one to matter, is in a block; nothing before is."""
+    """All that a hidden object fills, save beside the known one, is in a block; nothing before it is."""
     wall = resting("cracker_box", Orientation.UPRIGHT_0, name="wall")
     hidden = resting("gelatin_box", xy=(0.0, 0.072), name="hidden")
     empty = tilted.look(scene_of()).observation.depth
@@ -265,7 +265,7 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
 
 
 def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
-    """Something nameless of 28 mm is a block, the floor and the rim, whose depth changes from pixel to pixel, are none."""
+    """Something nameless of 28 mm is a block; floor and rim, at a depth that changes, are none."""
     empty = tilted.look(scene_of()).observation.depth
     assert unseen_blocks([], tilted.look(scene_of()).observation, empty) == ()
     stranger = resting("gelatin_box", xy=(0.1, 0.1), name="stranger")

@@ -44,7 +44,7 @@ def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
 
 def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(tmp_path: Path) -> None:
     """Whatever its cameras are called."""
-    text = "{pose: {translation: [0, 0, 2]}, width: 320}"
+    text = "{pose: {translation: [0, 0, 2], rpy_deg: [180, 0, 0]}, width: 320}"
     config = load_config(config_file(tmp_path, f"cell: {{cameras: {{camera: {text}, arm: {text}}}}}"))
     assert list(config.cell.cameras) == ["camera", "arm"]
     both = "camera: {width: 320, height: 100}\ncell: {cameras: {overhead: {height: 200}}}\n"
@@ -62,7 +62,7 @@ def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> Non
 
 
 def test_two_cameras_are_read_back(tmp_path: Path) -> None:
-    config = world_with("cell.cameras={side: {pose: {translation: [1, 0, 1]}}, top: {pose: {}}}")
+    config = world_with("cell.cameras={side: {pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}}, top: {pose: {}}}")
     assert list(config.cell.cameras) == ["side", "top"]
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
     one = load_config(settings=["cell.cameras.top.width=320"], path=tmp_path / "world.yaml")

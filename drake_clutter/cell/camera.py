@@ -22,11 +22,18 @@ D435_FOV_Y_DEG = 42.5
 D435_FOCAL_LENGTH = 480 / 2 / math.tan(math.radians(D435_FOV_Y_DEG) / 2)
 """Its focal length at 640 x 480 [px]."""
 _PARALLEL = 1e-3
-"""Of a ray of length 1 along the optical axis, the part down to the floor with which it is taken to be parallel."""
+"""A ray that falls by less, for 1 m along the optical axis, is taken to be parallel to the floor [m]."""
 
 
 def pixel_grid(shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return column and row of each pixel of an image of a shape (height, width). Shape (height, width, 2)."""
+    """Return column and row of each pixel of an image.
+
+    Args:
+        shape: Of the image (height, width).
+
+    Returns:
+        Whole numbers [px]. Shape (height, width, 2).
+    """
     row, column = np.indices(shape)
     return np.stack([column, row], axis=-1)
 
@@ -134,7 +141,8 @@ class Camera(Model):
     def floor_depth(self) -> NDArray[np.float32]:
         """What the camera would see of the plane of the support's floor alone.
 
-        Along the optical axis [m], infinite where the plane is not met. Shape (height, width); not to be written to.
+        Along the optical axis [m], infinite where the plane is not met; not to be written to.
+        Shape (height, width).
         """
         return _floor_depth(self)
 
@@ -146,8 +154,8 @@ class Camera(Model):
             height: Of what stands on it [m].
 
         Returns:
-            Column and row of the middle (2,) and side [px] of the upright square that holds it; None if a part of it is
-            not before the camera.
+            Column and row of the middle (2,) and side [px] of the upright square that holds it;
+            None if a part of it is not before the camera.
         """
         half = max(support.half_size)
         corners = np.array([[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, height)])
@@ -169,7 +177,10 @@ class Camera(Model):
 
 
 def _along(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the sum of components by a row of a rotation; what counts for nothing is left out, also where it is infinite."""
+    """Return the sum of components by a row of a rotation.
+
+    What counts for nothing is left out, also where it is infinite.
+    """
     terms = [factor * component for factor, component in zip(row, components, strict=True) if factor]
     return np.asarray(sum(terms[1:], terms[0]))
 

@@ -1,7 +1,7 @@
 """The projection of `Camera` for compiled loops.
 
-With a camera whose axes are parallel to those of T all rotations are exact, so that every sum is rounded as if it were
-written for that camera alone.
+With a camera whose axes are parallel to those of T all rotations are exact, so that every sum is
+rounded as if it were written for that camera alone.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,8 @@ class Pinhole(NamedTuple):
         focal_length: Focal length [px].
         u0: Column on the optical axis [px].
         v0: Row on the optical axis [px].
-        X_CT: The three rows of rotation matrix and translation [m]; numbers, as an array would be counted by every loop.
+        X_CT: The three rows of rotation matrix and translation [m]. Shape (12,); a tuple, as each
+            use of an array in a loop costs counting its references.
         p_TC: Position [m].
     """
 

@@ -17,7 +17,7 @@ DEPTH_UNIT = 1e-4
 
 
 def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, float]:
-    """Writes the images of a scene at rest, with a camera's name before theirs if there are several.
+    """Writes the images of a scene at rest, after the camera's name if there are several.
 
     `label.png` holds 0 for what is no object and k for the k-th object of the scene.
 

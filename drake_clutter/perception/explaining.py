@@ -64,9 +64,11 @@ class Explanation:
 
 @njit(cache=True, error_model="numpy")
 def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-def]
-    """First row and column of a rectangle that holds a pose; what its pixels say of it, int8, and how far away it is there, m.
+    """What the pixels say of a pose.
 
-    Last the number of pixels that it covers.
+    Returns:
+        First row and column of a rectangle that holds it; (rows, columns) int8 what its pixels say,
+        and float32 how far away the pose is there, m; how many pixels it covers.
     """
     R, p = pose_in_camera(camera, R, p)
     top, bottom, left, right = image_bounds(half, R, p, depth.shape, camera)

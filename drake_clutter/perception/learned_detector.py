@@ -84,8 +84,8 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
 class LearnedDetector:
     """Detects objects of some classes in depth, or in depth and colour.
 
-    The shipped networks learned from the default cell's camera: from above the tray's middle, straight down. What another
-    one shows them is not rectified; the poses are fitted to any.
+    The shipped networks learned from the default cell's camera: from above the tray's middle,
+    straight down. What another one shows them is not rectified; the poses are fitted to any.
     """
 
     def __init__(self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: Camera, support: Support) -> None:

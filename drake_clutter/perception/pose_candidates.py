@@ -25,7 +25,7 @@ SLACKS = (0.012, 0.048)
 
 @njit(cache=True, nogil=True)
 def _point(camera, u, v, z):  # type: ignore[no-untyped-def]
-    """p_TP, m, of what is seen at a pixel at a depth, m; infinitely deep if nothing is measured there."""
+    """p_TP, m, of what is seen at a pixel at a depth, m; infinitely deep if nothing is measured."""
     if not 0.05 < z < np.inf:
         return np.inf, np.inf, -np.inf
     return backproject(camera, u, v, z)

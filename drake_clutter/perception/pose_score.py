@@ -105,9 +105,9 @@ def eye_in(R, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def image_bounds(half, R, p, shape, camera):  # type: ignore[no-untyped-def]
-    """First row, end row, first column, end column of the pixels that a box of half sizes (3,) m falls on; none if too close.
+    """First row, end row, first column, end column of the pixels that a box falls on; none if too close.
 
-    Its pose is given in C, R_CO (3, 3) and p_CO (3) m.
+    Half its sizes are (3,) m, its pose is R_CO (3, 3) and p_CO (3) m.
     """
     height, width = shape
     top, bottom, left, right = height, 0, width, 0
@@ -129,7 +129,7 @@ def image_bounds(half, R, p, shape, camera):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def rays_of_row(R, v, camera):  # type: ignore[no-untyped-def]
-    """In O, of a pose R_CO (3, 3): the ray at the optical axis' column of row v, and the step from column to column."""
+    """In O, of a pose R_CO (3, 3): the ray in row v and column u0, and the step to the next column."""
     y, focal = (v - camera.v0) / camera.focal_length, camera.focal_length
     ray = (R[1, 0] * y + R[2, 0], R[1, 1] * y + R[2, 1], R[1, 2] * y + R[2, 2])
     return ray, (R[0, 0] / focal, R[0, 1] / focal, R[0, 2] / focal)

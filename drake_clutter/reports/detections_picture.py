@@ -20,7 +20,10 @@ _INK = "#d7263d"
 
 
 def detections_picture(observation: Observation) -> NDArray[np.uint8]:
-    """(720, 720, 3) where the tray is in the image, the brighter, the higher above it; with outlines of what was recognised."""
+    """(720, 720, 3) the part of the image with the tray, the brighter, the higher above it.
+
+    What was recognised is outlined.
+    """
     camera, depth = observation.camera, observation.depth
     size_px = np.array([camera.width, camera.height])
     middle_px, wanted = camera.support_bounds(observation.support, _TALL) or (np.array(camera.principal_point), np.inf)

@@ -62,7 +62,10 @@ class _Grid:
 
 
 def _pixels(camera: Camera, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Row and column of the pixel that each of points (N, 3) m falls on, and how deep it is, m; NaN if out of the frame."""
+    """Row and column of the pixel on which each of points (N, 3) m falls, and how deep it is, m.
+
+    Out of the frame the depth is NaN.
+    """
     pixels, depth = camera.project_with_depth(p_T)
     columns, rows = np.rint(pixels).astype(np.int64).T
     within = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width) & (depth > NEAREST)

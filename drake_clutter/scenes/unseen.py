@@ -1,4 +1,4 @@
-"""Space that nobody has seen into: for a planner that knows only K_t, whatever may be there is."""
+"""Space into which the camera has not seen: for a planner that knows only K_t, it is full."""
 
 import math
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ _HIGHEST = 0.98
 _EVERY = 2
 """Pixels, each way, of which one is looked at."""
 _CELL, _LEVEL, _STEP = 0.02, 0.01, 0.03
-"""m, side of the columns into which the space behind objects is cut, how fine their heights are, and by how much the heights of
-one block differ."""
+"""m, side of the columns into which the space behind objects is cut, how fine their heights are, and
+by how much the heights of one block differ."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,10 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
 
 
 def _behind(known: Sequence[SceneObject], observation: Observation) -> list[UnseenBlock]:
-    """What a camera that looks at an angle cannot see behind known objects; beside them nothing is thick enough to matter."""
+    """What a camera that looks at an angle cannot see behind known objects.
+
+    What is so near to them that nothing has room in between is left out.
+    """
     eye, top = observation.camera.X_TC.translation(), max((o.top for o in known), default=0.0)
     x, y = (np.arange(-count, count + 1) * (_CELL / 2) for count in (int(side / _CELL) for side in observation.support.size))
     z = np.arange(_FLAT, top, _LEVEL)

@@ -1,4 +1,4 @@
-"""A camera of the cell in Drake: rendered images of a scene, and the share of each object that it sees."""
+"""A camera in Drake: rendered images of a scene, and the share of each object that it sees."""
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
@@ -92,7 +92,7 @@ def _clipping_over_tray(X_TC: RigidTransform) -> ClippingRange:
 
 
 class OverheadCamera:
-    """Renders scenes with one rendering engine that is kept alive, its objects moved from scene to scene."""
+    """Renders scenes with one engine that is kept alive, its objects moved from scene to scene."""
 
     def __init__(self, config: Camera, engine: RenderEngineVtkParams = ENGINE) -> None:
         """Makes a camera; `engine` sets light, background and shadows."""

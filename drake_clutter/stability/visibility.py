@@ -1,9 +1,9 @@
 """Which object each of the camera's rays meets first, by compiled loops over the faces of convex objects.
 
-The rays go through the pixels' middles, as `Camera` has them. The rays that meet a face fill a convex polygon of the
-image, row by row, and along a face the inverse depth is linear in the pixel: so a ray costs one addition and one comparison.
-Nothing but the plane of the support's floor is seen beside the objects; walls are not cast. An object that reaches behind
-the camera is out of its sight.
+The rays go through the pixels' middles, as `Camera` has them. The rays that meet a face fill a convex
+polygon of the image, row by row, and along a face the inverse depth is linear in the pixel: so a ray
+costs one addition and one comparison. Nothing but the plane of the support's floor is seen beside the
+objects; walls are not cast. An object that reaches behind the camera is out of its sight.
 """
 
 import math
@@ -24,7 +24,7 @@ _MOST_COVERED = 64
 
 @njit(cache=True, inline="always")
 def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
-    """Of a plane's inverse depth, 1/m, the slopes along a row and down a column, and the value at pixel (0, 0).
+    """A plane's inverse depth, 1/m: its slopes along rows and columns, and its value at pixel (0, 0).
 
     The plane: its normal in T, and how far it is along that from the camera, m.
     """
@@ -94,7 +94,7 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
 
 @njit(cache=True)
 def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
-    """First row, last row, first column and last column (ends excluded) of a rectangle that holds an object's box.
+    """First and last row, first and last column (ends excluded) of what holds an object's box.
 
     All are 0 if nothing of it is in the image.
     """
@@ -121,7 +121,7 @@ def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
-    """The floor of a camera that looks at an angle: its inverse depth, of which both slopes and the first value are given."""
+    """Fills in the inverse depth of the floor that is seen at an angle, see `_inverse_depth`."""
     for row in range(nearest.shape[0]):
         inverse, step, here = np.float32(start + down * row), np.float32(along), nearest[row]
         for k in range(len(here)):
@@ -138,7 +138,7 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
         shapes: (n,) rows of the table.
         p_T: (n, 3) m.
         camera: a `Pinhole`.
-        nearest: (height, width) float32, becomes the inverse depth of what is seen, 1/m; 0 where nothing is.
+        nearest: (height, width) float32, becomes the inverse depth of what is seen, 1/m, or 0.
         hit: (height, width) int16, becomes the index of the object, -1 where no object is.
         alone: (n,) zeros; becomes the number of rays that meet the object if nothing is before it.
         seen: (n,) zeros; becomes the number of rays that meet the object first.
