@@ -64,13 +64,12 @@ class _Grid:
 def _pixels(camera: Camera, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Row and column of the pixel on which each of points (N, 3) m falls, and how deep it is, m.
 
-    Out of the frame the depth is NaN.
+    Out of the frame the depth is NaN, and the pixel any.
     """
     pixels, depth = camera.project_with_depth(p_T)
     columns, rows = np.rint(pixels).astype(np.int64).T
     within = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width) & (depth > NEAREST)
-    rows, columns = np.clip(rows, 0, camera.height - 1), np.clip(columns, 0, camera.width - 1)
-    return rows, columns, np.where(within, depth, np.nan)
+    return rows * within, columns * within, np.where(within, depth, np.nan)
 
 
 def seen_through(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
