@@ -9,7 +9,7 @@ from conftest import DEFAULT_CELL, random_scene, resting, rng, scene_of, tray, w
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 from test_camera import SCATTERED, outline
-from test_placement import CONFIG, carried_by, deepest_with
+from test_placement import carried_by, deepest_with, placed_at
 from test_rays import SCENES, labels
 
 from drake_clutter.cell.camera import Camera, pixel_grid
@@ -26,13 +26,13 @@ from drake_clutter.perception.pose_fit import PoseFitter, pose_error
 from drake_clutter.perception.segmentation import Window
 from drake_clutter.reports.detections_picture import SIDE, detections_picture
 from drake_clutter.resources import shipped_path
-from drake_clutter.scenes.placement import choose_placement, has_clear_top, seen_through
+from drake_clutter.scenes.placement import has_clear_top, seen_through
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.tasks.exploration import legal_moves
+from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import load_typed
 
 CELL = load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml"))
@@ -225,7 +225,7 @@ def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetecto
     moves = legal_moves(observation)
     checked = 0
     for move in [moves[i] for i in generator.permutation(len(moves))[:40]]:
-        X_TO = choose_placement(observation, move, CONFIG, generator)
+        X_TO = placed_at(observation, move, generator)
         if X_TO is not None:
             checked += 1
             assert deepest_with(scene, move.pick, X_TO, tuple(carried_by(scene, move.pick))) <= 0

@@ -2,7 +2,8 @@
 
 import pytest
 
-from drake_clutter.agents.exploration import LargestClear, play
+from drake_clutter.agents.backends import backends
+from drake_clutter.agents.exploration import largest_clear
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run import play as play_loop
 from drake_clutter.commands.run import scene_of
@@ -12,7 +13,8 @@ from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.tasks.exploration import DETECTORS, EXECUTORS, EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.exploration import EpisodeEnd
 
 WORLD = ClutterConfig(cell=load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml")))
 SCENARIO = Scenario(generator="random", nodes=8, agent="largest-clear", max_moves=4, world=WORLD)
@@ -27,9 +29,9 @@ def generated() -> Scene:
 @pytest.mark.parametrize("fidelity", ["fast", "settle", "arm"])
 def test_scenes_are_explored(fidelity: str, generated: Scene) -> None:
     """The moves that are offered can be made, and what they uncover is found."""
-    task = ExplorationTask(generated, EXECUTORS[fidelity](WORLD), DETECTORS[fidelity](WORLD.cell.camera), WORLD.exploration, 4)
-    assert task.look.observation.camera == WORLD.cell.camera
-    play(task, LargestClear(), item_rng(0))
+    backend = backends(fidelity, WORLD)(generated, item_rng(0))
+    assert backend.look.observation.camera == WORLD.cell.camera
+    task = run_episode(backend, largest_clear, max_moves=4)
     assert task.steps
     assert task.steps[0].outcome.result is MoveResult.PLACED
     assert task.end is EpisodeEnd.ALL_FOUND
