@@ -10,7 +10,7 @@ from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
-from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
+from drake_clutter.systems.perception_system import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import Between, Flag, config_class
 
