@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.agents.exploration import largest_clear
+from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
@@ -18,6 +19,7 @@ from drake_clutter.files import InputError
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.visibility import RayCaster
@@ -226,6 +228,19 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert (fields["success"], fields["ended"]) == (True, "all found")
     assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
     assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
+
+
+@pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
+def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfig) -> None:
+    cell = load_cell(shipped_path(f"models/cells/{robot}_epick_tray.yaml"))
+    loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record=True)
+    task = run_episode(loop, largest_clear, max_moves=1)
+    (step,) = task.steps
+    assert (step.outcome.result, task.end) == (MoveResult.PLACED, EpisodeEnd.ALL_FOUND)
+    arm = step.outcome.motion[0].arm
+    assert arm is not None
+    assert len(arm.q) == joints
+    assert arm.q == pytest.approx(cell.robot.home, abs=0.01)
 
 
 def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:

@@ -104,7 +104,6 @@ class StationSimulation:
         cell: WorkCell,
         scene: Scene,
         *,
-        time_step: float = TIME_STEP,
         jointed: str = "",
         visuals: bool = False,
         add_systems: AddSystems | None = None,
@@ -114,7 +113,6 @@ class StationSimulation:
         Args:
             cell: Everything else that stands there.
             scene: The objects, at rest.
-            time_step: Of the plant [s].
             jointed: Name of the one object that the gripper can take, see `ClutterStation`.
             visuals: Whether cameras are to see the station.
             add_systems: What else is in the diagram; None: plans come by `execute`.
@@ -124,7 +122,7 @@ class StationSimulation:
         classes = [(o.name, o.object_class) for o in scene.objects]
         self.station: ClutterStation = builder.AddNamedSystem(
             "clutter_station",
-            ClutterStation(self.cell, classes, time_step=time_step, jointed=jointed, visuals=visuals),
+            ClutterStation(self.cell, classes, time_step=TIME_STEP, jointed=jointed, visuals=visuals),
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
         for source, target, port in (
@@ -200,7 +198,7 @@ class StationSimulation:
             must_hold = state.schedule.suction_on + STEP <= elapsed < end
         self._sleep.update(self.root, wanted, self.gripper.status, must_hold=must_hold)
         self._num_steps += 1
-        self.simulator.AdvanceTo(self._num_steps * STEP + self.station.time_step / 2)
+        self.simulator.AdvanceTo(self._num_steps * STEP + TIME_STEP / 2)
 
     def run_until(self, event: Callable[[], bool]) -> None:
         """Step until something is true; it is asked before each step."""
