@@ -130,7 +130,7 @@ _MISSING = "|".join(name for name in OPTIONAL if importlib.util.find_spec(name) 
 
 def _skipped_if_missing(report: AnyReport, path: Path) -> AnyReport:
     """Return a report, as one of a skipped test if it failed for want of an optional package."""
-    words = rf"No module named '({_MISSING})|install drake_clutter with \["
+    words = rf"No module named '({_MISSING})[.\w]*'|install drake_clutter with \[\w+\]"
     if _MISSING and report.failed and (found := re.search(words, report.longreprtext)):
         report.outcome = "skipped"
         report.longrepr = (str(path), 0, f"Skipped: {found[0]}")
