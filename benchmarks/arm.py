@@ -303,8 +303,9 @@ def holds(
             results, walls = list[PickPlaceResult](), list[float]()
             for scene, plan in track(plans, f"{kind}, {hold}", console=console):
                 begun = time.perf_counter()
-                options = {"jointed": plan.pick if jointed else ""}
-                results.append(StationSimulation(default_cell(), scene, **options).execute(plan))
+                name = plan.pick if jointed else ""
+                simulation = StationSimulation(default_cell(), scene, jointed=name)
+                results.append(simulation.execute(plan))
                 walls.append(time.perf_counter() - begun)
             rows.append(
                 {

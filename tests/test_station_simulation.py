@@ -1,5 +1,6 @@
 """The simulated station: begun anew, stepped, recorded, and drawn where it was."""
 
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -56,13 +57,16 @@ def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
     }
 
 
+def is_past(simulation: StationSimulation, time: float) -> bool:
+    return bool(simulation.root.get_time() > time)
+
+
 def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
     simulation, motion, simulated = StationSimulation(CELL, SCENE), list[Frame](), []
     context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
     simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, planned()))
-    for _ in range(3):
-        start = simulation.root.get_time()
-        simulation.run_until(lambda start=start: simulation.root.get_time() > start + 0.4)
+    for end in (0.4, 0.8, 1.2):
+        simulation.run_until(partial(is_past, simulation, end))
         motion.append(simulation.sample())
         simulated.append(link_poses(simulation))
     outcome = Outcome(MoveResult.PLACED, SCENE, motion=tuple(motion))
