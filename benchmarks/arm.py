@@ -33,7 +33,8 @@ from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, worst_fall
+from drake_clutter.station.arm_executor import ArmExecutor, worst_fall
+from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
@@ -83,7 +84,7 @@ class Trial:
     unstable_anyway: bool = False
 
 
-def judged(carried: Carried) -> str:
+def judged(carried: PickPlaceResult) -> str:
     """What became of a plan."""
     if not carried.sealed:
         return "not sealed"
@@ -147,7 +148,7 @@ class Mover:
         if isinstance(plan, NoPlan):
             return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, sure.seconds)
         begun = time.perf_counter()
-        carried = ArmSimulation(default_cell(), scene, plan).run()
+        carried = StationSimulation(default_cell(), scene).execute(plan)
         wall, result = time.perf_counter() - begun, judged(carried)
         return Trial(
             result=result,
@@ -262,8 +263,8 @@ def parts(
         timed_as("distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q))
         timed_as("distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q))
         timed_as("timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload()))
-        simulation = timed_as("simulation, built", lambda: ArmSimulation(default_cell(), scene, plan))
-        timed_as("simulation, run", simulation.run)
+        simulation = timed_as("simulation, built", lambda: StationSimulation(default_cell(), scene))
+        timed_as("simulation, run", lambda: simulation.execute(plan))
         return True
 
     number = done = 0
@@ -298,11 +299,13 @@ def holds(
             found = executor.plan(scene, command) if command else None
             if isinstance(found, Plan):
                 plans.append((scene, found))
-        for hold, jointed in (("JointHold", True), ("HexapodHold", False)):
-            results, walls = list[Carried](), list[float]()
+        for hold, jointed in (("WeldGrasp", True), ("CompliantGrasp", False)):
+            results, walls = list[PickPlaceResult](), list[float]()
             for scene, plan in track(plans, f"{kind}, {hold}", console=console):
                 begun = time.perf_counter()
-                results.append(ArmSimulation(default_cell(), scene, plan, jointed=jointed).run())
+                name = plan.pick if jointed else ""
+                simulation = StationSimulation(default_cell(), scene, jointed=name)
+                results.append(simulation.execute(plan))
                 walls.append(time.perf_counter() - begun)
             rows.append(
                 {

@@ -2,10 +2,12 @@
 
 import gc
 import importlib.util
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -34,6 +36,8 @@ from drake_clutter.validation import load_typed
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
+
+AnyReport = TypeVar("AnyReport", pytest.CollectReport, pytest.TestReport)
 
 CATALOGUE = load_catalogue()
 CLASSES = CATALOGUE.classes
@@ -117,6 +121,36 @@ def executed(
 def rng(seed: int = 0) -> np.random.Generator:
     """A generator for what a test leaves to chance."""
     return np.random.default_rng(seed)
+
+
+OPTIONAL = ("torch", "safetensors", "tensorboard", "threadpoolctl", "ray", "pybullet")
+"""Packages that a test may take and that need not be installed: then it is skipped."""
+_MISSING = "|".join(name for name in OPTIONAL if importlib.util.find_spec(name) is None)
+
+
+def _skipped_if_missing(report: AnyReport, path: Path) -> AnyReport:
+    """Return a report, as one of a skipped test if it failed for want of an optional package."""
+    words = rf"No module named '({_MISSING})[.\w]*'|install drake_clutter with \[\w+\]"
+    if _MISSING and report.failed and (found := re.search(words, report.longreprtext)):
+        report.outcome = "skipped"
+        report.longrepr = (str(path), 0, f"Skipped: {found[0]}")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Skip modules that take what is not installed."""
+    return _skipped_if_missing((yield), collector.path)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Skip tests that take what is not installed."""
+    return _skipped_if_missing((yield), item.path)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -22,9 +22,12 @@ from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.station.arm_executor import ArmExecutor, ArmSimulation, Carried, judged
+from drake_clutter.station.arm_executor import ArmExecutor, judged
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.pick_place import DWELL, PickPlaceExecutor, scheduled
+from drake_clutter.station.command_schedule import DWELL, build_command_schedule
+from drake_clutter.station.messages import ExecutorStatus, PlannedMove
+from drake_clutter.station.pick_place_executor import PickPlaceExecutor
+from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
 
 SCENE = scene_of(
     resting("sugar_box", Orientation.UPRIGHT_0),
@@ -45,8 +48,8 @@ def plan() -> Plan:
     return planned()
 
 
-def run(plan: Plan, cell: WorkCell | None = None, jointed: bool = False) -> Carried:
-    return ArmSimulation(cell or DEFAULT_CELL, SCENE, plan, jointed=jointed).run()
+def run(plan: Plan, cell: WorkCell | None = None, jointed: str = "") -> PickPlaceResult:
+    return StationSimulation(cell or DEFAULT_CELL, SCENE, jointed=jointed).execute(plan)
 
 
 def test_placed_where_it_should_be(plan: Plan) -> None:
@@ -63,7 +66,7 @@ def test_placed_where_it_should_be(plan: Plan) -> None:
 
 
 def test_a_locked_joint_does_not_slip(plan: Plan) -> None:
-    carried = run(plan, jointed=True)
+    carried = run(plan, jointed=plan.pick)
     assert carried.sealed
     assert carried.slip < 1e-9
 
@@ -72,7 +75,7 @@ def test_a_vacuum_that_fails_drops_the_object(plan: Plan) -> None:
     """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
     carried = run(plan, cell_with("gripper.vacuum=0.1"))
     assert carried.sealed
-    on = scheduled(plan, DEFAULT_CELL).suction_on
+    on = build_command_schedule(plan, DEFAULT_CELL).suction_on
     assert on < carried.dropped < on + DWELL + 0.5, "as soon as it is lifted"
     assert carried.place_error > 0.2
 
@@ -94,7 +97,7 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
 
 
 def test_the_schedule(plan: Plan) -> None:
-    schedule = scheduled(plan, DEFAULT_CELL)
+    schedule = build_command_schedule(plan, DEFAULT_CELL)
     assert [name for name, _ in schedule.starts] == ["approach", "grasp", "carry", "release", "retreat"]
     assert schedule.end == pytest.approx(plan.duration + 2 * DWELL)
     assert schedule.phase(0.0) == "approach"
@@ -115,9 +118,8 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(too_
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, Plan)
-    simulation = ArmSimulation(DEFAULT_CELL, scene_of(stands), plan)
-    carried = simulation.run()
-    assert simulation.running.lowered == pytest.approx(too_tall + 0.003, abs=0.002)
+    carried = StationSimulation(DEFAULT_CELL, scene_of(stands)).execute(plan)
+    assert carried.lowered_distance == pytest.approx(too_tall + 0.003, abs=0.002)
     assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
 
 
@@ -129,9 +131,8 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
     slow = PlannerConfig(descent=0.08, optimise=False)
     plan = PickPlacePlanner(DEFAULT_CELL, slow).plan([box], box.name, X_TO)
     assert isinstance(plan, Plan)
-    simulation = ArmSimulation(DEFAULT_CELL, scene_of(box, support), plan)
-    carried = simulation.run()
-    assert simulation.running.lowered < 0.002
+    carried = StationSimulation(DEFAULT_CELL, scene_of(box, support)).execute(plan)
+    assert carried.lowered_distance < 0.002
     assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
     assert carried.displaced[support.name] < 0.005
 
@@ -140,9 +141,8 @@ def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08)).plan(SCENE.objects, "sugar_box", PLACE)
     assert isinstance(guarded, Plan)
     assert guarded.depth == pytest.approx(0.08)
-    simulation = ArmSimulation(cell_with("gripper.unevenness=0"), SCENE, guarded)
-    simulation.run()
-    assert simulation.running.lowered < 0.002
+    carried = StationSimulation(cell_with("gripper.unevenness=0"), SCENE).execute(guarded)
+    assert carried.lowered_distance < 0.002
 
 
 @pytest.mark.parametrize("jointed", ["", "sugar_box"])
@@ -170,14 +170,14 @@ def test_an_executor_without_a_plan_stays_at_home() -> None:
     context = executor.CreateDefaultContext()
     assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(DEFAULT_CELL.robot.home)
     assert executor.GetOutputPort("suction").Eval(context)[0] == 0
-    assert executor.GetOutputPort("status").Eval(context) == "idle"
+    assert executor.GetOutputPort("status").Eval(context) == ExecutorStatus()
 
 
 def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     """The executor's state is in its context, not in the system."""
     executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
-    executor.GetInputPort("plan").FixValue(context, plan)
+    executor.GetInputPort("plan").FixValue(context, PlannedMove(1, plan))
     simulator = Simulator(executor, context)
     simulator.AdvanceTo(1.0)
     clone = Simulator(executor, simulator.get_context().Clone())
@@ -186,7 +186,8 @@ def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     for port in ("command", "suction"):
         first, second = (executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone))
         assert (first == second).all()
-    assert executor.GetOutputPort("status").Eval(clone.get_context()) == scheduled(plan, DEFAULT_CELL).phase(2.0)
+    phase = build_command_schedule(plan, DEFAULT_CELL).phase(2.0)
+    assert executor.GetOutputPort("status").Eval(clone.get_context()) == ExecutorStatus(1, phase)
     assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(DEFAULT_CELL.robot.home)
 
 
@@ -220,7 +221,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
 
 
 def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None:
-    motion = ArmSimulation(DEFAULT_CELL, SCENE, plan).run(record=True).motion
+    motion = StationSimulation(DEFAULT_CELL, SCENE).execute(plan, record=True).motion
     assert motion[0].arm is not None
     assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)
     moments = arm_moments(motion, "sugar_box")
@@ -244,6 +245,6 @@ def test_what_is_put_on_an_edge_falls() -> None:
     scene = scene_of(resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0)))
     beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
     plan = planned(scene, "gelatin_box", beside)
-    carried = ArmSimulation(DEFAULT_CELL, scene, plan).run()
+    carried = StationSimulation(DEFAULT_CELL, scene).execute(plan)
     assert carried.sealed
     assert carried.poses["gelatin_box"].translation[2] < 0.1

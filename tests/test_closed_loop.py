@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.agents.exploration import largest_clear
+from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
@@ -18,14 +19,17 @@ from drake_clutter.files import InputError
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
-from drake_clutter.systems.exploration_agent import AgentState, ExplorationAgent, Phase
-from drake_clutter.systems.move_planner import Answer, MovePlanner
+from drake_clutter.systems.planner_system import PlannerSystem
+from drake_clutter.systems.policy_system import Phase, PolicyState, PolicySystem
 from drake_clutter.systems.scenario import Scenario, policy_of
+from drake_clutter.systems.station_camera import empty_depth
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd
@@ -52,24 +56,24 @@ class Bench:
     """An agent alone, its inputs given by hand."""
 
     def __init__(self) -> None:
-        self.agent = ExplorationAgent(policy=first_allowed, config=ExplorationConfig(), seed=0)
+        self.agent = PolicySystem(policy=first_allowed, config=ExplorationConfig(), seed=0)
         self.simulator = Simulator(self.agent)
         self.time = 0.0
-        self.give(BEFORE, Answer(), 0)
+        self.give(BEFORE, PlanResponse(), 0)
 
-    def give(self, observation: Observation, answer: Answer, finished: int) -> None:
+    def give(self, observation: Observation, response: PlanResponse, finished: int) -> None:
         context = self.simulator.get_mutable_context()
         self.agent.GetInputPort("observation").FixValue(context, observation)
-        self.agent.GetInputPort("answer").FixValue(context, answer)
+        self.agent.GetInputPort("response").FixValue(context, response)
         self.agent.GetInputPort("finished").FixValue(context, [finished, 0.0])
 
-    def after(self, seconds: float) -> AgentState:
+    def after(self, seconds: float) -> PolicyState:
         self.time += seconds
         self.simulator.AdvanceTo(self.time)
         return self.state(self.simulator.get_context())
 
-    def state(self, context: Context) -> AgentState:
-        state: AgentState = self.agent.GetOutputPort("state").Eval(context)
+    def state(self, context: Context) -> PolicyState:
+        state: PolicyState = self.agent.GetOutputPort("state").Eval(context)
         return state
 
 
@@ -85,18 +89,16 @@ def test_it_looks_waits_rests_and_looks_again() -> None:
     bench = Bench()
     state = bench.after(0.1)
     assert state.phase is Phase.WAITING
-    assert state.request is not None
     assert (state.request.number, state.request.move) == (1, Move("cracker_box"))
     assert [o.name for o in state.belief.objects] == ["cracker_box"]
-    bench.give(AFTER, Answer(1, a_plan()), 0)
+    bench.give(AFTER, PlanResponse(1, a_plan()), 0)
     assert bench.after(5.0).phase is Phase.WAITING, "the arm has not come home"
-    bench.give(AFTER, Answer(1, a_plan()), 1)
+    bench.give(AFTER, PlanResponse(1, a_plan()), 1)
     state = bench.after(0.1)
-    assert (state.phase, state.carried_out) == (Phase.LOOKING, 1)
+    assert state.phase is Phase.LOOKING
     assert state.belief.history == (Move("cracker_box"),)
     assert [o.name for o in state.belief.objects] == ["cracker_box"], "it has not looked yet"
     state = bench.after(0.6)
-    assert state.request is not None
     assert state.request.number == 2
     assert {o.name: o.X_TO for o in state.belief.objects} == ASIDE.poses
 
@@ -104,7 +106,7 @@ def test_it_looks_waits_rests_and_looks_again() -> None:
 def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
     bench = Bench()
     bench.after(0.1)
-    bench.give(BEFORE, Answer(1, NO_SEAL), 0)
+    bench.give(BEFORE, PlanResponse(1, NO_SEAL), 0)
     state = bench.after(0.2)
     assert (state.phase, state.belief.invalid_moves) == (Phase.DONE, (Move("cracker_box"),))
 
@@ -112,9 +114,9 @@ def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
 def test_what_the_cup_did_not_get_is_left_alone() -> None:
     bench = Bench()
     bench.after(0.1)
-    bench.give(BEFORE, Answer(1, a_plan()), 1)
+    bench.give(BEFORE, PlanResponse(1, a_plan()), 1)
     state = bench.after(0.8)
-    assert state.carried_out == 1
+    assert state.belief.history == (Move("cracker_box"),)
     assert state.belief.invalid_moves == (Move("cracker_box"),), "it is seen where it was"
     assert state.phase is Phase.DONE
 
@@ -124,13 +126,13 @@ def test_what_is_lost_is_forgotten() -> None:
     failed = MoveResult.NOT_PLANNED
     belief = Belief().update(AFTER).record(Move("gelatin_box"), failed)
     belief = belief.record(Move("cracker_box"), failed)
-    agent = ExplorationAgent(
+    agent = PolicySystem(
         policy=lambda *_: Decision(None),
         config=ExplorationConfig(),
         seed=0,
         tracker=lambda known, observation: (observation, ("gelatin_box",)),
     )
-    after = agent.decided(AgentState(belief=belief), BEFORE).belief
+    after = agent.decided(PolicyState(belief=belief), BEFORE).belief
     assert [o.name for o in after.objects] == ["cracker_box"]
     assert after.invalid_moves == (Move("cracker_box"),)
 
@@ -138,13 +140,11 @@ def test_what_is_lost_is_forgotten() -> None:
 def test_a_cloned_agent_goes_on_the_same() -> None:
     bench = Bench()
     bench.after(0.1)
-    bench.give(AFTER, Answer(1, NO_SEAL), 0)
+    bench.give(AFTER, PlanResponse(1, NO_SEAL), 0)
     clone = Simulator(bench.agent, bench.simulator.get_context().Clone())
     state = bench.after(0.3)
     clone.AdvanceTo(bench.time)
     other = bench.state(clone.get_context())
-    assert state.request is not None
-    assert other.request is not None
     assert other.request.number == state.request.number == 2
     assert other.request.move == state.request.move
     assert (other.belief.history, other.phase) == (state.belief.history, state.phase)
@@ -156,33 +156,44 @@ def test_what_was_seen_stays_known() -> None:
     assert {o.name: o.X_TO for o in known} == COVERED.poses, "the box under the other one is where it was seen"
 
 
-def test_the_planner_answers_each_request_once() -> None:
+def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, asked, plan = Bench(), list[int](), a_plan()
     request = bench.after(0.1).request
-    assert request is not None
 
-    def answer(given: object, rng: np.random.Generator) -> Plan | NoPlan:
+    def answer(*_: object) -> Plan | NoPlan:
         asked.append(1)
         return plan if len(asked) == 1 else NO_SEAL
 
-    planner = MovePlanner(plan=answer, seed=0, latency=0.2)
-    simulator = Simulator(planner)
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    monkeypatch.setattr(planner, "plan", answer)
+    empty = empty_depth(DEFAULT_CELL)
+    system = PlannerSystem(planner=planner, empty_depth=empty, latency=0.2)
+    simulator = Simulator(system)
     context = simulator.get_mutable_context()
-    planner.GetInputPort("request").FixValue(context, None)
+    response, planned = system.GetOutputPort("response"), system.GetOutputPort("plan")
+    system.GetInputPort("request").FixValue(context, PlanRequest())
     simulator.AdvanceTo(0.2)
     assert asked == []
-    planner.GetInputPort("request").FixValue(context, request)
+    assert (response.Eval(context), planned.Eval(context)) == (PlanResponse(), PlannedMove())
+    system.GetInputPort("request").FixValue(context, request)
     simulator.AdvanceTo(0.4)
     assert asked == []
+    clone = Simulator(system, context.Clone())
     simulator.AdvanceTo(0.5)
     assert asked == [1]
-    found: Answer = planner.GetOutputPort("answer").Eval(context)
-    assert (found.number, found.plan) == (1, plan)
-    planner.GetInputPort("request").FixValue(context, replace(request, number=2))
+    assert response.Eval(context) == PlanResponse(1, plan)
+    assert planned.Eval(context) == PlannedMove(1, plan)
+    system.GetInputPort("request").FixValue(context, replace(request, number=2))
     simulator.AdvanceTo(1.0)
-    found = planner.GetOutputPort("answer").Eval(context)
-    assert (found.number, found.plan) == (2, NO_SEAL)
-    assert planner.GetOutputPort("plan").Eval(context) is plan, "the arm has nothing new to do"
+    assert response.Eval(context) == PlanResponse(2, NO_SEAL)
+    assert planned.Eval(context) == PlannedMove(), "the arm has nothing new to do"
+    asked.clear()
+    clone.AdvanceTo(0.5)
+    assert planned.Eval(clone.get_context()) == PlannedMove(1, plan), "the same from a clone"
+    system.GetInputPort("request").FixValue(context, replace(request, number=3, command=None))
+    simulator.AdvanceTo(1.5)
+    failure = NoPlan(PlanFailure.NO_FREE_SPOT, "tray")
+    assert response.Eval(context) == PlanResponse(3, failure), "without asking the planner"
 
 
 def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
@@ -219,6 +230,19 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
 
 
+@pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
+def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfig) -> None:
+    cell = load_cell(shipped_path(f"models/cells/{robot}_epick_tray.yaml"))
+    loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record=True)
+    task = run_episode(loop, largest_clear, max_moves=1)
+    (step,) = task.steps
+    assert (step.outcome.result, task.end) == (MoveResult.PLACED, EpisodeEnd.ALL_FOUND)
+    arm = step.outcome.motion[0].arm
+    assert arm is not None
+    assert len(arm.q) == joints
+    assert arm.q == pytest.approx(cell.robot.home, abs=0.01)
+
+
 def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:
     task, _ = play(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
     assert task.end is EpisodeEnd.ALL_FOUND
@@ -250,11 +274,10 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
 ) -> None:
     monkeypatch.setattr(closed_loop, "GUARDED", PlannerConfig(descent=descent, above=0.007))
     loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
-    loop.agent.policy = first_allowed
-    request = loop.agent.decided(AgentState(), BEFORE).request
-    assert request is not None
+    loop.policy_system.policy = first_allowed
+    request = loop.policy_system.decided(PolicyState(), BEFORE).request
     assert request.command is not None
-    plan = loop._plan(request, rng(0))
+    plan = loop.planner_system._plan(request)
     assert isinstance(plan, Plan)
     above = plan.X_TO_place.translation[2] - request.command.X_TO_place.translation[2]
     assert above == pytest.approx(0.007 if descent else 0.0)
@@ -272,8 +295,8 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
     box = resting("gelatin_box", xy=(-0.1, 0.0))
     marker, can = resting("large_marker", xy=(-0.1, 0.0), floor=box.top), resting("tomato_soup_can", xy=(0.2, 0.2))
     loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
-    loop.agent.policy = policy
+    loop.policy_system.policy = policy
     observation = loop.look.observation
-    assert loop.agent.decided(AgentState(), observation).phase is Phase.DONE
+    assert loop.policy_system.decided(PolicyState(), observation).phase is Phase.DONE
     allowed = set(legal_moves(observation)) - set(given[0].invalid_moves)
     assert allowed == {Move(can.name)}

@@ -80,4 +80,4 @@ def _at_box(middle: np.ndarray, way: np.ndarray, aside: np.ndarray) -> np.ndarra
 
 if __name__ == "__main__":
     empty = ClosedLoop(Scene((), default_cell().support), seed=0, world=ClutterConfig())
-    draw_diagram(empty.diagram, Path(sys.argv[1]))
+    draw_diagram(empty.simulation.diagram, Path(sys.argv[1]))

@@ -2,12 +2,12 @@
 
 Attributes of the file: `version`, `scene` (a scene file's text: how everything lay at first), `cell` (a `WorkCell` as YAML).
 A group `move_0001`, ... for each move that the arm carried out; its attributes are `pick`, `place`, `result` and `detail`, its
-datasets, over n moments:
+datasets, over n moments, for an arm of j joints:
 
     time     (n,)             s, since the move began
-    q        (n, 6)           rad
-    v        (n, 6)           rad/s
-    torque   (n, 6)           N m, of the motors
+    q        (n, j)           rad
+    v        (n, j)           rad/s
+    torque   (n, j)           N m, of the motors
     suction  (n,)             whether the vacuum is switched on
     X_TO     (n, objects, 7)  qw, qx, qy, qz, x, y, z (m), in the order of the scene file's objects
 """
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import Catalogue
+from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
 from drake_clutter.files import InputError, replacing
@@ -78,7 +79,8 @@ def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell
             raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
         scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
         cell = _cell(path, file.attrs)
-        return scene, cell, [_move(path, name, file[name], scene) for name in sorted(file)]
+        joints = load_robot(cell.robot).num_joints
+        return scene, cell, [_move(path, name, file[name], scene, joints) for name in sorted(file)]
 
 
 def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
@@ -88,9 +90,10 @@ def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
     return override(default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}")
 
 
-def _move(path: Path, name: str, group: h5py.Group, scene: Scene) -> tuple[Move, tuple[Frame, ...]]:
+def _move(path: Path, name: str, group: h5py.Group, scene: Scene, joints: int) -> tuple[Move, tuple[Frame, ...]]:
     arrays: dict[str, NDArray[np.float64]] = {}
-    shapes = {"time": (), "q": (6,), "v": (6,), "torque": (6,), "suction": (), "X_TO": (len(scene.objects), 7)}
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM, (joints,))
+    shapes |= {"time": (), "suction": (), "X_TO": (len(scene.objects), 7)}
     for field, shape in shapes.items():
         found = group.get(field)
         if not isinstance(found, h5py.Dataset) or len(found.shape) == 0 or found.shape[1:] != shape:

@@ -1,16 +1,14 @@
-"""The closed loop: station, camera, perception, agent, planner and executor in one Diagram."""
+"""Closed-loop exploration: station, camera, perception, policy, planner, executor in one Diagram.
 
-import math
+Outcomes are evaluated outside the diagram, from the true poses.
+"""
+
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.geometry import MakeRenderEngineVtk
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
@@ -18,34 +16,33 @@ from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.scenes.geometry import carried
-from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.unseen import unseen_blocks
-from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
-from drake_clutter.station.arm_executor import LOOK, TIME_STEP, disturbed_by, judged, nearest, taking_part
-from drake_clutter.station.clutter_station import ClutterStation, Freedom, Vacuum
-from drake_clutter.station.pick_place import PickPlaceExecutor
-from drake_clutter.systems.exploration_agent import (
-    AgentState,
-    ExplorationAgent,
-    Phase,
-    Request,
-    in_true_names,
-    infeasible_moves,
+from drake_clutter.station.arm_executor import judged
+from drake_clutter.station.body_sleep import nearest
+from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.messages import PlanResponse
+from drake_clutter.station.pick_place_executor import PickPlaceExecutor
+from drake_clutter.station.station_simulation import StationSimulation
+from drake_clutter.systems.action_filter import InfeasibleMoves
+from drake_clutter.systems.perception_system import (
+    LabelPerception,
+    Perceive,
+    PerceptionSystem,
+    for_who_sees,
 )
-from drake_clutter.systems.move_planner import Answer, MovePlanner
-from drake_clutter.systems.scene_perception import LabelPerception, Perceive, ScenePerception, for_who_sees
-from drake_clutter.systems.tracking import tracked
+from drake_clutter.systems.planner_system import PlannerSystem
+from drake_clutter.systems.policy_system import Phase, PolicyState, PolicySystem
+from drake_clutter.systems.station_camera import add_camera, empty_depth
+from drake_clutter.systems.tracking import in_true_names, tracked
 from drake_clutter.tasks.belief import Belief, Policy
 from drake_clutter.tasks.exploration import Attempt
 
 LATENCY = 1.15
-"""s, from an image to the plan: 0.15 for perception, 1 for planning."""
+"""From an observation to the plan [s]: 0.15 for perception, 1 for planning."""
 GUARDED = PlannerConfig(descent=0.08, above=0.007)
-"""For objects known from images: of a box in a pile they show the top, and with a wrong class its height is wrong; what it is to
-stand on may be a little higher, too."""
-PATIENCE = 1.0
-"""s, after a plan's end, for which what has fallen is followed."""
+"""For objects known from images: of a box in a pile they show the top, and with a wrong class its
+height is wrong; what it is to stand on may be a little higher, too."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,9 @@ class Timing:
     """How long an episode took.
 
     Attributes:
-        robot: s simulated. wall: s.
-        planning: s, of all plans.
+        robot: Simulated [s].
+        wall: On the computer [s].
+        planning: Of `wall`, for all plans [s].
     """
 
     robot: float
@@ -66,9 +64,11 @@ class ClosedLoop:
     """One scene and everything that searches it (a `Backend`).
 
     Attributes:
-        diagram: all of it.
-        scene: The true objects, as they were when the agent last looked.
+        scene: The true objects, as they were when the policy last looked.
         look: What a perfect detector sees of them.
+        simulation: Of the diagram.
+        policy_system: Chooses the moves.
+        planner_system: Plans them.
     """
 
     def __init__(
@@ -80,100 +80,53 @@ class ClosedLoop:
         world: ClutterConfig,
         record: bool = False,
     ) -> None:
-        """Builds the diagram around a scene at rest.
+        """Build the diagram around a scene at rest.
 
         Args:
-            scene: the objects.
-            perceive: what sees; None: the perfect detector.
-            seed: of all chances.
-            world: config.
+            scene: The objects.
+            perceive: The detector; None: the perfect one.
+            seed: Of all chances.
+            world: The config.
             record: Whether outcomes have motions.
         """
-        self.scene, self._record = scene, record
+        self.scene, self._record, self._perceive = scene, record, perceive
         world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else for_who_sees(world)
-        builder, camera, eye = DiagramBuilder(), world.cell.camera, Intrinsics.of(world.cell.camera)
-        self.station: ClutterStation = builder.AddSystem(
-            ClutterStation(
-                world.cell,
-                [(o.name, o.object_class) for o in scene.objects],
-                time_step=TIME_STEP,
-                visuals=True,
-            )
-        )
-        self.station.set_name("clutter_station")
-        seen = self.station.camera_scene_graph
-        assert seen is not None
-        seen.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
-        sensor = builder.AddSystem(RgbdSensor(seen.world_frame_id(), eye.X_TC, eye.color, eye.depth))
-        sensor.set_name("overhead_camera")
-        sees: Perceive = perceive or LabelPerception(scene, self.station, world)
-        perception = ScenePerception.AddToBuilder(builder, perceive=sees, width=camera.width, height=camera.height)
-        self._tracks = perceive is not None
-        ways = GUARDED if self._tracks else PlannerConfig()
-        self._ways = PickPlacePlanner(world.cell, ways)
-        self.agent = ExplorationAgent.AddToBuilder(
-            builder,
-            config=self._world.exploration,
-            seed=seed,
-            tracker=tracked if self._tracks else None,
-            action_filter=self._infeasible_moves,
-        )
-        self._planner = planner = MovePlanner.AddToBuilder(builder, plan=self._plan, seed=seed, latency=LATENCY)
-        self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=world.cell)
-        for source, target, ports in (
-            (self.station, sensor, {"query": "geometry_query"}),
-            (sensor, perception, {"depth_image_32f": "depth_image", "color_image": "color_image"}),
-            (self.station, perception, {"body_poses": "body_poses"}),
-            (perception, self.agent, {"observation": "observation"}),
-            (planner, self.agent, {"answer": "answer"}),
-            (self.executor, self.agent, {"finished": "finished"}),
-            (self.agent, planner, {"request": "request"}),
-            (planner, self.executor, {"plan": "plan"}),
-            (self.executor, self.station, {"command": "command"}),
-            (self.station, self.executor, {"bellows": "bellows"}),
-        ):
-            for output, input_ in ports.items():
-                builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
-        self.diagram = builder.Build()
-        self.diagram.set_name("closed_loop")
-        self.simulator = Simulator(self.diagram)
-        self.vacuum = Vacuum(self.station, self._suction)
-        self._detector = LabelDetector(camera)
+        self._detector = LabelDetector(world.cell.camera)
         self.look = self._detector.look(scene)
-        self._planning, self._begun_at = 0.0, time.perf_counter()
-        self._empty = self._empty_cell(sensor)
+        ways = PlannerConfig() if perceive is None else GUARDED
+        self._planner, empty = PickPlacePlanner(world.cell, ways), empty_depth(world.cell)
+        self.policy_system = PolicySystem(
+            config=self.config,
+            seed=seed,
+            tracker=None if perceive is None else tracked,
+            action_filter=InfeasibleMoves(self._pickable, empty, self.config),
+        )
+        self.planner_system = PlannerSystem(planner=self._planner, empty_depth=empty, latency=LATENCY)
+        self.simulation = StationSimulation(world.cell, scene, visuals=True, add_systems=self._add_systems)
+        self.simulation.diagram.set_name("closed_loop")
+        self._planning, self._start_time = 0.0, time.perf_counter()
 
-    def _empty_cell(self, sensor: RgbdSensor) -> NDArray[np.float32]:
-        """(height, width) m, the depth of the cell as it is without objects: they are below the floor, where nobody sees them."""
-        root = self.diagram.CreateDefaultContext()
-        below = [replace(o, X_TO=o.X_TO.moved((0.0, 0.0, -10.0))) for o in self.scene.objects]
-        self.station.set_scene(root, np.array(self._world.cell.robot.home), below)
-        image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root))
-        return np.asarray(image.data[..., 0].copy())
+    def _pickable(self, known: Sequence[SceneObject]) -> set[str]:
+        return {o.name for o in known if self._planner.can_pick(o, known)}
 
-    def _suction(self, root: Context) -> bool:
-        context = self.executor.GetMyContextFromRoot(root)
-        return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
-
-    def _infeasible_moves(self, belief: Belief, observation: Observation) -> list[Move]:
-        """Moves of what no cup holds, and those that are not worth trying with any hand."""
-        known = belief.objects
-        able = {o.name for o in known if self._ways.can_pick(o, known)}
-        return infeasible_moves(known, observation, able, self._empty, self.config)
-
-    def _plan(self, request: Request, rng: np.random.Generator) -> Plan | NoPlan:
-        if request.command is None:
-            return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
-        known = request.belief.objects
-        unseen = unseen_blocks(known, request.observation, self._empty)
-        found = self._ways.plan(known, request.move.pick, request.command.X_TO_place, unseen)
-        self._planning += found.seconds
-        return found
-
-    def _agent_state(self, root: Context) -> AgentState:
-        state: AgentState = self.agent.GetOutputPort("state").Eval(self.agent.GetMyContextFromRoot(root))
-        return state
+    def _add_systems(self, builder: DiagramBuilder, station: ClutterStation, executor: PickPlaceExecutor) -> None:
+        camera = add_camera(builder, station)
+        perceive = self._perceive or LabelPerception(self.scene, station, self._world)
+        perception = PerceptionSystem.AddToBuilder(builder, perceive=perceive, camera=station.cell.camera)
+        policy = builder.AddNamedSystem("policy_system", self.policy_system)
+        planner = builder.AddNamedSystem("planner_system", self.planner_system)
+        for source, output, target, input_ in (
+            (camera, "depth_image_32f", perception, "depth_image"),
+            (camera, "color_image", perception, "color_image"),
+            (station, "body_poses", perception, "body_poses"),
+            (perception, "observation", policy, "observation"),
+            (planner, "response", policy, "response"),
+            (executor, "finished", policy, "finished"),
+            (policy, "request", planner, "request"),
+            (planner, "plan", executor, "plan"),
+        ):
+            builder.Connect(source.GetOutputPort(output), target.GetInputPort(input_))
 
     @property
     def config(self) -> ExplorationConfig:
@@ -181,91 +134,83 @@ class ClosedLoop:
         return self._world.exploration
 
     @property
+    def _state(self) -> PolicyState:
+        context = self.policy_system.GetMyContextFromRoot(self.simulation.root)
+        return self.policy_system.state(context)
+
+    @property
+    def _response(self) -> PlanResponse:
+        context = self.planner_system.GetMyContextFromRoot(self.simulation.root)
+        return self.planner_system.response(context)
+
+    @property
     def belief(self) -> Belief:
-        """What the agent knows now."""
-        return self._agent_state(self.simulator.get_context()).belief
+        """What the policy knows now."""
+        return self._state.belief
 
     @property
     def timing(self) -> Timing:
         """How long the episode has taken so far."""
-        robot = self.simulator.get_context().get_time()
-        return Timing(robot, time.perf_counter() - self._begun_at, self._planning)
+        wall = time.perf_counter() - self._start_time
+        return Timing(self.simulation.root.get_time(), wall, self._planning)
 
     def rollout(self, policy: Policy) -> Iterator[Attempt]:
         """See `Backend.rollout`."""
-        self.agent.policy = policy
-        self._begun_at = time.perf_counter()
-        root = self.simulator.get_mutable_context()
-        self.station.set_scene(root, np.array(self._world.cell.robot.home), self.scene.objects)
-        self.simulator.set_monitor(self.vacuum)
-        freedom = Freedom(self.station, self.vacuum)
-        freedom.begin(root)
-        self.simulator.Initialize()
-        plan: Plan | None = None
-        beside, motion, answers, k = (set[str](), set[str]()), list[Frame](), dict[int, Answer](), 0
-        state = self._agent_state(root)
+        self.policy_system.policy = policy
+        self._start_time = time.perf_counter()
+        motion, state = list[Frame](), self._state
         while state.phase is not Phase.DONE:
-            now = root.get_time()
-            running = self.executor.running(self.executor.GetMyContextFromRoot(root))
-            if running.plan is not plan and running.plan is not None:
-                plan, beside = running.plan, disturbed_by(self._objects(root), running.plan)
-            wanted, must_hold = set[str](), False
-            if running.schedule is not None:
-                elapsed = now - running.begun
-                wanted = taking_part(running.schedule, *beside, elapsed)
-                must_hold = running.schedule.suction_on + LOOK <= elapsed < running.schedule.end + PATIENCE
-            freedom.update(root, wanted, must_hold=must_hold)
-            k += 1
-            self.simulator.AdvanceTo(k * LOOK + TIME_STEP / 2)
-            moving = running.schedule is not None and now - running.begun < running.schedule.end
-            if self._record and moving:
-                context = self.station.plant_context(root)
-                arm = self.station.arm_state(context, self._suction(root))
-                motion.append(Frame(root.get_time() - running.begun, self.station.scene.poses(context), arm))
-            answer: Answer = self._planner.GetOutputPort("answer").Eval(self._planner.GetMyContextFromRoot(root))
-            answers[answer.number] = answer
-            before, state = state, self._agent_state(root)
-            looked_again = state.phase is Phase.DONE or state.request is not before.request
-            if looked_again and before.request is not None:
-                answer = answers[before.request.number]
-                yield self._judged(root, before.request, answer, tuple(motion))
+            is_moving = self.simulation.is_moving
+            self.simulation.step()
+            if self._record and is_moving:
+                motion.append(self.simulation.sample())
+            before, state = state, self._state
+            done = state.phase is Phase.DONE or state.request.number != before.request.number
+            if done and before.request.number:
+                yield self._attempt(before, tuple(motion))
                 motion.clear()
 
-    def _objects(self, root: Context) -> tuple[SceneObject, ...]:
-        return self.scene.at(self.station.scene.poses(self.station.plant_context(root))).objects
+    def _attempt(self, state: PolicyState, motion: tuple[Frame, ...]) -> Attempt:
+        """Return how a move went, once the policy has looked again.
 
-    def _judged(
-        self,
-        root: Context,
-        request: Request,
-        answer: Answer,
-        motion: tuple[Frame, ...],
-    ) -> Attempt:
-        """How a move went, by the truth, once the agent has looked again."""
-        before, plan, decision = self.scene, answer.plan, request.decision
+        Args:
+            state: Of the policy, before it looked.
+            motion: Of the move.
+        """
+        before, decision, plan = self.scene, state.decision, self._response.plan
+        assert decision is not None
         assert plan is not None
-        if self._tracks:
-            decision = in_true_names(decision, request.belief, request.observation, before.objects)
-        move = decision.move
-        assert move is not None
+        self._planning += plan.seconds
+        if self._perceive is not None:
+            observation = state.request.observation
+            assert observation is not None
+            known = state.request.objects
+            decision = in_true_names(decision, known, observation, before.objects)
         if isinstance(plan, NoPlan):
             no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if no_spot else str(plan))
             return Attempt(decision, outcome, self.look)
-        after = replace(before, objects=self._objects(root))
-        # What hung on the cup, which may not be what the agent took it for.
-        picked = self.vacuum.taken or nearest(before.objects, plan.X_TO_pick).name
-        decision = replace(decision, move=replace(move, pick=picked))
+        picked, outcome = self._outcome(plan)
+        assert decision.move is not None
+        decision = replace(decision, move=replace(decision.move, pick=picked))
+        # The simulation goes on from where things are in it.
+        self.scene = self.simulation.scene
+        self.look = self._detector.look(self.scene)
+        return Attempt(decision, replace(outcome, scene=self.scene, motion=motion), self.look)
+
+    def _outcome(self, plan: Plan) -> tuple[str, Outcome]:
+        """Return the name of what was picked, and what the move has led to."""
+        before, after, grasp = self.scene, self.simulation.scene, self.simulation.gripper.status
+        # What hung on the cup may not be what the policy took it for.
+        picked = grasp.last_held or nearest(before.objects, plan.X_TO_pick).name
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
-        lowered = self.executor.running(self.executor.GetMyContextFromRoot(root)).lowered
-        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO).moved((0.0, 0.0, -lowered))
-        came_off = not self.vacuum.sealed or not math.isnan(self.vacuum.dropped)
+        lowered = self.simulation.executor_state.lowered_distance
+        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
+        X_TO_place = X_TO_place.moved((0.0, 0.0, -lowered))
+        came_off = not grasp.has_held or grasp.came_off
         outcome = judged(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"
-        # The simulation goes on from where things are in it.
-        outcome = replace(outcome, scene=after, motion=motion, detail=detail)
-        self.scene, self.look = after, self._detector.look(after)
-        return Attempt(decision, outcome, self.look)
+        return picked, replace(outcome, detail=detail)

@@ -9,21 +9,20 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import carried, rests_on
 from drake_clutter.scenes.interfaces import (
-    Move,
     MoveResult,
     Observation,
     Outcome,
     PickPlaceCommand,
 )
-from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.station.arm_executor import nearest
-from drake_clutter.systems.exploration_agent import in_true_names, infeasible_moves
-from drake_clutter.systems.scene_perception import Perceive, for_who_sees
-from drake_clutter.systems.tracking import tracked
-from drake_clutter.tasks.belief import Belief, Decision
+from drake_clutter.station.body_sleep import nearest
+from drake_clutter.systems.action_filter import InfeasibleMoves
+from drake_clutter.systems.perception_system import Perceive, for_who_sees
+from drake_clutter.systems.tracking import in_true_names, tracked
+from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import SteppedBackend
 
 
@@ -53,7 +52,7 @@ class ImageBackend(SteppedBackend):
         world = for_who_sees(world)
         self._perceive, self._seed = perceive, seed
         self._camera = OverheadCamera(world.cell.camera)
-        self._empty = self._camera.render(replace(scene, objects=())).depth
+        empty_depth = self._camera.render(replace(scene, objects=())).depth
         super().__init__(
             SettleExecutor(world, follow_falls=False),
             LabelDetector(world.cell.camera),
@@ -61,7 +60,7 @@ class ImageBackend(SteppedBackend):
             scene,
             item_rng(seed),
             tracker=tracked,
-            action_filter=self._infeasible_moves,
+            action_filter=InfeasibleMoves(_bare, empty_depth, world.exploration),
         )
 
     @property
@@ -79,11 +78,6 @@ class ImageBackend(SteppedBackend):
         images = self._camera.render(self.scene)
         return self._perceive(images.depth, images.color, ())
 
-    def _infeasible_moves(self, belief: Belief, observation: Observation) -> Sequence[Move]:
-        known = belief.objects
-        free = {o.name for o in known if not rests_on(o, known)}
-        return infeasible_moves(known, observation, free, self._empty, self.config)
-
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `SteppedBackend.execute`."""
         picked = nearest(self.scene.objects, command.X_TO_pick)
@@ -98,4 +92,9 @@ class ImageBackend(SteppedBackend):
 
     def in_true_names(self, decision: Decision) -> Decision:
         """See `SteppedBackend.in_true_names`."""
-        return in_true_names(decision, self.belief, self.observation, self.scene.objects)
+        return in_true_names(decision, self.belief.objects, self.observation, self.scene.objects)
+
+
+def _bare(known: Sequence[SceneObject]) -> set[str]:
+    """Return the names of objects on which nothing rests."""
+    return {o.name for o in known if not rests_on(o, known)}

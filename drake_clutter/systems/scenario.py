@@ -4,14 +4,14 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
-from drake_clutter.agents.exploration import BASELINES, make_explorers
+from drake_clutter.agents.exploration import BASELINES, FULL_KNOWLEDGE, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
-from drake_clutter.systems.scene_perception import LearnedPerception, Perceive
+from drake_clutter.systems.perception_system import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import Between, config_class
 
@@ -81,11 +81,11 @@ def policy_of(name: str, config: ClutterConfig) -> Policy:
     """
     if name in BASELINES:
         return BASELINES[name]
-    explorers = make_explorers(name, config)
-    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+    explorers = None if name == FULL_KNOWLEDGE else make_explorers(name, config)
+    if explorers is not None:
+        from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch
 
-    if not isinstance(explorers, LearnedExplorers) or explorers.privileged:
-        raise InputError(
-            f"agent: {name} knows more than the camera shows; allowed is a student, or one of {', '.join(BASELINES)}"
-        )
-    return explorers()
+        if isinstance(explorers, LearnedExplorers) and not explorers.privileged:
+            return explorers()
+    allowed = f"a student, or one of {', '.join(BASELINES)}"
+    raise InputError(f"agent: {name} knows more than the camera shows; allowed is {allowed}")

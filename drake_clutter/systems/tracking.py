@@ -10,8 +10,10 @@ from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.perception.explaining import explanation
 from drake_clutter.scenes.geometry import penetration
-from drake_clutter.scenes.interfaces import Detection, Observation
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.interfaces import Detection, Move, Observation
+from drake_clutter.scenes.scene import TRAY, SceneObject
+from drake_clutter.station.body_sleep import nearest
+from drake_clutter.tasks.belief import Decision
 
 NEAR = 0.04
 """m; an object that is seen so near to where one of its class is known to be is that one."""
@@ -119,6 +121,30 @@ def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> 
         pairs = _matched([o for o in known if o.object_class.name == name], there, NEAR)
         found |= {there[k].name for k in pairs.values()}
     return tuple(o.name for o in objects if o.name in found)
+
+
+def in_true_names(
+    decision: Decision,
+    known: Sequence[SceneObject],
+    observation: Observation,
+    objects: Sequence[SceneObject],
+) -> Decision:
+    """Return a decision in the names of what is really there.
+
+    Args:
+        decision: In the names of K_t; its move is not None.
+        known: K_t when it was made; each object is the true one nearest to its place.
+        observation: When it was made; it is kept in the decision.
+        objects: The true ones.
+    """
+    assert decision.move is not None
+    name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in known}
+    return Decision(
+        Move(name[decision.move.pick], name[decision.move.place]),
+        {name[pick]: chance for pick, chance in decision.picks.items()},
+        tuple(name[known] for known in decision.known),
+        observation,
+    )
 
 
 def _matched(known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float) -> dict[int, int]:

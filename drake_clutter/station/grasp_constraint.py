@@ -1,7 +1,8 @@
-"""What the vacuum is in a plant: two ways to fix an object to the cup, at whatever pose it has then.
+"""Two ways to fix an object to the cup in a plant, at the pose that it has then.
 
-`JointHold` is a floating joint from the cup to the object that is locked. `HexapodHold` is six distance constraints, the legs of
-a Stewart platform, whose feet are set when it is switched on. docs/arm.md compares them.
+`WeldGrasp` is a floating joint from the cup to the object that is locked. `CompliantGrasp` is six
+distance constraints, the legs of a Stewart platform, whose feet are set when it is switched on.
+docs/arm.md compares them.
 """
 
 import math
@@ -21,24 +22,24 @@ from drake_clutter.cell.suction import GRAVITY
 Floats = NDArray[np.float64]
 
 
-class Hold(Protocol):
-    """Fixes an object to the cup of an arm, or does not; made before the plant is finalized."""
+class GraspConstraint(Protocol):
+    """Fixes an object to the cup of an arm; made before the plant is finalized."""
 
     def reset(self, context: Context) -> None:
-        """To be called once on every new context of the plant: nothing is held."""
+        """Hold nothing; called once on every new context of the plant."""
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """Holds an object where it is."""
+        """Hold an object where it is."""
 
     def release(self, context: Context) -> None:
-        """Lets it go."""
+        """Let it go."""
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """Force (3,) N and moment (3,) N m of the object on the lip of the cup, in G."""
+        """Return force [N] and moment [N m] of the object on the lip of the cup, in G. Shapes (3,)."""
 
 
 def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
-    """What the cup is loaded with besides its own weight, from the reaction in the bellows; in G."""
+    """Return the load of the cup without its own weight, from the reaction in the bellows; in G."""
     bellows = plant.GetJointByName("bellows", arm.tool)
     reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
     down_G = -arm.cup.CalcPoseInWorld(context).rotation().matrix()[2]
@@ -46,63 +47,67 @@ def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Flo
     return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
 
 
-class JointHold:
-    """A floating joint between cup and one object, locked while it holds; it replaces the object's joint to the world."""
+class WeldGrasp:
+    """A floating joint between cup and one object, locked while it holds.
+
+    It replaces the object's joint to the world.
+    """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
         self._plant, self._arm = plant, arm
         self._joint = plant.AddJoint(QuaternionFloatingJoint("hold", arm.cup, body.body_frame()))
 
     def reset(self, context: Context) -> None:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         self._joint.Unlock(context)
 
     def put(self, context: Context, X_TO: RigidTransform) -> None:
-        """Puts the object at a pose."""
+        """Put the object at a pose."""
         self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """See `Hold`; it is the one object that it was made for."""
+        """See `GraspConstraint`; the object is the one that it was made for."""
         velocities, start = self._plant.GetVelocities(context), self._joint.velocity_start()
         velocities[start : start + 6] = 0.0
         self._plant.SetVelocities(context, velocities)
         self._joint.Lock(context)
 
     def release(self, context: Context) -> None:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         self._joint.Unlock(context)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         return _load_of_cup(self._plant, self._arm, context)
 
 
 _LEVER = 0.08
-"""m, size of the platforms; so large that forces and moments load the legs about equally."""
+"""Size of the platforms [m]: forces and moments load the legs about equally."""
 _LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
-"""N/m and N s/m: rubber yields a little in every direction; stiff legs would tear at the seal with every tracking error."""
+"""[N/m] and [N s/m]: rubber yields a little in every direction; stiff legs would tear at the seal
+with every tracking error."""
 _ANGLE = 2 * math.pi / 3
 _UPPER = np.array([[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)])
 _LOWER = np.array([[_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0] for k in (0, 1, 2)])
 _LEGS = [(_UPPER[k], _LOWER[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
 
 
-class HexapodHold:
-    """Six distance constraints between cup and object, from points above the lip to points around it; one set for all objects."""
+class CompliantGrasp:
+    """Six distance constraints from points above the lip to points around it; for any object."""
 
     def __init__(self, plant: MultibodyPlant, arm: Arm) -> None:
         self._plant, self._arm = plant, arm
         self._cup = plant.GetBodyByName("cup", arm.tool)
-        # Between whatever bodies there are, as long as nothing is held.
+        # Between any two bodies, as long as nothing is held.
         other = plant.GetBodyByName("body", arm.tool)
         self._legs = [plant.AddDistanceConstraint(self._cup, top, other, foot, 1.0) for top, foot in _LEGS]
 
     def reset(self, context: Context) -> None:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         self.release(context)
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         X_OG = body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
         for leg, (top, foot) in zip(self._legs, _LEGS, strict=True):
             ends = self._cup.index(), top, body.index(), X_OG @ foot
@@ -111,10 +116,10 @@ class HexapodHold:
             self._plant.SetConstraintActiveStatus(context, leg, True)
 
     def release(self, context: Context) -> None:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         for leg in self._legs:
             self._plant.SetConstraintActiveStatus(context, leg, False)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """See `Hold`."""
+        """See `GraspConstraint`."""
         return _load_of_cup(self._plant, self._arm, context)

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.depth_noise import DepthNoise, noisy_depth
 from drake_clutter.perception.label_detector import LabelDetector
@@ -19,6 +20,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.messages import no_observation
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation]
 """From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned
@@ -37,32 +39,53 @@ def for_who_sees(world: ClutterConfig) -> ClutterConfig:
     return replace(world, exploration=replace(world.exploration, release_height=higher))
 
 
-class ScenePerception(LeafSystem):
-    """Detects what is in view, whenever it is asked.
+class PerceptionSystem(LeafSystem):
+    """Detect what is in view, whenever the output is evaluated.
 
-    Input ports: depth_image, ImageDepth32F; color_image, ImageRgba8U; body_poses, of a plant.
-    Output port: observation, abstract, an `Observation`. It is computed when it is looked at, once for a state of the inputs.
+    .. pydrake_system::
+
+        name: PerceptionSystem
+        input_ports:
+        - depth_image
+        - color_image
+        - body_poses
+        output_ports:
+        - observation
+
+    Input ports:
+        depth_image: `ImageDepth32F`.
+        color_image: `ImageRgba8U`.
+        body_poses: Of a plant.
+
+    Output ports:
+        observation: `Observation`, computed once for a state of the inputs.
     """
 
-    def __init__(self, *, perceive: Perceive, width: int, height: int) -> None:
-        """With a detector, for images of a size in pixels."""
+    def __init__(self, *, perceive: Perceive, camera: Camera) -> None:
+        """Make a system.
+
+        Args:
+            perceive: The detector.
+            camera: Whose images it gets.
+        """
         super().__init__()
-        self._perceive = perceive
-        self._depth = self.DeclareAbstractInputPort("depth_image", AbstractValue.Make(ImageDepth32F(width, height)))
-        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(width, height)))
+        self._perceive, size = perceive, (camera.width, camera.height)
+        self._depth = self.DeclareAbstractInputPort("depth_image", AbstractValue.Make(ImageDepth32F(*size)))
+        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(*size)))
         self._poses = self.DeclareAbstractInputPort("body_poses", AbstractValue.Make([RigidTransform()]))
-        self.DeclareAbstractOutputPort("observation", lambda: AbstractValue.Make(None), self._calc_observation)
+        self.DeclareAbstractOutputPort("observation", lambda: AbstractValue.Make(no_observation()), self._calc_observation)
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, *, perceive: Perceive, width: int, height: int) -> "ScenePerception":
-        """Adds one."""
-        system: ScenePerception = builder.AddSystem(ScenePerception(perceive=perceive, width=width, height=height))
-        system.set_name("scene_perception")
+    def AddToBuilder(builder: DiagramBuilder, *, perceive: Perceive, camera: Camera) -> "PerceptionSystem":
+        """Add a system to a diagram; arguments as of the constructor."""
+        made = PerceptionSystem(perceive=perceive, camera=camera)
+        system: PerceptionSystem = builder.AddNamedSystem("perception_system", made)
         return system
 
     def _calc_observation(self, context: Context, output: AbstractValue) -> None:
         depth, color = (port.Eval(context).data for port in (self._depth, self._color))
-        output.set_value(self._perceive(depth[..., 0].copy(), color[..., :3].copy(), self._poses.Eval(context)))
+        depth, color = depth[..., 0].copy(), color[..., :3].copy()
+        output.set_value(self._perceive(depth, color, self._poses.Eval(context)))
 
 
 class LearnedPerception:

@@ -1,0 +1,42 @@
+"""The camera of the simulated station."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import MakeRenderEngineVtk
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
+
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
+from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.station_simulation import TIME_STEP
+
+
+def add_camera(builder: DiagramBuilder, station: ClutterStation) -> RgbdSensor:
+    """Add the cell's camera to a diagram, connected to a station that has visuals."""
+    seen = station.camera_scene_graph
+    assert seen is not None
+    seen.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
+    eye = Intrinsics.of(station.cell.camera)
+    sensor = RgbdSensor(seen.world_frame_id(), eye.X_TC, eye.color, eye.depth)
+    builder.AddNamedSystem("overhead_camera", sensor)
+    builder.Connect(station.GetOutputPort("query"), sensor.GetInputPort("geometry_query"))
+    return sensor
+
+
+@lru_cache(maxsize=8)
+def empty_depth(cell: WorkCell) -> NDArray[np.float32]:
+    """Return the depth image of a cell without objects, the arm at home [m]. Shape (h, w)."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(ClutterStation(cell, [], time_step=TIME_STEP, visuals=True))
+    sensor = add_camera(builder, station)
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    station.set_scene(root, np.array(cell.robot.home), [])
+    context = sensor.GetMyContextFromRoot(root)
+    image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(context)
+    depth: NDArray[np.float32] = image.data[..., 0].copy()
+    depth.flags.writeable = False
+    return depth

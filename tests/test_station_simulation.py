@@ -1,0 +1,165 @@
+"""The simulated station: begun anew, stepped, recorded, and drawn where it was."""
+
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import cell_with, resting, scene_of
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.fixture import Fixture
+from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.work_cell import WorkCell, load_cell
+from drake_clutter.files import InputError
+from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.clearance import ClearanceScene
+from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.reports import recording
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Outcome
+from drake_clutter.scenes.scene import Pose
+from drake_clutter.simulation.plant import pose_of
+from drake_clutter.station.messages import PlannedMove
+from drake_clutter.station.station_simulation import STEP, StationSimulation
+from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
+from drake_clutter.validation import config_yaml
+
+SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", xy=(0.15, 0.1)))
+CELL = cell_with(
+    "robot.base.x=-0.7",
+    "robot.base.y=0.05",
+    "robot.base.yaw=10",
+    "gripper.extension=0.12",
+    "cameras.overhead.pose.z=1.8",
+)
+"""Base, tool and camera are elsewhere than in the default cell."""
+
+
+def planned(cell: WorkCell = CELL) -> Plan:
+    box = SCENE["pudding_box"].X_TO
+    X_TO = Pose((0.0, -0.2, box.translation[2] + 0.001), box.quaternion)
+    planner = PickPlacePlanner(cell, PlannerConfig(optimise=False))
+    plan = planner.plan(SCENE.objects, "pudding_box", X_TO)
+    assert isinstance(plan, Plan)
+    return plan
+
+
+def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
+    """X_TL of the arm's links by name; the cup gives way on its bellows, and is left out."""
+    plant, context = simulation.station.plant, simulation.plant_context
+    return {
+        f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_of(body.EvalPoseInWorld(context))
+        for body in simulation.station.arm.bodies
+        if body.name() != "cup"
+    }
+
+
+def is_past(simulation: StationSimulation, time: float) -> bool:
+    return bool(simulation.root.get_time() > time)
+
+
+def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
+    simulation, motion, simulated = StationSimulation(CELL, SCENE), list[Frame](), []
+    context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
+    simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, planned()))
+    for end in (0.4, 0.8, 1.2):
+        simulation.run_until(partial(is_past, simulation, end))
+        motion.append(simulation.sample())
+        simulated.append(link_poses(simulation))
+    outcome = Outcome(MoveResult.PLACED, SCENE, motion=tuple(motion))
+    path = tmp_path / "trajectory.h5"
+    write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], CELL)
+    scene, cell, ((_, frames),) = read_trajectories(path, load_catalogue())
+    assert cell == CELL
+    _, _, drawn_at = recording._shown(scene, cell, arm=True)
+    for frame, poses in zip(frames, simulated, strict=True):
+        assert frame.arm is not None
+        drawn = drawn_at(frame.arm.q)
+        for name, X_TL in poses.items():
+            assert drawn[name].p == pytest.approx(X_TL.p, abs=1e-9)
+            assert drawn[name].rotation == pytest.approx(X_TL.rotation, abs=1e-9)
+    ends = [poses["epick::body"].p for poses in (simulated[0], simulated[-1])]
+    assert np.linalg.norm(ends[1] - ends[0]) > 0.1, "it moved meanwhile"
+
+
+def test_it_begins_anew_and_does_the_same() -> None:
+    plan, simulation = planned(), StationSimulation(CELL, SCENE)
+    first = simulation.execute(plan, record=True)
+    simulation.reset(SCENE)
+    assert simulation.root.get_time() == 0.0
+    assert simulation.scene["pudding_box"].X_TO.p == pytest.approx(SCENE["pudding_box"].X_TO.p)
+    again = simulation.execute(plan, record=True)
+    assert again.poses == first.poses
+    assert again.motion == first.motion
+
+
+def test_one_plan_after_the_other() -> None:
+    simulation = StationSimulation(CELL, SCENE)
+    first = simulation.execute(planned())
+    assert (simulation.finished, simulation.is_moving, first.came_off) == (1, False, False)
+    place = Pose((0.0, 0.2, 0.0185), simulation.scene["pudding_box"].X_TO.quaternion)
+    planner = PickPlacePlanner(CELL, PlannerConfig(optimise=False))
+    plan = planner.plan(simulation.scene.objects, "pudding_box", place)
+    assert isinstance(plan, Plan)
+    second = simulation.execute(plan, record=True)
+    assert simulation.finished == 2
+    assert second.poses["pudding_box"].p[:2] == pytest.approx(place.p[:2], abs=0.003)
+    assert 0 < second.motion[0].time <= 2 * STEP
+    assert second.motion[-1].time == pytest.approx(second.time - simulation.executor_state.start_time)
+
+
+def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
+    cell = load_cell(shipped_path("models/cells/iiwa14_epick_tray.yaml"))
+    result = StationSimulation(cell, SCENE).execute(planned(cell), record=True)
+    assert result.poses["pudding_box"].p[:2] == pytest.approx([0.0, -0.2], abs=0.005)
+    assert result.tracking < 0.02
+    outcome, path = Outcome(MoveResult.PLACED, SCENE, motion=result.motion), tmp_path / "t.h5"
+    write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], cell)
+    _, read, ((_, frames),) = read_trajectories(path, load_catalogue())
+    assert read == cell
+    assert frames[0].arm is not None
+    assert frames[0].arm.q == pytest.approx(cell.robot.home, abs=0.01)
+    with h5py.File(path, "a") as file:
+        file.attrs["cell"] = config_yaml(CELL)
+    with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
+        read_trajectories(path, load_catalogue())
+
+
+BOARD = """<robot name="board"><link name="top">
+  <visual><geometry><box size="0.2 0.2 0.02"/></geometry></visual>
+  <collision><geometry><box size="0.2 0.2 0.02"/></geometry></collision>
+</link>{}</robot>"""
+FLAP = """<link name="flap"/><joint name="hinge" type="{}"><parent link="top"/><child link="flap"/>
+  <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+
+
+def with_board(path: Path, z: float) -> WorkCell:
+    board = Fixture(name="shelf", model=str(path), pose=PoseSpec(translation=(0.0, 0.0, z)))
+    return CELL.model_copy(update={"fixtures": (*CELL.fixtures, board)})
+
+
+def test_a_fixture_with_a_model_is_an_obstacle(tmp_path: Path) -> None:
+    """For the simulation and for plans, by its name."""
+    path, top = tmp_path / "board.urdf", 0.12
+    path.write_text(BOARD.format(FLAP.format("fixed")))
+    cell = with_board(path, top - 0.01)
+    scene = scene_of(resting("gelatin_box", floor=top))
+    simulation = StationSimulation(cell, scene)
+    for _ in range(8):
+        simulation.step()
+    assert simulation.scene["gelatin_box"].X_TO.p == pytest.approx(scene["gelatin_box"].X_TO.p)
+    around = ClearanceScene(cell, [])
+    near = around.close(np.array(cell.robot.home), 1.0)
+    assert any("shelf" in clearance.pair for clearance in near)
+
+
+def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "door.urdf"
+    path.write_text(BOARD.format(FLAP.format("revolute")))
+    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .* has parts that move; allowed"):
+        StationSimulation(with_board(path, 0.3), SCENE)
+    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .*allowed is an SDF or URDF"):
+        StationSimulation(with_board(tmp_path / "none.urdf", 0.3), SCENE)
