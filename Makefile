@@ -20,7 +20,7 @@ test: .venv/installed
 	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 --dist loadfile
 
 test-any:
-	OMP_NUM_THREADS=1 PYTHONPATH=. $(PYTHON) -m pytest -q -rs --ignore tests/test_install.py
+	OMP_NUM_THREADS=1 PYTHONPATH=$(CURDIR) $(PYTHON) -m pytest -q -rs --ignore tests/test_install.py
 
 docs: .venv/installed
 	.venv/bin/pdoc -d google drake_clutter -o out/api
