@@ -1,4 +1,4 @@
-"""The simulated station: begun anew, stepped, recorded, and drawn where it was."""
+"""The simulated station: reset, stepped, recorded, and drawn where it was."""
 
 from functools import partial
 from pathlib import Path

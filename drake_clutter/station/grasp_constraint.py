@@ -35,7 +35,7 @@ class GraspConstraint(Protocol):
         """Let it go."""
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """Return force [N] and moment [N m] of the object on the lip of the cup, in G. Shapes (3,)."""
+        """Return force [N] and moment [N m] of the object on the cup's lip, in G. Shapes (3,)."""
 
 
 def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:

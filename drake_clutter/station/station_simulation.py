@@ -27,8 +27,8 @@ SETTLE_TIME = 0.1
 STEP = 0.025
 """Between two decisions which objects are simulated [s]."""
 TIME_STEP = STEP / 10
-"""Of the plant [s]; with twice as much a high stack trembles as soon as it is free, and creeps until
-it falls."""
+"""Of the plant [s]; with twice as much a high stack trembles as soon as it is free, and creeps
+until it falls."""
 POST_MOTION_WAIT = 1.0
 """After a plan's end, for which what has fallen is followed [s]."""
 
