@@ -8,7 +8,7 @@ _INSTALLED_DATA_DIR = _PACKAGE_DIR / "_shipped"
 
 
 def shipped_path(relative: str) -> Path:
-    """Absolute path of a shipped file or folder, e.g. ``shipped_path("models/ur10.sdf")``.
+    """Absolute path of a shipped file or folder, e.g. ``shipped_path("models/robots/ur10.sdf")``.
 
     A wheel holds `models/`, `sdf_assets/` and `training/` inside the package; a checkout holds them beside it.
 

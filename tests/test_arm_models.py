@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_clutter.cell import iiwa14
-from drake_clutter.cell.rods import Rod
-from drake_clutter.cell.ur_e_series import E_SERIES, UR3E, UR5E
-from drake_clutter.cell.ur_family import UrArm, ur_sdf
+import iiwa14
+from drake_clutter.cell.primitives import Rod
 from drake_clutter.resources import shipped_path
+from ur_e_series import E_SERIES, UR3E, UR5E
+from ur_family import UrArm, ur_sdf
 
 DATA = Path(__file__).parent / "data"
 MODELS = {**{arm.name: ur_sdf(arm) for arm in E_SERIES}, "iiwa14": iiwa14.iiwa14_sdf()}

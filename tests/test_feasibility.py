@@ -12,7 +12,6 @@ import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from typer.testing import CliRunner
 
-from drake_clutter.cell.kinematics import jacobian, manipulability
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
 from drake_clutter.commands import feasibility as command
@@ -26,6 +25,7 @@ from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.planning.tool_kinematics import downwards
 from drake_clutter.reports import feasibility_report
 from drake_clutter.resources import shipped_path
+from drake_clutter.robots.ur_kinematics import jacobian, manipulability
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene

@@ -15,7 +15,7 @@ FLOORS = {
         *("statistics", "validation", "workers", "yaml_text"),
     },
     1: {"cell", "config", "grammar"},
-    2: {"scenes", "stability"},
+    2: {"robots", "scenes", "stability"},
     3: {"export", "simulation"},
     4: {"perception", "planning"},
     5: {"tasks"},

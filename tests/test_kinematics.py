@@ -5,7 +5,7 @@ import pytest
 from conftest import rng
 from numpy.typing import NDArray
 
-from drake_clutter.cell.kinematics import forward_kinematics, inverse_kinematics, jacobian, link_poses, manipulability
+from drake_clutter.robots.ur_kinematics import forward_kinematics, inverse_kinematics, jacobian, link_poses, manipulability
 
 
 def apart(q: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:

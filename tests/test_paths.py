@@ -9,7 +9,6 @@ from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.planning.paths import (
     MARGIN,
     dynamics_plant,
@@ -20,6 +19,7 @@ from drake_clutter.planning.paths import (
     timed,
     torques,
 )
+from drake_clutter.robots.robot_model import load_robot
 
 ARM = DEFAULT_CELL
 ROBOT = load_robot(ARM.robot)

@@ -7,8 +7,8 @@ import pytest
 from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
 
 from drake_clutter.cell.robot import RobotSpec
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.files import InputError
+from drake_clutter.robots.robot_model import load_robot
 
 JOINTS = ", ".join(robot("ur5e").joint_names)
 SHIPPED = "package://drake_clutter_models/FILE"

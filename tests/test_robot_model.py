@@ -11,14 +11,14 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_clutter.cell import kinematics
-from drake_clutter.cell.numerical_ik import NumericalInverseKinematics
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.robot import JointLimits, RobotSpec
-from drake_clutter.cell.robot_model import RobotModel, load_robot
-from drake_clutter.cell.robot_plant import add_robot, unmeeting_links
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.resources import shipped_path
+from drake_clutter.robots import ur_kinematics as kinematics
+from drake_clutter.robots.numerical_ik import NumericalInverseKinematics
+from drake_clutter.robots.robot_model import RobotModel, load_robot
+from drake_clutter.robots.robot_plant import add_robot, unmeeting_links
 
 Floats = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 from test_robot_model import CELLS
 
-from drake_clutter.cell.robot_model import RobotModel, load_robot
-from drake_clutter.cell.robot_plant import add_robot, filter_collisions
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.resources import shipped_path
+from drake_clutter.robots.robot_model import RobotModel, load_robot
+from drake_clutter.robots.robot_plant import add_robot, filter_collisions
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ from conftest import DEFAULT_CELL, executed, resting, rng, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.cell.ur10 import LINKS
 from drake_clutter.cli import app
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -19,6 +18,7 @@ from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
+from ur10 import LINKS
 
 SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", floor=0.035), resting("large_marker", xy=(0.2, 0.2)))
 MOVES = (Move("gelatin_box"), Move("large_marker"))

@@ -10,10 +10,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_clutter.cell.kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
-from drake_clutter.cell.rods import Rod
-from drake_clutter.cell.ur10 import BASE_OUTLINE, LINKS, ur10_sdf
+from drake_clutter.cell.primitives import Rod
 from drake_clutter.resources import shipped_path
+from drake_clutter.robots.ur_kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
+from ur10 import BASE_OUTLINE, LINKS, ur10_sdf
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
 """Corners (V, 3), in 10 um, and triangles of each link in its frame: the meshes of ROS-Industrial's ur_description (BSD)."""
@@ -22,14 +22,14 @@ OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
 @pytest.fixture(scope="module")
 def plant() -> MultibodyPlant:
     made = MultibodyPlant(0.001)
-    Parser(made).AddModels(str(shipped_path("models/ur10.sdf")))
+    Parser(made).AddModels(str(shipped_path("models/robots/ur10.sdf")))
     made.WeldFrames(made.world_frame(), made.GetFrameByName("base"))
     made.Finalize()
     return made
 
 
 def test_the_file_is_what_is_written() -> None:
-    assert shipped_path("models/ur10.sdf").read_text() == ur10_sdf()
+    assert shipped_path("models/robots/ur10.sdf").read_text() == ur10_sdf()
 
 
 def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:

@@ -8,7 +8,7 @@ Sources: see `suction`; the masses of tube and cup are assumed.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.rods import Rod, sdf_link, sdf_pose
+from drake_clutter.cell.primitives import Rod, sdf_link, sdf_pose
 
 EPICK_LENGTH = 0.1023
 EPICK_RADIUS = 0.044

@@ -16,13 +16,13 @@ from pydantic import field_validator
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, output_directory, write_json, write_text
 from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.reports.feasibility_report import write_report
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng

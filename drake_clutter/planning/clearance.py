@@ -12,12 +12,12 @@ from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.tool_kinematics import inverse
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
+from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_numbers
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 
 Floats = NDArray[np.float64]

@@ -13,10 +13,10 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.robot_model import RobotModel, load_robot
-from drake_clutter.cell.robot_plant import add_robot
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.time_optimal import squared_speeds
+from drake_clutter.robots.robot_model import RobotModel, load_robot
+from drake_clutter.robots.robot_plant import add_robot
 
 Floats = NDArray[np.float64]
 

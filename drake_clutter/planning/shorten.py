@@ -21,8 +21,8 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 from scipy import sparse
 
-from drake_clutter.cell.robot_model import RobotModel
 from drake_clutter.planning.paths import MARGIN
+from drake_clutter.robots.robot_model import RobotModel
 
 Floats = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.cell.robot_model import RobotModel, load_robot
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.paths import SPACING, straight
+from drake_clutter.robots.robot_model import RobotModel, load_robot
 
 Floats = NDArray[np.float64]
 

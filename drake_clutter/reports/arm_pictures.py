@@ -15,11 +15,11 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drake_clutter.cell.plant import add_work_cell, set_joint_angles
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.reports.pictures import ENGINE, look_at
 from drake_clutter.scenes.interfaces import Frame
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 
 _SIZE = (480, 480)

@@ -19,11 +19,11 @@ from pydrake.geometry import (
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation, Slerp
 
-from drake_clutter.cell.plant import add_work_cell, set_joint_angles
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import write_text
 from drake_clutter.scenes.interfaces import Frame
 from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
 from drake_clutter.simulation.quiet import drake_silent_below
 from drake_clutter.tasks.exploration import Step

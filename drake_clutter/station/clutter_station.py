@@ -12,11 +12,11 @@ from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.catalogue import ObjectClass
-from drake_clutter.cell.plant import Arm, add_work_cell, joint_numbers
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_numbers
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
 from drake_clutter.station.grasp_constraint import CompliantGrasp, GraspConstraint, WeldGrasp
 

@@ -16,8 +16,8 @@ from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
 from drake_clutter.cell.epick import CUP_MASS
-from drake_clutter.cell.plant import Arm
 from drake_clutter.cell.suction import GRAVITY
+from drake_clutter.simulation.cell_plant import Arm
 
 Floats = NDArray[np.float64]
 

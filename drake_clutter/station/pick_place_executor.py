@@ -16,10 +16,10 @@ from pydrake.systems.framework import (
 )
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.paths import dynamics_plant, torques
 from drake_clutter.planning.plan import DESCENT_SPEED, Plan
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.station.command_schedule import CommandSchedule, build_command_schedule
 from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
 

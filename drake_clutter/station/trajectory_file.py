@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalogue import Catalogue
-from drake_clutter.cell.robot_model import load_robot
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
 from drake_clutter.files import InputError, replacing
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import scene_from_text, scene_text

@@ -15,9 +15,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from drake_clutter.cell.inverse_kinematics import JUMP
-from drake_clutter.cell.joint_range import TURN, JointRange
-from drake_clutter.cell.serial_chain import SerialChain, chain_frames, chain_jacobian
+from drake_clutter.robots.inverse_kinematics import JUMP
+from drake_clutter.robots.joint_range import TURN, JointRange
+from drake_clutter.robots.serial_chain import SerialChain, chain_frames, chain_jacobian
 
 Floats = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_clutter.cell.stl import stl_as_obj
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
+from drake_clutter.robots.stl import stl_as_obj
 
 PACKAGE = "drake_clutter_models"
 """Name of the package whose files ship as `models/`."""

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_clutter.cell.kinematics import DenavitHartenberg
-from drake_clutter.cell.rods import Point, Rod
-from drake_clutter.cell.ur_family import CAP, JOINT, TUBE, Link, UrArm
+from drake_clutter.cell.primitives import Point, Rod
+from drake_clutter.robots.ur_kinematics import DenavitHartenberg
+from ur_family import CAP, JOINT, TUBE, Link, UrArm
 
 NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 BASE_MASS = 4.0
@@ -118,7 +118,7 @@ def _arm(
     )
     radius, height = shape.base
     base_looks = (_rod((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),)
-    this = "drake_clutter.cell.ur_e_series"
+    this = "models/generators/ur_e_series.py"
     return UrArm(name, parameters, links, (base_outline,), base_looks, BASE_MASS, this)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.rods import Rod, sdf_link, sdf_pose
+from drake_clutter.cell.primitives import Rod, sdf_link, sdf_pose
 
 Floats = NDArray[np.float64]
 

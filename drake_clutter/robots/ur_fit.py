@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.cell.kinematics import DenavitHartenberg, forward_kinematics
-from drake_clutter.cell.serial_chain import SerialChain
+from drake_clutter.robots.serial_chain import SerialChain
+from drake_clutter.robots.ur_kinematics import DenavitHartenberg, forward_kinematics
 
 Floats = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_clutter.cell.arm_sdf import ArmLink, arm_sdf
-from drake_clutter.cell.kinematics import JOINTS, DenavitHartenberg, after_joint
-from drake_clutter.cell.rods import Point, Rod
+from arm_sdf import ArmLink, arm_sdf
+from drake_clutter.cell.primitives import Point, Rod
+from drake_clutter.robots.ur_kinematics import JOINTS, DenavitHartenberg, after_joint
 
 JOINT_RANGE = 2 * math.pi
 """Greatest angle of all joints, either way [rad] (data sheets)."""

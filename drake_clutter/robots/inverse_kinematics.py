@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.cell.joint_range import JointRange
-from drake_clutter.cell.kinematics import DenavitHartenberg, branch_of, branches
+from drake_clutter.robots.joint_range import JointRange
+from drake_clutter.robots.ur_kinematics import DenavitHartenberg, branch_of, branches
 
 Floats = NDArray[np.float64]
 

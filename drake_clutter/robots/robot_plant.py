@@ -13,8 +13,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_clutter.cell.model_file import parse_model
-from drake_clutter.cell.robot_model import RobotModel
+from drake_clutter.robots.model_file import parse_model
+from drake_clutter.robots.robot_model import RobotModel
 
 _SAMPLES = 200
 """Configurations at which links two joints apart are looked at."""

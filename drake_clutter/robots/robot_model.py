@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell import kinematics
-from drake_clutter.cell.inverse_kinematics import InverseKinematics, UrInverseKinematics
-from drake_clutter.cell.joint_range import JointRange
-from drake_clutter.cell.numerical_ik import NumericalInverseKinematics
-from drake_clutter.cell.parsed_arm import ParsedArm, parse_arm
 from drake_clutter.cell.robot import RobotSpec
-from drake_clutter.cell.serial_chain import SerialChain
-from drake_clutter.cell.ur_fit import UrFit, fit_ur
 from drake_clutter.files import InputError
+from drake_clutter.robots import ur_kinematics as kinematics
+from drake_clutter.robots.inverse_kinematics import InverseKinematics, UrInverseKinematics
+from drake_clutter.robots.joint_range import JointRange
+from drake_clutter.robots.numerical_ik import NumericalInverseKinematics
+from drake_clutter.robots.parsed_arm import ParsedArm, parse_arm
+from drake_clutter.robots.serial_chain import SerialChain
+from drake_clutter.robots.ur_fit import UrFit, fit_ur
 
 Floats = NDArray[np.float64]
 
@@ -117,6 +117,8 @@ def load_robot(spec: RobotSpec) -> RobotModel:
     ik: InverseKinematics = NumericalInverseKinematics(arm.chain, joints, home)
     if fit is not None:
         ik = UrInverseKinematics(fit.parameters, joints, _inverse(fit.X_B0), _inverse(fit.X_6F))
+    at_home = arm.chain.forward_kinematics(home)[None]
+    ik.solve(at_home), ik.track(at_home, home)  # compiled here: no plan's time limit pays for it
     return RobotModel(
         spec,
         tuple(joint.name() for joint in arm.joints),

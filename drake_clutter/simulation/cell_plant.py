@@ -16,11 +16,11 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context
 
 from drake_clutter.cell.fixture import Fixture
-from drake_clutter.cell.model_file import parse_model
-from drake_clutter.cell.robot_model import load_robot
-from drake_clutter.cell.robot_plant import add_robot, filter_collisions
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
+from drake_clutter.robots.model_file import parse_model
+from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.robots.robot_plant import add_robot, filter_collisions
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The UR10 of the CB series as a model: `models/ur10.sdf` is what `ur_sdf(UR10_ARM)` writes.
+"""The UR10 of the CB series as a model: `models/robots/ur10.sdf` is what `ur_sdf(UR10_ARM)` writes.
 
 Frames: see `ur_family`.
 
@@ -11,10 +11,10 @@ mass is assumed.
 
 import math
 
-from drake_clutter.cell.kinematics import UR10
-from drake_clutter.cell.rods import Rod
-from drake_clutter.cell.ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
-from drake_clutter.cell.ur_family import JOINT_RANGE as JOINT_RANGE
+from drake_clutter.cell.primitives import Rod
+from drake_clutter.robots.ur_kinematics import UR10
+from ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
+from ur_family import JOINT_RANGE as JOINT_RANGE
 
 _SHOULDER_SPEED, _SPEED = math.radians(120), math.radians(180)
 LINKS = (
@@ -107,7 +107,7 @@ LINKS = (
 )
 BASE_OUTLINE = (Rod((0.0, -0.0247, 0.0091), (0.0, 0.0245, 0.0083), 0.0825),)
 BASE_LOOKS = (Rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.0380), 0.0750, JOINT),)
-UR10_ARM = UrArm("ur10", UR10, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "drake_clutter.cell.ur10")
+UR10_ARM = UrArm("ur10", UR10, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "models/generators/ur10.py")
 
 
 def ur10_sdf() -> str:

@@ -18,10 +18,10 @@ from pydrake.multibody.tree import (
     RigidBody,
 )
 
-from drake_clutter.cell.model_file import model_path, parse_model, torque_limits
 from drake_clutter.cell.robot import RobotSpec
-from drake_clutter.cell.serial_chain import SerialChain
 from drake_clutter.files import InputError
+from drake_clutter.robots.model_file import model_path, parse_model, torque_limits
+from drake_clutter.robots.serial_chain import SerialChain
 
 _OF_DRAKE = ("__model__", "_parent", "_child")
 """Ends of the names of frames that Drake's parser adds."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.arm_sdf import ArmLink, arm_sdf
-from drake_clutter.cell.rods import Rod
+from arm_sdf import ArmLink, arm_sdf
+from drake_clutter.cell.primitives import Rod
 
 _ORANGE, _GREY = "0.90 0.45 0.12 1", "0.62 0.63 0.65 1"
 _RANGES_DEG = (170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0)
@@ -113,4 +113,4 @@ def iiwa14_sdf() -> str:
         drive = math.radians(_RANGES_DEG[k]), _TORQUES[k], math.radians(_SPEEDS_DEG[k])
         links.append(ArmLink(f"link_{k + 1}", *shape, f"joint_{k + 1}", _pose(place), *drive))
     X_LF = _pose(((0.0, 0.0, FLANGE), _UP))
-    return arm_sdf("iiwa14", "drake_clutter.cell.iiwa14", links, X_LF)
+    return arm_sdf("iiwa14", "models/generators/iiwa14.py", links, X_LF)
