@@ -25,9 +25,10 @@ from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import told_in_one_line, write_json
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import NEAR, REPORTED, PlannerConfig
+from drake_clutter.planning.attempts import NEAR, REPORTED
 from drake_clutter.planning.paths import sampled, smooth, timed
 from drake_clutter.planning.plan import NoPlan, Plan
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene

@@ -15,9 +15,9 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult

@@ -16,9 +16,9 @@ from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
 from drake_clutter.files import InputError
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene

@@ -18,9 +18,9 @@ from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.planning.tool_kinematics import downwards
 from drake_clutter.reports import feasibility_report

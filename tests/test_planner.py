@@ -9,9 +9,9 @@ from conftest import CLASSES, DEFAULT_CELL, cell_with, random_scene, resting, rn
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject

@@ -11,10 +11,10 @@ from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.paths import dynamics_plant, torques
 from drake_clutter.planning.plan import NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform

@@ -13,10 +13,10 @@ from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.files import InputError
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.clearance import ClearanceScene
 from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports import recording
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Outcome

@@ -10,9 +10,9 @@ from conftest import DEFAULT_CELL, resting, scene_of
 
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Pose, SceneObject

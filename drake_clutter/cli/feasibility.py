@@ -8,7 +8,7 @@ import typer
 
 from drake_clutter.cli.options import CatalogueOption, ConfigOption, JsonOption, SeedOption, SetOption, WorkersOption
 from drake_clutter.cli.output import progress_bar, show
-from drake_clutter.cli.world import load_world
+from drake_clutter.cli.world import load_scene_and_world, load_world
 from drake_clutter.files import InputError
 
 PLACE = "X,Y,Z,YAW"
@@ -50,7 +50,8 @@ def feasibility(
     """Ask an arm about every legal move of scenes: tables, pictures and a report. A study that was stopped goes on."""
     from drake_clutter.commands import feasibility as command
 
-    world = load_world(config, None, settings)
+    files = command.scene_files(scenes)
+    _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
     cells = {path.stem: load_world(config, path, settings).cell for path in cell or []}
     setups = command.setups(
         [_numbers("--base", text) for text in base or []],
@@ -60,9 +61,8 @@ def feasibility(
     )
     if cells:
         setups = cells | {name: other for name, other in setups.items() if name != "default"}
-    job = command.FeasibilityJob(
-        command.scene_files(scenes), setups, command.read_targets(targets) if targets else (), seed, world, catalogue
-    )
+    asked = command.read_targets(targets) if targets else ()
+    job = command.FeasibilityJob(files, setups, asked, seed, world, catalogue)
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return progress_bar("parts", made, done, total)

@@ -24,7 +24,7 @@ from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
-from drake_clutter.validation import Model, Text, validate
+from drake_clutter.validation import Model, Text, to_plain, validate
 from drake_clutter.yaml_text import read_yaml
 
 Report = Callable[[Step], None]
@@ -119,7 +119,7 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
             )
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
-    write_json(out / "plan.json", {"seed": seed, "plans": plans})
+    write_json(out / "plan.json", {"seed": seed, "cell": to_plain(config.cell), "plans": plans})
     return plans
 
 
@@ -195,5 +195,5 @@ def write_episode(
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields, config.cell)
     if fidelity == "arm":
         write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], config.cell)
-    write_json(out / "episode.json", fields)
+    write_json(out / "episode.json", fields | {"cell": to_plain(config.cell)})
     return fields

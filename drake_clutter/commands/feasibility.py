@@ -19,7 +19,7 @@ from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, output_directory, write_json, write_text
-from drake_clutter.planning.attempts import PlannerConfig
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.reports.feasibility_report import write_report
 from drake_clutter.robots.robot_model import load_robot

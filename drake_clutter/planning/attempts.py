@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.clearance import Clearance, ClearanceScene
 from drake_clutter.planning.paths import SPACING, least_time, sampled, slowed, smooth, timed
 from drake_clutter.planning.plan import DESCENT_SPEED, NoPlan, Phase, Plan, PlanFailure
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.shorten import Wall, Way, shortened
 from drake_clutter.planning.tool_kinematics import (
     CarryWay,
@@ -29,41 +29,8 @@ from drake_clutter.planning.tool_kinematics import (
 )
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
-from drake_clutter.validation import Between, Flag, NonNegative, config_class
 
 Floats = NDArray[np.float64]
-
-
-@config_class
-class PlannerConfig:
-    """How plans are searched.
-
-    Attributes:
-        clearance: m, kept from everything, but for what the held object is closer to at an end of its way.
-        rise: m, that the held object is lifted over what it must pass.
-        lip_gap: m, between lip and face when the vacuum is switched on.
-        grasp_spacing: m, between the points of a face that are tried; grasps: of them, at most.
-        yaws: of the cup, that are tried.
-        attempts: of grasp, yaw, branch and height, at most.
-        least_acceleration: m/s^2, that a grasp must bear.
-        time_limit: s; so long that it decides nothing: the same question has the same answer on any machine.
-        descent: m, at most, that an object is lowered from its place until it touches something; 0: it is let go there.
-        above: m, over its place, that this descent begins; where there is no room to go down, it is let go at its place.
-        optimise: whether the sure way is made quicker by trajectory optimisation, see `planning/shorten.py`.
-    """
-
-    clearance: NonNegative = 0.005
-    rise: NonNegative = 0.020
-    lip_gap: NonNegative = 0.0005
-    grasp_spacing: NonNegative = 0.012
-    grasps: Annotated[int, Between(0)] = 9
-    yaws: Annotated[int, Between(0)] = 12
-    attempts: Annotated[int, Between(0)] = 400
-    least_acceleration: NonNegative = 0.3
-    time_limit: NonNegative = 600.0
-    descent: NonNegative = 0.0
-    above: NonNegative = 0.0
-    optimise: Flag = True
 
 
 REPORTED = 0.03

@@ -10,9 +10,10 @@ from functools import lru_cache
 
 from drake_clutter.cell.gripper import Grasp, GraspSampling, Gripper, NoGrasp
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.attempts import Attempts, PlannerConfig
+from drake_clutter.planning.attempts import Attempts
 from drake_clutter.planning.clearance import ClearanceScene
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject

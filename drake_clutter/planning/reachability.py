@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import downwards
 
 Floats = NDArray[np.float64]

@@ -21,9 +21,9 @@ from pydrake.math import RigidTransform
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.reports.arm_pictures import strip
 from drake_clutter.reports.pictures import Marks, PictureCamera

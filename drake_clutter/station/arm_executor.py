@@ -7,9 +7,9 @@ import numpy as np
 
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig, SettleConfig
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.interfaces import Instability, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject

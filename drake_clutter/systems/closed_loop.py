@@ -12,9 +12,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject

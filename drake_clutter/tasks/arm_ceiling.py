@@ -1,8 +1,8 @@
 """What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.stability.judge import FastJudge

@@ -15,10 +15,10 @@ from drake_clutter.catalogue import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import PlannerConfig
 from drake_clutter.planning.paths import sampled
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import Move, PickPlaceCommand
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject

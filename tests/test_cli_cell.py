@@ -1,0 +1,90 @@
+"""Commands with a cell of one's own: what they use, what they write, and what they refuse in one line."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import DEFAULT_CELL, resting, scene_of
+from typer.testing import CliRunner
+
+from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.work_cell import WorkCell, load_cell
+from drake_clutter.cli import app
+from drake_clutter.files import InputError
+from drake_clutter.resources import shipped_path
+from drake_clutter.scenes.scene_file import load_scene, save_scene
+from drake_clutter.station.trajectory_file import read_trajectories
+from drake_clutter.validation import config_yaml, to_plain, validate
+
+UR5E = shipped_path("models/cells/ur5e_epick_tray.yaml")
+SCENE = scene_of(resting("gelatin_box", xy=(-0.1, 0.1)), resting("pudding_box", xy=(0.15, -0.1)), side=0.6)
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.yaml"
+    save_scene(path, SCENE, load_cell(UR5E).with_support(SCENE.support))
+    return path
+
+
+def run(*arguments: str | Path) -> None:
+    told = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if told.exception is not None and not isinstance(told.exception, SystemExit):
+        raise told.exception
+    assert told.exit_code == 0, told.output
+
+
+def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(scene_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("move", scene_file, "--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--out", out)
+    expected = load_cell(UR5E).with_support(SCENE.support)
+    _, cell, moves = read_trajectories(out / "trajectory.h5", load_catalogue())
+    assert cell == expected
+    assert len(moves) == 1
+    assert load_scene(out / "after.yaml", load_catalogue()).cell == expected
+    episode = json.loads((out / "episode.json").read_text())
+    assert validate(WorkCell, episode["cell"], "episode.json") == expected
+    assert episode["moves"][0]["outcome"] == "placed"
+
+
+def test_options_go_over_the_scene_s_cell_but_for_its_support(scene_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    cell = tmp_path / "higher.yaml"
+    higher = DEFAULT_CELL.model_copy(update={"robot": DEFAULT_CELL.robot.model_copy(update={"payload": 9.0})})
+    cell.write_text(config_yaml(higher))
+    moves = ("--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--plan-only")
+    run("move", scene_file, *moves, "--cell", cell, "--set", "robot.base.z=0.35", "--out", out)
+    plan = json.loads((out / "plan.json").read_text())
+    assert plan["plans"][0]["planned"]
+    assert plan["cell"]["robot"]["payload"] == 9.0
+    assert plan["cell"]["robot"]["base"]["translation"][2] == 0.35
+    assert plan["cell"]["support"]["size"] == [0.6, 0.6]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"robot": {"tool_frame": None}}, r"robot\.tool_frame: None; allowed is a text"),
+        ({"robot": {"tool_frame": "nose"}}, r"robot\.tool_frame: 'nose'.*allowed"),
+        ({"robot": {"model": "none.sdf"}}, r"robot\.model: .*none\.sdf.*allowed"),
+        ({"robot": {"home": [0.0, 0.0]}}, r"robot\..*allowed"),
+        ({"robot": {"home": [0.0, 0.0, 0.0, 0.0, 0.0, 7.0]}}, r"robot\.home.*allowed"),
+        ({"robot": {"arm": 3}}, r"robot\.arm: is unknown; allowed are"),
+        ({"gripper": {"kind": "hand"}}, r"gripper\.kind: 'hand'; allowed"),
+        ({"support": {"size": [9.0, 0.5]}}, r"support\.size\[0\]: 9\.0; allowed"),
+        ({"cameras": {"overhead": {"pose": {"rpy_deg": [0, 0, 0]}}}}, r"sees nothing of the support; allowed"),
+        ({"fixtures": [{"name": "post"}]}, r"fixtures\[0\].*allowed"),
+    ],
+)
+def test_a_cell_that_is_none_is_one_line(change: dict[str, object], message: str, scene_file: Path, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    document = to_plain(DEFAULT_CELL)
+    for part, fields in change.items():
+        document[part] = {**document[part], **fields} if isinstance(fields, dict) and part != "cameras" else fields
+    cell.write_text(yaml.safe_dump(document))
+    arguments = ("move", scene_file, "--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--cell", cell)
+    with pytest.raises(InputError, match=message) as refusal:
+        run(*arguments, "--out", tmp_path / "out")
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
