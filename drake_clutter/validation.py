@@ -285,7 +285,7 @@ def _parse_setting(setting: str, config: Any) -> Any:
             part, index = _POSE_FIELDS[part]
             value = _replaced(getattr(owner, part), index, value)
         if isinstance(owner, tuple) and part.isdecimal() and int(part) < len(owner):
-            value = _replaced(owner, int(part), value)
+            value = _replaced(owner, int(part), _merged(owner[int(part)], value))
         else:
             value = {**(owner if isinstance(owner, dict) else {}), part: value}
     return value

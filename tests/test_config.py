@@ -146,6 +146,14 @@ def test_a_broken_file_is_refused(text: str, named: str, tmp_path: Path) -> None
     assert "allowed" in str(refusal.value)
 
 
+def test_a_setting_names_an_entry_of_a_list() -> None:
+    """The other fields of the entry stay, and so do the other entries."""
+    cell = cell_with("fixtures.0.pose.z=-0.05", "robot.limits.acceleration.1=2")
+    (table,), (before,) = cell.fixtures, DEFAULT_CELL.fixtures
+    assert table == before.model_copy(update={"pose": before.pose.model_copy(update={"translation": (0.0, 0.0, -0.05)})})
+    assert cell.robot.limits.acceleration == (4.0, 2.0, 6.0, 10.0, 10.0, 10.0)
+
+
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.yaml"):
         load_config(tmp_path / "none.yaml")
