@@ -1,4 +1,4 @@
-"""A module imports only from its own floor and the ones below, as `DESIGN.md` lays them out."""
+"""A module imports only from its own floor and the ones below, as CONTRIBUTING.md lists them."""
 
 import ast
 from collections.abc import Iterator
