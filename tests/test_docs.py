@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 import typer.main
-from conftest import DEFAULT_CELL, resting, scene_of
+from conftest import DEFAULT_CELL, resting, scene_of, training_script
 
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
-from drake_clutter.config import load_config
+from drake_clutter.config import load_config, upgrade
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import load_typed, to_plain, validate
@@ -32,6 +32,7 @@ BLOCK = re.compile(r"(<!-- not run: .+ -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILI
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 COMMAND = re.compile(r"`(drake-clutter [^`]+)`")
 FILE = re.compile(r"`([\w./-]*\w\.(?:py|yaml|json|sdf|md|html|safetensors))[`: ]")
+TRAINING = "python training/"
 MADE = ("out/", "runs/")
 """Folders of files that commands on the pages write."""
 
@@ -117,10 +118,11 @@ def test_yaml_loads(page: Path, folder: Path) -> None:
             validate(WorkCell, {**to_plain(DEFAULT_CELL), **given}, str(page))
 
 
-def command_lines(page: Path) -> Iterator[str]:
+def lines(page: Path, start: str) -> Iterator[str]:
+    """Yield the command lines that begin so."""
     for block in blocks(page, "sh", "console", ""):
         for line in block.text.replace("\\\n", " ").splitlines():
-            if line.removeprefix("$ ").startswith("drake-clutter "):
+            if line.removeprefix("$ ").startswith(start):
                 yield line.removeprefix("$ ")
 
 
@@ -129,44 +131,58 @@ def commands() -> Any:
     return typer.main.get_command(app)
 
 
-def parsed(line: str, *, complete: bool) -> None:
-    """Parse a command line.
+def fault(line: str, *, complete: bool) -> str:
+    """Return what is wrong with a command line; "" if nothing is.
 
     Args:
         line: What a user types.
         complete: Whether it has all that the command needs; else only its options are looked up.
     """
     words = shlex.split(line, comments=True)[1:]
-    command, name = commands(), "drake-clutter"
-    while words and hasattr(command, "commands"):
-        name = words.pop(0)
-        assert name in command.commands, f"{line}: {name} is no command"
-        command = command.commands[name]
-    context = command.make_context(name, [] if not complete else list(words), resilient_parsing=not complete)
-    if not complete:
-        command.make_parser(context).parse_args(list(words))
+    command = commands()
+    try:
+        while hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        context = command.make_context(line, list(words) if complete else [], resilient_parsing=not complete)
+        if not complete:
+            command.make_parser(context).parse_args(list(words))
+    except Exception as error:  # typer has a click of its own, whose errors it does not export
+        return f"{line}: {getattr(error, 'message', error)}"
+    return ""
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_parse(page: Path) -> None:
-    for line in command_lines(page):
-        try:
-            parsed(line, complete=True)
-        except Exception as error:
-            raise AssertionError(f"{line}: {getattr(error, 'message', error)}") from error
+    for line in lines(page, "drake-clutter "):
+        assert fault(line, complete=True) == ""
     for line in COMMAND.findall(prose(page)):
-        try:
-            parsed(line, complete=False)
-        except Exception as error:
-            raise AssertionError(f"{line}: {getattr(error, 'message', error)}") from error
+        assert fault(line, complete=False) == ""
+
+
+SCRIPTS = [page for page in PAGES if any(lines(page, TRAINING))]
+
+
+@pytest.mark.parametrize("page", SCRIPTS, ids=lambda page: page.stem)
+def test_training_scripts_parse(page: Path) -> None:
+    """Options exist, and so do the fields that are set."""
+    for line in lines(page, TRAINING):
+        words = shlex.split(line.removeprefix(TRAINING), comments=True)
+        name = words.pop(0).removesuffix(".py")
+        script = typer.Typer()
+        module = training_script(name)
+        script.command()(module.main)
+        given = typer.main.get_command(script).make_context(name, words).params
+        if "settings" in given:
+            training = getattr(module, name.title().replace("_", ""))
+            config = ROOT / given["config"] if given["config"] else None
+            load_typed(training(), config, given["settings"] or [], upgrade)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_scripts_and_their_configs_exist(page: Path) -> None:
-    for block in blocks(page, "sh", "console", ""):
-        named = re.findall(r"\b((?:training|benchmarks|models|examples)/[\w./-]*\.\w+)", block.text)
-        missing = [name for name in named if not (ROOT / name).exists() and "--out " + name not in block.text]
-        assert not missing
+def test_files_of_commands_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"(?<!--out )\b((?:benchmarks|examples|models|training)/[\w./-]+\.\w+)", text)
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize("page", LINKING, ids=lambda page: page.stem)
