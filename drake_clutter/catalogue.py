@@ -13,6 +13,7 @@ from enum import Enum
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Self
+from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
@@ -174,6 +175,21 @@ class ObjectClass:
     def sdf_path(self) -> Path:
         """The built SDF model."""
         return self.folder / "model.sdf"
+
+    @cached_property
+    def model_path(self) -> Path:
+        """The built SDF model, with the mass of the catalogue.
+
+        Raises:
+            InputError: It is missing, or was built with another mass.
+        """
+        remedy = f"run `drake-clutter assets build {self.folder.parent}`"
+        if not self.sdf_path.is_file():
+            raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
+        mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
+        if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
+            raise InputError(f"{self.sdf_path}: mass: {mass}; allowed is the catalogue's, {self.mass:g} kg; {remedy}")
+        return self.sdf_path
 
     @cached_property
     def convex_pieces(self) -> tuple[NDArray[np.float64], ...]:

@@ -5,9 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from conftest import TRAY
+from pydrake.systems.framework import DiagramBuilder
 
-from drake_clutter.catalogue import PairArrangement, Rest, Shape, load_catalogue
+from drake_clutter.assets import build_assets
+from drake_clutter.catalogue import ObjectClass, PairArrangement, Rest, Shape, load_catalogue
+from drake_clutter.cell.sdf import sdf_text
 from drake_clutter.files import InputError
+from drake_clutter.simulation.plant import add_scene_plant
 
 BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
 
@@ -161,3 +166,26 @@ def test_mesh_without_assets(tmp_path: Path) -> None:
     assert block.size == pytest.approx((0.05, 0.06, 0.07))
     with pytest.raises(InputError, match="run `drake-clutter assets build"):
         _ = block.convex_pieces
+
+
+def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
+    """A mass that the catalogue changes is refused until the model is built anew; then it is simulated."""
+
+    def block(mass_g: int) -> ObjectClass:
+        text = f"classes:\n  block: {{shape: box, size_mm: [50, 60, 70], mass_g: {mass_g}, source: made up}}\n"
+        load_catalogue.cache_clear()  # a process reads a folder once
+        sdf_text.cache_clear()
+        return load_catalogue(user_catalogue(tmp_path, text)).classes["block"]
+
+    def body_mass(entry: ObjectClass) -> float:
+        made = add_scene_plant(DiagramBuilder(), [("it", entry)], TRAY, 0.01, visuals=False)
+        return float(made.bodies["it"].default_mass())
+
+    with pytest.raises(InputError, match="class block has no assets; run `drake-clutter assets build"):
+        body_mass(block(100))
+    build_assets(tmp_path)
+    assert body_mass(block(100)) == pytest.approx(0.100)
+    with pytest.raises(InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalogue's, 0\.15 kg; run"):
+        body_mass(block(150))
+    build_assets(tmp_path)
+    assert body_mass(block(150)) == pytest.approx(0.150)

@@ -59,11 +59,7 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
                 f"between them, and no name that a format reserves ({_RESERVED.pattern.replace('|', ', ')})"
             )
     for object_class in classes_of(scene):
-        if not object_class.sdf_path.is_file():
-            folder = object_class.folder
-            raise InputError(
-                f"{folder}: class {object_class.name} has no assets; run `drake-clutter assets build {folder.parent}`"
-            )
+        _ = object_class.model_path  # says what is wrong before anything is written
     staged = out / f".export.{secrets.token_hex(4)}"
     staged.mkdir()
     try:

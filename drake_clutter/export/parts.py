@@ -75,7 +75,7 @@ def write_xml(path: Path, root: ElementTree.Element) -> None:
 
 def class_inertial(object_class: ObjectClass) -> Inertial:
     """The mass properties in the class's built model."""
-    inertial = ElementTree.parse(object_class.sdf_path).find("model/link/inertial")
+    inertial = ElementTree.parse(object_class.model_path).find("model/link/inertial")
     assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
     moments = (float(inertial.findtext(f"inertia/{entry}", "nan")) for entry in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     com = (float(value) for value in inertial.findtext("pose", "").split()[:3])

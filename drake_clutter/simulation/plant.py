@@ -100,7 +100,7 @@ def populated(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:
-        text = sdf_text(object_class.sdf_path, visuals=visuals)
+        text = sdf_text(object_class.model_path, visuals=visuals)
         (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
         if name != jointed and object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
