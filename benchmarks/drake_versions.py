@@ -32,9 +32,12 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.station.station_simulation import TIME_STEP, StationSimulation
 
 SEED, NODES = 3200, 25
 """Of the generated scenes."""
+STEPS = 400
+"""Of the plant, that are timed."""
 EPISODES = ("sg_star_15", (1, 3, 5), "largest-clear")
 """Frozen set, scenes in it, and the explorer of the timed episodes, which the arm carries out."""
 
@@ -44,6 +47,21 @@ app = typer.Typer(no_args_is_help=True)
 def _frozen(number: int, config: ClutterConfig) -> Scene:
     held = load_scene_set(shipped_path(f"training/scenes/{EPISODES[0]}.json"), load_catalogue())
     return held.settled(number, held.grammar, config)
+
+
+def _step_milliseconds(config: ClutterConfig) -> dict[str, float]:
+    """Return what a step of the station's plant takes, with all objects asleep and with all awake [ms]."""
+    scene = _frozen(EPISODES[1][0], config)
+    simulation = StationSimulation(config.cell, scene)
+    taken = dict[str, float]()
+    for name, awake in (("asleep", set[str]()), ("awake", set(scene.names))):
+        simulation.station.lock_all_but(simulation.root, awake)
+        begin = simulation.root.get_time()
+        simulation.simulator.AdvanceTo(begin + 0.1)
+        start = time.perf_counter()
+        simulation.simulator.AdvanceTo(begin + 0.1 + STEPS * TIME_STEP)
+        taken[name] = 1000 * (time.perf_counter() - start) / STEPS
+    return taken
 
 
 @app.command()
@@ -79,6 +97,7 @@ def measure(
             "nodes": NODES,
             "count": count,
             "settle_seconds": {"median": float(np.median(seconds)), "mean": float(np.mean(seconds))},
+            "step_ms": _step_milliseconds(config),
             "episodes": episodes,
             "episode_seconds_per_move": sum(e["seconds"] for e in episodes) / sum(e["moves"] for e in episodes),
             "verdicts": verdicts,
@@ -90,7 +109,9 @@ def measure(
 def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measure` wrote; the first is the reference.")]) -> None:
     """Print how often verdicts agree with those of the first file, and what things cost."""
     found = [json.loads(path.read_text(encoding="utf-8")) for path in files]
-    table = Table("Drake", "Python", "stable", "same stable", "same hidden", "settle, median s", "arm, s per move")
+    table = Table(
+        "Drake", "Python", "stable", "same stable", "same hidden", "step, ms (asleep, awake)", "settle, s", "arm, s per move"
+    )
     for one in found:
         pairs = list(zip(found[0]["verdicts"], one["verdicts"], strict=True))
         same = np.mean([a["stable"] == b["stable"] for a, b in pairs])
@@ -98,7 +119,8 @@ def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measur
         hidden = np.mean([a["hidden"] == b["hidden"] for a, b in both])
         stable = np.mean([verdict["stable"] for verdict in one["verdicts"]])
         numbers = (f"{stable:.3f}", f"{same:.4f}", f"{hidden:.4f}")
-        costs = (f"{one['settle_seconds']['median']:.3f}", f"{one['episode_seconds_per_move']:.2f}")
+        step = f"{one['step_ms']['asleep']:.2f}, {one['step_ms']['awake']:.2f}"
+        costs = (step, f"{one['settle_seconds']['median']:.3f}", f"{one['episode_seconds_per_move']:.2f}")
         table.add_row(one["drake"], one["python"], *numbers, *costs)
     Console().print(table)
 
