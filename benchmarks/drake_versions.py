@@ -32,7 +32,6 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.station.body_sleep import BodySleepManager
 from drake_clutter.station.station_simulation import TIME_STEP, StationSimulation
 
 SEED, NODES = 3200, 25
@@ -54,10 +53,9 @@ def _step_milliseconds(config: ClutterConfig) -> dict[str, float]:
     """Return what a step of the station's plant takes, with all objects asleep and with all awake [ms]."""
     scene = _frozen(EPISODES[1][0], config)
     simulation = StationSimulation(config.cell, scene)
-    sleep, taken = BodySleepManager(simulation.station), dict[str, float]()
-    sleep.reset(simulation.root)
+    taken = dict[str, float]()
     for name, awake in (("asleep", set[str]()), ("awake", set(scene.names))):
-        sleep.update(simulation.root, awake, simulation.gripper.status, must_hold=False)
+        simulation._sleep.update(simulation.root, awake, simulation.gripper.status, must_hold=False)
         begin = simulation.root.get_time()
         simulation.simulator.AdvanceTo(begin + 0.1)
         start = time.perf_counter()
