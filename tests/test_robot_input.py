@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import DEFAULT_CELL
 from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
 
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.files import InputError
 from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.simulation.cell_plant import check_models
 
 JOINTS = ", ".join(robot("ur5e").joint_names)
 SHIPPED = "package://drake_clutter_models/FILE"
@@ -145,3 +147,28 @@ def test_a_gripper_in_the_arms_file() -> None:
     assert message(changed(spec, tool_frame="lbr_iiwa_link_5")).endswith(
         "model.urdf: joint 'lbr_iiwa_joint_6' does not move the tool frame; allowed is an arm alone"
     )
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ('xyz="0 0 0.1625"', 'xyz="${height} 0 0"', "Expected 3 values for attribute xyz got ${height} 0 0"),
+        ('lower="-6.2"', 'lower="7"', "condition '(pos_lower_limits.array() <= pos_upper_limits.array()).all()'"),
+        ("</robot>", '<link name="loose"/></robot>', "link 'loose' hangs on no joint; allowed is an arm alone"),
+        ("<limit", '<mimic joint="elbow_joint"/><limit', "joint 'shoulder_pan_joint' mimics another; allowed are joints"),
+    ],
+)
+def test_a_damaged_arm(tmp_path: Path, before: str, after: str, expected: str) -> None:
+    spec = ros_spec(tmp_path, ros_urdf().replace(before, after, 1))
+    text = message(spec)
+    assert text.startswith(f"{spec.model}: ")
+    assert expected in text
+
+
+def test_an_arm_that_can_hit_nothing(tmp_path: Path) -> None:
+    """Its motions would be planned through everything."""
+    spec = ros_spec(tmp_path, ros_urdf())
+    with pytest.raises(InputError) as raised:
+        check_models(DEFAULT_CELL.model_copy(update={"robot": spec}))
+    found = f"robot.model: {spec.model!r}: no link has a shape for collisions"
+    assert str(raised.value) == f"{found}; allowed is one that can hit something"

@@ -120,12 +120,18 @@ def parse_model(
     text = model_text(path, visuals=visuals)
     try:
         instances = Parser(plant).AddModelsFromString(text, path.suffix.removeprefix("."))
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, SystemExit) as error:  # the last: Drake's assertions
         words = " ".join(str(error).split())
         raise InputError(f"{path}: {words}; allowed is a model that Drake reads") from error
     if len(instances) != 1:
         raise InputError(f"{path}: holds {len(instances)} models; allowed is one")
     return instances[0]
+
+
+def mimicking_joint(path: Path) -> str | None:
+    """Return the name of a joint of a model file that follows another one; None: it has none."""
+    joints = _root(path).iter("joint")
+    return next((joint.get("name", "") for joint in joints if joint.find(".//mimic") is not None), None)
 
 
 @lru_cache(maxsize=32)

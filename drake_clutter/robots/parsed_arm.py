@@ -20,7 +20,12 @@ from pydrake.multibody.tree import (
 
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.files import InputError
-from drake_clutter.robots.model_file import model_path, parse_model, torque_limits
+from drake_clutter.robots.model_file import (
+    mimicking_joint,
+    model_path,
+    parse_model,
+    torque_limits,
+)
 from drake_clutter.robots.serial_chain import SerialChain
 
 _OF_DRAKE = ("__model__", "_parent", "_child")
@@ -95,6 +100,8 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
     if spec.base_link not in roots:
         known = ", ".join(roots) or "a link that is not fixed to the world"
         raise InputError(f"robot.base_link: {spec.base_link!r}; allowed in {path.name} is {known}")
+    if loose := [name for name in roots if name != spec.base_link]:
+        raise InputError(f"{path}: link {loose[0]!r} hangs on no joint; allowed is an arm alone")
     if not plant.HasFrameNamed(spec.tool_frame, instance):
         frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
         known = ", ".join(name for name in frames if not name.endswith(_OF_DRAKE))
@@ -136,3 +143,6 @@ def _check_serial(path: Path, joints: list[Joint], moving: list[Joint]) -> None:
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             kinds = "revolute, continuous and prismatic joints"
             raise InputError(f"{what} is of type {joint.type_name()}; allowed are {kinds}")
+    if (mimic := mimicking_joint(path)) is not None:
+        allowed = "joints that move by themselves"
+        raise InputError(f"{path}: joint {mimic!r} mimics another; allowed are {allowed}")

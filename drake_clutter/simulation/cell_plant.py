@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydrake.geometry import Box, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.work_cell import WorkCell
@@ -73,6 +73,9 @@ def add_work_cell(
     """
     model = load_robot(cell.robot)
     robot = add_robot(plant, model, visuals=visuals)
+    if not any(plant.GetCollisionGeometriesForBody(body) for body in _bodies(plant, robot)):
+        found = f"robot.model: {cell.robot.model!r}: no link has a shape for collisions"
+        raise InputError(f"{found}; allowed is one that can hit something")
     (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=compliant), "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
@@ -95,6 +98,16 @@ def add_work_cell(
     bodies = _bodies(plant, robot, tool)
     cup = plant.GetFrameByName("cup", tool)
     return Arm(robot, tool, model.joint_names, bodies, tuple(fixed), flange, cup)
+
+
+def check_models(cell: WorkCell) -> None:
+    """Read all models of a cell.
+
+    Raises:
+        InputError: One of them cannot be used, or does not fit what the cell says of it.
+    """
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.001)
+    add_work_cell(plant, scene_graph, cell, compliant=False, visuals=True)
 
 
 def _bodies(plant: MultibodyPlant, *models: ModelInstanceIndex) -> tuple[RigidBody, ...]:
