@@ -72,8 +72,14 @@ def test_two_cameras_are_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("fixtures=[{name: tray, box: [1, 1, 1]}]", "fixtures: [{'box': [...], 'name': 'tray'}]; allowed is fixtures with names"),
-        ("fixtures=[{name: a, box: [1, 1, 1]}, {name: a, box: [1, 1, 1]}]", "names that differ, also from tray, camera"),
+        (
+            "fixtures=[{name: tray, box: [1, 1, 1]}]",
+            "fixtures.tray: is taken; allowed are names that differ, also from tray, camera",
+        ),
+        (
+            "fixtures=[{name: a, box: [1, 1, 1]}, {name: a, box: [1, 1, 1]}]",
+            "fixtures.a: is taken; allowed are names that differ",
+        ),
         ("fixtures=[{name: overhead, box: [1, 1, 1]}]", "gripper, overhead"),
         ("fixtures=[{name: a}]", "fixtures[0]: {'name': 'a'}; allowed is either a box or a model"),
         ("fixtures=[{name: a, box: [1, 1, 1], model: a.sdf}]", "allowed is either a box or a model"),
@@ -84,8 +90,8 @@ def test_two_cameras_are_read_back(tmp_path: Path) -> None:
         ),
         ("cameras={}", "cameras: {}; allowed is a mapping of at least one entry"),
         ("robot.home=[]", "robot.home: []; allowed is a list of at least one entry"),
-        ("robot.home=[0, 0, 0]", "allowed is 3 values of"),
-        ("robot.limits.jerk=[1, 2]", "allowed is 6 values of jerk, as home has"),
+        ("robot.home=[0, 0, 0]", "allowed are 3, as robot.home has"),
+        ("robot.limits.jerk=[1, 2]", "robot.limits.jerk: 2 values; allowed are 6, as robot.home has"),
         ("robot.limits.position=[[1, 2, 3]]", "robot.limits.position[0]: [1, 2, 3]; allowed is a list of 2 numbers"),
     ],
 )

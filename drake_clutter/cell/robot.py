@@ -6,7 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Finite, Model, Positive, Text, allowed
+from drake_clutter.validation import Between, Finite, Model, Positive, Text, refused
 
 
 class JointLimits(Model):
@@ -59,7 +59,8 @@ class RobotSpec(Model):
         joints = len(info.data.get("home", ()))
         for name, values in limits:
             if joints and values is not None and len(values) != joints:
-                raise allowed(f"{joints} values of {name}, as home has")
+                found = f"{name}: {len(values)} values"
+                raise refused(f"{found}; allowed are {joints}, as robot.home has")
         return limits
 
     @property

@@ -15,7 +15,7 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
 from drake_clutter.resources import shipped_path
-from drake_clutter.validation import Model, Text, allowed, load_typed, refused, validate
+from drake_clutter.validation import Model, Text, load_typed, refused, validate
 from drake_clutter.yaml_text import read_yaml
 
 GripperSpec = SuctionGripper
@@ -49,7 +49,8 @@ class WorkCell(Model):
         taken = [*_RESERVED, *info.data.get("cameras", ())]
         for fixture in fixtures:
             if fixture.name in taken:
-                raise allowed(f"fixtures with names that differ, also from {', '.join(taken)}")
+                what = f"names that differ, also from {', '.join(taken)}"
+                raise refused(f"{fixture.name}: is taken; allowed are {what}")
             taken.append(fixture.name)
         return fixtures
 
