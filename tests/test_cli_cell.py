@@ -87,4 +87,26 @@ def test_a_cell_that_is_none_is_one_line(change: dict[str, object], message: str
     with pytest.raises(InputError, match=message) as refusal:
         run(*arguments, "--out", tmp_path / "out")
     assert "\n" not in str(refusal.value)
+    assert str(refusal.value).startswith(f"{cell}: ")
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("options", [("--cell", "own.yaml"), ("--set", "robot.model=none.sdf")])
+def test_commands_that_need_no_arm_check_the_cell_too(
+    options: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it fails hours later, with the scenes that were made with it."""
+    monkeypatch.chdir(tmp_path)
+    own = DEFAULT_CELL.model_copy(update={"robot": DEFAULT_CELL.robot.model_copy(update={"model": "none.sdf"})})
+    Path("own.yaml").write_text(config_yaml(own))
+    with pytest.raises(InputError, match=r"robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
+        run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
+    assert not Path("out").exists()
+
+
+def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other = tmp_path / "other" / UR5E.name
+    other.write_text(config_yaml(load_cell(UR5E)))
+    with pytest.raises(InputError, match="--cell, --arm: ur5e_epick_tray is there twice; allowed are files"):
+        run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

@@ -52,6 +52,7 @@ def feasibility(
 
     files = command.scene_files(scenes)
     _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
+    command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])
     cells = {path.stem: load_world(config, path, settings).cell for path in cell or []}
     setups = command.setups(
         [_numbers("--base", text) for text in base or []],

@@ -9,7 +9,7 @@ import typer
 
 from drake_clutter.cli.options import CellOption, JsonOption, NodesOption, OutOption, SeedOption, SetOption
 from drake_clutter.cli.output import report_step, show_episode
-from drake_clutter.cli.world import in_world
+from drake_clutter.cli.world import check_cell, in_world
 from drake_clutter.files import output_directory
 
 if TYPE_CHECKING:
@@ -41,7 +41,9 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
     scenario = load_typed(base, file, convert=upgrade)
     if cell is not None:
         scenario = replace(scenario, world=replace(scenario.world, cell=load_cell(cell)))
-    return load_typed(scenario, settings=names, convert=upgrade)
+    scenario = load_typed(scenario, settings=names, convert=upgrade)
+    check_cell(scenario.world.cell, cell, settings)
+    return scenario
 
 
 def run(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from drake_clutter.cell.work_cell import WorkCell
     from drake_clutter.config import ClutterConfig
     from drake_clutter.scenes.scene_file import SceneFile
 
@@ -18,6 +19,29 @@ def in_world(setting: str) -> str:
     return f"cell.{setting}" if setting.split("=")[0].split(".")[0] in CELL_FIELDS else setting
 
 
+def check_cell(cell: "WorkCell", file: Path | None, settings: Sequence[str] | None) -> None:
+    """Read the models of a cell that options name, before anything is done with it.
+
+    Args:
+        cell: The cell, with the settings over it.
+        file: That of --cell, or None.
+        settings: Those of --set.
+
+    Raises:
+        InputError: The file, the field and what is allowed.
+    """
+    from drake_clutter.files import InputError
+    from drake_clutter.simulation.cell_plant import check_models
+
+    of_models = ("robot", "fixtures", "cell")
+    if file is None and not any(setting.startswith(of_models) for setting in settings or ()):
+        return
+    try:
+        check_models(cell)
+    except InputError as error:
+        raise InputError(f"{file}: {error}" if file is not None else f"--set: {error}") from error
+
+
 def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "ClutterConfig":
     """Return the world: the defaults, over them the config's fields, the cell, and single fields."""
     from drake_clutter.cell.work_cell import load_cell
@@ -27,7 +51,9 @@ def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] |
     world = load_config(config)
     if cell is not None:
         world = replace(world, cell=load_cell(cell))
-    return load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    check_cell(world.cell, cell, settings)
+    return world
 
 
 def load_scene_and_world(
@@ -48,4 +74,5 @@ def load_scene_and_world(
     of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
     world = load_typed(replace(ClutterConfig(), cell=of_scene), config, convert=upgrade)
     world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    check_cell(world.cell, cell, settings)
     return replace(file, scene=replace(file.scene, support=world.cell.support)), world

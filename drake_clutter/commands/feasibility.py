@@ -92,9 +92,18 @@ def scene_files(given: Sequence[Path]) -> tuple[Path, ...]:
         if not files:
             raise InputError(f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote")
         found += files
-    if twice := [name for name, count in Counter(path.stem for path in found).items() if count > 1]:
-        raise InputError(f"scenes: {twice[0]} is there twice; allowed are files with names of their own")
+    check_names("scenes", found)
     return tuple(found)
+
+
+def check_names(what: str, files: Sequence[Path]) -> None:
+    """Refuse files of which two have the same name but for its end, as results are named after them.
+
+    Raises:
+        InputError: The name.
+    """
+    if twice := [name for name, count in Counter(path.stem for path in files).items() if count > 1]:
+        raise InputError(f"{what}: {twice[0]} is there twice; allowed are files with names of their own")
 
 
 def setups(
