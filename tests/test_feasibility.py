@@ -18,7 +18,7 @@ from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.plan import NoPlan, PlanFailure
+from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
@@ -86,6 +86,9 @@ def test_what_no_arm_can_do_is_a_reason() -> None:
 
     in_tray = reason(cell_with("robot.base.x=-0.1"))
     assert (in_tray.reason, in_tray.about) == (PlanFailure.IN_COLLISION, "pedestal and tray")
+    hanging = cell_with("robot.base.x=-0.1", "robot.base.z=1.2", "robot.base.roll=180", "robot.pedestal_side=0.0")
+    planner = PickPlacePlanner(hanging, PlannerConfig())
+    assert isinstance(planner.plan(SCENE.objects, "tomato_soup_can", place), Plan), "it has no pedestal"
     assert reason(cell_with("robot.base.x=-5.0")).reason is PlanFailure.UNREACHABLE
     assert reason(cell_with("robot.payload=1")).reason is PlanFailure.TOO_HEAVY
 

@@ -86,7 +86,9 @@ class WorkCell(Model):
 
     @property
     def pedestal_in_support(self) -> bool:
-        """Whether the pedestal would stand in the support."""
+        """Whether the pedestal, or the base if it has none, would stand in the support."""
+        if not self.robot.pedestal_side and self.robot.X_TB.translation()[2] > self.support.wall_height:
+            return False  # from a ceiling, or a wall
         x, y = np.abs(self.robot.X_TB.translation()[:2])
         beside = self.support.half_size + self.support.wall_thickness + self.robot.pedestal_side / 2
         return bool(x < beside[0] and y < beside[1])
