@@ -72,6 +72,9 @@ def test_what_is_no_such_file_is_refused(file: Path, tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(InputError, match="cannot be read as HDF5"):
         read_trajectories(tmp_path / "text.h5", catalogue)
+    with pytest.raises(InputError, match="allowed is a trajectory file") as refusal:
+        read_trajectories(tmp_path, catalogue)
+    assert "\n" not in str(refusal.value)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["x"] = 1
     with pytest.raises(InputError, match="allowed is a trajectory file of version 1"):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalogue import Catalogue
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
-from drake_clutter.files import InputError, replacing
+from drake_clutter.files import InputError, refusal, replacing
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
@@ -73,7 +73,7 @@ def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell
     try:
         file = h5py.File(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read as HDF5 ({error})") from error
+        raise refusal(str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})") from error
     with file:
         if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
             raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
