@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.cli import app
+from drake_clutter.cli.world import load_world
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene_file import load_scene, save_scene
@@ -102,6 +103,17 @@ def test_commands_that_need_no_arm_check_the_cell_too(
     with pytest.raises(InputError, match=r"robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
         run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
     assert not Path("out").exists()
+
+
+def test_a_config_goes_over_the_cell(tmp_path: Path) -> None:
+    """In all commands; here one of version 0.1."""
+    config = tmp_path / "config.yaml"
+    config.write_text("{layout: {tray_side: 0.5}, camera: {altitude: 1.4}}")
+    world = load_world(config, UR5E, ["robot.base.z=0.35"])
+    assert world.cell.robot.model == load_cell(UR5E).robot.model
+    assert world.cell.robot.base.translation[2] == 0.35
+    assert world.cell.support.size == (0.5, 0.5)
+    assert world.cell.camera.pose.translation[2] == 1.4
 
 
 def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> None:

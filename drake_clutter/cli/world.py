@@ -43,14 +43,13 @@ def check_cell(cell: "WorkCell", file: Path | None, settings: Sequence[str] | No
 
 
 def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "ClutterConfig":
-    """Return the world: the defaults, over them the config's fields, the cell, and single fields."""
+    """Return the world: the defaults with the cell, over them the config's fields, and single fields."""
     from drake_clutter.cell.work_cell import load_cell
-    from drake_clutter.config import load_config, upgrade
+    from drake_clutter.config import ClutterConfig, upgrade
     from drake_clutter.validation import load_typed
 
-    world = load_config(config)
-    if cell is not None:
-        world = replace(world, cell=load_cell(cell))
+    default = ClutterConfig() if cell is None else replace(ClutterConfig(), cell=load_cell(cell))
+    world = load_typed(default, config, convert=upgrade)
     world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
     check_cell(world.cell, cell, settings)
     return world
