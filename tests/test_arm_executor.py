@@ -18,7 +18,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.reports.arm_pictures import arm_moments, strip
+from drake_clutter.reports.arm_pictures import arm_moments, quarter_turn_to_base, strip
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
@@ -238,6 +238,16 @@ def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None
     write_recording(tmp_path / "without.html", SCENE, [replace(frame, arm=None) for frame in motion[::8]], DEFAULT_CELL)
     with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))
     assert with_arm > without + 20_000, "its links, and their key frames"
+
+
+def test_pictures_are_taken_from_where_the_arm_is_not_in_the_way() -> None:
+    assert quarter_turn_to_base(DEFAULT_CELL).tolist() == np.eye(3).tolist()
+    other_side = quarter_turn_to_base(cell_with("robot.base.x=0.65"))
+    assert (other_side @ [-1.0, 0.0, 0.0]).tolist() == [1.0, 0.0, 0.0]
+    beside = quarter_turn_to_base(cell_with("robot.base.x=0.1", "robot.base.y=-0.65"))
+    assert (beside @ [-1.0, 0.0, 0.0]).tolist() == [0.0, -1.0, 0.0]
+    above = quarter_turn_to_base(cell_with("robot.base.x=0.0", "robot.base.y=0.0"))
+    assert above.tolist() == np.eye(3).tolist()
 
 
 def test_what_is_put_on_an_edge_falls() -> None:

@@ -25,6 +25,7 @@ from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 _SIZE = (480, 480)
 _OVERSAMPLING = 2
 _EYE, _TARGET, _FOV_Y_DEG = (1.10, -1.90, 1.30), (-0.22, 0.0, 0.46), 36.0
+"""Where the camera is and what it looks at [m], if the arm's base is at -x; and its view [deg]."""
 _RENDERER = "arm_pictures"
 
 
@@ -38,6 +39,15 @@ def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
     still = np.flatnonzero(np.abs(height - height[-1]) > 0.002)
     down = min(int(still[-1]) + 1, len(frames) - 1) if len(still) else len(frames) - 1
     return [frames[k] for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)]
+
+
+def quarter_turn_to_base(cell: WorkCell) -> NDArray[np.float64]:
+    """Return the rotation (3, 3), by quarter turns about z, of the direction -x to that of the arm's base."""
+    x, y = cell.robot.X_TB.translation()[:2]
+    c, s = (-np.sign(x), 0.0) if abs(x) >= abs(y) else (0.0, -np.sign(y))
+    if not c and not s:
+        c = 1.0
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.uint8]:
@@ -54,7 +64,8 @@ def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.u
     width, height = (_OVERSAMPLING * size for size in _SIZE)
     info = CameraInfo(width, height, np.radians(_FOV_Y_DEG))
     camera = ColorRenderCamera(RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False)
-    X_TC = rigid_transform(look_at(np.array(_EYE), np.array(_TARGET)))
+    R = quarter_turn_to_base(cell)
+    X_TC = rigid_transform(look_at(R @ np.array(_EYE), R @ np.array(_TARGET)))
     query_port = made.scene_graph.get_query_output_port()
     pictures = []
     for frame in frames:
