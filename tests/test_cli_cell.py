@@ -92,7 +92,7 @@ def test_a_cell_that_is_none_is_one_line(change: dict[str, object], message: str
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
-@pytest.mark.parametrize("options", [("--cell", "own.yaml"), ("--set", "robot.model=none.sdf")])
+@pytest.mark.parametrize("options", [("--cell", "own.yaml"), ("--config", "config.yaml"), ("--set", "robot.model=none.sdf")])
 def test_commands_that_need_no_arm_check_the_cell_too(
     options: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,7 +100,9 @@ def test_commands_that_need_no_arm_check_the_cell_too(
     monkeypatch.chdir(tmp_path)
     own = DEFAULT_CELL.model_copy(update={"robot": DEFAULT_CELL.robot.model_copy(update={"model": "none.sdf"})})
     Path("own.yaml").write_text(config_yaml(own))
-    with pytest.raises(InputError, match=r"robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
+    Path("config.yaml").write_text("cell: {robot: {model: none.sdf}}")
+    source = "--set" if options[0] == "--set" else options[1]
+    with pytest.raises(InputError, match=rf"{source}: robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
         run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
     assert not Path("out").exists()
 

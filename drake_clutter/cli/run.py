@@ -42,7 +42,7 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
     if cell is not None:
         scenario = replace(scenario, world=replace(scenario.world, cell=load_cell(cell)))
     scenario = load_typed(scenario, settings=names, convert=upgrade)
-    check_cell(scenario.world.cell, cell, settings)
+    check_cell(scenario.world.cell, base.world.cell, cell or file)
     return scenario
 
 

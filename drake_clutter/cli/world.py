@@ -19,13 +19,13 @@ def in_world(setting: str) -> str:
     return f"cell.{setting}" if setting.split("=")[0].split(".")[0] in CELL_FIELDS else setting
 
 
-def check_cell(cell: "WorkCell", file: Path | None, settings: Sequence[str] | None) -> None:
-    """Read the models of a cell that options name, before anything is done with it.
+def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
+    """Read the models of a cell, before anything is done with it.
 
     Args:
-        cell: The cell, with the settings over it.
-        file: That of --cell, or None.
-        settings: Those of --set.
+        cell: The cell.
+        before: What it was without options: what the models are then, a command may do without.
+        file: Which file it is from; None: from --set.
 
     Raises:
         InputError: The file, the field and what is allowed.
@@ -33,13 +33,12 @@ def check_cell(cell: "WorkCell", file: Path | None, settings: Sequence[str] | No
     from drake_clutter.files import InputError
     from drake_clutter.simulation.cell_plant import check_models
 
-    of_models = ("robot", "fixtures", "cell")
-    if file is None and not any(setting.startswith(of_models) for setting in settings or ()):
+    if (cell.robot, cell.fixtures) == (before.robot, before.fixtures):
         return
     try:
         check_models(cell)
     except InputError as error:
-        raise InputError(f"{file}: {error}" if file is not None else f"--set: {error}") from error
+        raise InputError(f"{file or '--set'}: {error}") from error
 
 
 def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "ClutterConfig":
@@ -51,7 +50,7 @@ def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] |
     default = ClutterConfig() if cell is None else replace(ClutterConfig(), cell=load_cell(cell))
     world = load_typed(default, config, convert=upgrade)
     world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
-    check_cell(world.cell, cell, settings)
+    check_cell(world.cell, ClutterConfig().cell, cell or config)
     return world
 
 
@@ -73,5 +72,5 @@ def load_scene_and_world(
     of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
     world = load_typed(replace(ClutterConfig(), cell=of_scene), config, convert=upgrade)
     world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
-    check_cell(world.cell, cell, settings)
+    check_cell(world.cell, file.cell, cell or config)
     return replace(file, scene=replace(file.scene, support=world.cell.support)), world
