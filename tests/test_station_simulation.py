@@ -156,6 +156,30 @@ def test_a_fixture_with_a_model_is_an_obstacle(tmp_path: Path) -> None:
     assert any("shelf" in clearance.pair for clearance in near)
 
 
+STATIC = """<sdf version="1.9"><model name="post"><static>true</static><link name="post">
+  <collision name="post"><geometry><box><size>0.1 0.1 0.5</size></box></geometry></collision>
+</link></model></sdf>"""
+
+
+def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
+    """Furniture is often static in its file; its pose is that of the cell."""
+    path = tmp_path / "post.sdf"
+    path.write_text(STATIC)
+    names = ("post", "other", "ur10", "epick")
+    posts = tuple(
+        Fixture(name=name, model=str(path), pose=PoseSpec(translation=(0.6, 0.3 * k, 0.25))) for k, name in enumerate(names)
+    )
+    around = ClearanceScene(CELL.model_copy(update={"fixtures": posts}), [])
+    near = around.close(np.array(CELL.robot.home), 3.0)
+    assert all(any(name in clearance.pair for clearance in near) for name in names)
+    assert around.fixture_tops == pytest.approx([0.5] * 4)
+    nailed = tmp_path / "nailed.urdf"
+    joint = '<link name="world"/><joint name="nail" type="fixed"><parent link="world"/><child link="top"/></joint>'
+    nailed.write_text(BOARD.format(joint))
+    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"):
+        ClearanceScene(with_board(nailed, 0.3), [])
+
+
 def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "door.urdf"
     path.write_text(BOARD.format(FLAP.format("revolute")))

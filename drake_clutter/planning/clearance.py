@@ -17,7 +17,7 @@ from drake_clutter.planning.tool_kinematics import inverse
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
-from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_numbers
+from drake_clutter.simulation.cell_plant import Arm, add_work_cell, fixture_name, joint_numbers
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -88,14 +88,14 @@ class ClearanceScene:
     def _name_geometries(self) -> dict[GeometryId, str]:
         names = dict[GeometryId, str]()
         owners = {body.index(): name for name, body in self._bodies.items()}
-        fixtures = {body.index(): body.model_instance() for body in self._arm.fixed[1:]}
+        fixtures = {body.index(): body for body in self._arm.fixed[1:]}
         inspector = self._scene_graph.model_inspector()
         shapes = {body.index() for body in self._fixed} - set(fixtures)
         for index in map(BodyIndex, range(self.plant.num_bodies())):
             body = self.plant.get_body(index)
             name = owners.get(index, body.name())
             if index in fixtures:
-                name = self.plant.GetModelInstanceName(fixtures[index])
+                name = fixture_name(self.plant, fixtures[index])
             for geometry in self.plant.GetCollisionGeometriesForBody(body):
                 of_its_own = inspector.GetName(geometry).split("::")[-1]
                 names[geometry] = of_its_own if index in shapes else name

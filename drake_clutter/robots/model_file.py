@@ -56,7 +56,7 @@ def package_map(path: Path) -> PackageMap:
 
 @lru_cache(maxsize=32)
 def model_text(path: Path, *, visuals: bool) -> str:
-    """Return a model with absolute paths of its meshes, for Drake's parser.
+    """Return a model that is not static, with absolute paths of its meshes, for Drake's parser.
 
     Drake parses a text in a few milliseconds, and the file that it came from in sixty.
 
@@ -71,6 +71,9 @@ def model_text(path: Path, *, visuals: bool) -> str:
     for link in root.iter("link"):
         for visual in () if visuals else link.findall("visual"):
             link.remove(visual)
+    for model in root.iter("model"):
+        for static in model.findall("static"):
+            model.remove(static)  # else it is fixed to the world's origin
     packages = package_map(path)
     for mesh in root.iter("mesh"):
         if (uri := mesh.find("uri")) is not None:
@@ -119,7 +122,9 @@ def parse_model(
     path = model_path(model, field)
     text = model_text(path, visuals=visuals)
     try:
-        instances = Parser(plant).AddModelsFromString(text, path.suffix.removeprefix("."))
+        parser = Parser(plant)
+        parser.SetAutoRenaming(True)  # of a second model of one name
+        instances = parser.AddModelsFromString(text, path.suffix.removeprefix("."))
     except (RuntimeError, ValueError, SystemExit) as error:  # the last: Drake's assertions
         words = " ".join(str(error).split())
         raise InputError(f"{path}: {words}; allowed is a model that Drake reads") from error

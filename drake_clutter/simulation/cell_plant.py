@@ -47,6 +47,8 @@ class Arm:
 
 
 _GREY = (0.45, 0.46, 0.48, 1.0)
+_FIXTURES = "fixtures."
+"""Before a fixture's name in that of its model instance, which no other model has."""
 _HOUSING = 0.06
 """Radius of the sphere that stands for a camera's housing, behind its lens [m]."""
 
@@ -100,6 +102,11 @@ def add_work_cell(
     return Arm(robot, tool, model.joint_names, bodies, tuple(fixed), flange, cup)
 
 
+def fixture_name(plant: MultibodyPlant, body: RigidBody) -> str:
+    """Return the name of the fixture whose model a body belongs to."""
+    return str(plant.GetModelInstanceName(body.model_instance())).removeprefix(_FIXTURES)
+
+
 def check_models(cell: WorkCell) -> None:
     """Read all models of a cell.
 
@@ -128,11 +135,15 @@ def _add_solid(
 
 
 def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tuple[RigidBody, ...]:
-    """Add a fixture's model, fixed to the world; its model instance bears the fixture's name."""
+    """Add a fixture's model, fixed to the world; see `fixture_name` for its model instance."""
     field = f"fixtures.{fixture.name}.model"
     instance = parse_model(plant, fixture.model, visuals=visuals, field=field)
-    plant.RenameModelInstance(instance, fixture.name)
+    plant.RenameModelInstance(instance, f"{_FIXTURES}{fixture.name}")
     bodies = _bodies(plant, instance)
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    if any(joint.parent_body().index() == plant.world_body().index() for joint in joints):
+        found = f"{field}: {fixture.model!r} is fixed to the world"
+        raise InputError(f"{found}; allowed is a model that its pose fixes there")
     of_model = plant.HasFrameNamed("__model__", instance)
     frame = plant.GetFrameByName("__model__", instance) if of_model else bodies[0].body_frame()
     plant.WeldFrames(plant.world_frame(), frame, fixture.pose.transform)
