@@ -195,5 +195,6 @@ def write_episode(
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields, config.cell)
     if fidelity == "arm":
         write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], config.cell)
-    write_json(out / "episode.json", fields | {"cell": to_plain(config.cell)})
+    fields["cell"] = to_plain(config.cell)
+    write_json(out / "episode.json", fields)
     return fields
