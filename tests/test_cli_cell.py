@@ -67,6 +67,7 @@ def test_options_go_over_the_scene_s_cell_but_for_its_support(scene_file: Path, 
     ("change", "message"),
     [
         ({"robot": {"tool_frame": None}}, r"robot\.tool_frame: None; allowed is a text"),
+        ({"robot": {"model": ""}}, r"robot\.model: ''; allowed is a text"),
         ({"robot": {"tool_frame": "nose"}}, r"robot\.tool_frame: 'nose'.*allowed"),
         ({"robot": {"model": "none.sdf"}}, r"robot\.model: .*none\.sdf.*allowed"),
         ({"robot": {"home": [0.0, 0.0]}}, r"robot\..*allowed"),
@@ -105,6 +106,14 @@ def test_commands_that_need_no_arm_check_the_cell_too(
     with pytest.raises(InputError, match=rf"{source}: robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
         run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
     assert not Path("out").exists()
+
+
+def test_a_model_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options name it from the folder of the command; what is written has its absolute path."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.sdf").write_text(shipped_path("models/robots/ur10.sdf").read_text())
+    world = load_world(None, None, ["robot.model=arm.sdf"])
+    assert world.cell.robot.model == str(tmp_path / "arm.sdf")
 
 
 def test_a_config_goes_over_the_cell(tmp_path: Path) -> None:

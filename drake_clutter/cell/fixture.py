@@ -4,6 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import model_validator
 
+from drake_clutter.cell.model_file import MaybeModelFile
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.validation import Between, Model, Share, Text, allowed
 
@@ -24,7 +25,7 @@ class Fixture(Model):
     name: Text
     pose: PoseSpec = PoseSpec()
     box: tuple[Extent, Extent, Extent] | None = None
-    model: str = ""
+    model: MaybeModelFile = ""
     color: tuple[Share, Share, Share, Share] | None = None
 
     @model_validator(mode="after")

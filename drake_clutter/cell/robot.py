@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform
 
+from drake_clutter.cell.model_file import ModelFile
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.validation import Between, Finite, Model, Positive, Text, refused
 
@@ -42,7 +43,7 @@ class RobotSpec(Model):
         pedestal_side: Of the pedestal's square section, from the table to the base [m]; 0 for none.
     """
 
-    model: Text
+    model: ModelFile
     base_link: Text
     tool_frame: Text
     base: PoseSpec
