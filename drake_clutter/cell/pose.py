@@ -1,9 +1,10 @@
 """A rigid pose as it stands in a cell's file."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_clutter.validation import Model, Vector3
 
@@ -21,13 +22,18 @@ class PoseSpec(Model):
 
     @property
     def transform(self) -> RigidTransform:
-        """X_AB; multiples of 90 deg are exact."""
+        """X_AB; angles that are multiples of 90 deg are exact."""
         return _transform(self)
 
 
 @lru_cache(maxsize=256)
 def _transform(pose: PoseSpec) -> RigidTransform:
-    R = RollPitchYaw(np.radians(pose.rpy_deg)).ToRotationMatrix().matrix()
-    if all(angle % 90 == 0 for angle in pose.rpy_deg):
-        R = np.round(R) + 0.0
+    R = np.eye(3)
+    for axis, angle in enumerate(pose.rpy_deg):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        if angle % 90 == 0:
+            c, s = float(round(c)), float(round(s))
+        turn, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+        turn[j, j], turn[j, k], turn[k, j], turn[k, k] = c, -s, s, c
+        R = turn @ R + 0.0
     return RigidTransform(RotationMatrix(R), pose.translation)

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.fixture import Fixture
+from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
@@ -76,22 +77,33 @@ class WorkCell(Model):
 
     @property
     def pedestal(self) -> tuple[RigidTransform, tuple[float, float, float]] | None:
-        """Pose X_TS and extents [m] of the box under the robot's base; None if it has none."""
-        side, X_TB = self.robot.pedestal_side, self.robot.X_TB
-        height = X_TB.translation()[2] - self.table_height
+        """Pose X_TS and extents [m] of the box under the robot's base; None if it has none.
+
+        It is upright, and turned as far about the vertical as the base.
+        """
+        side, (x, y, z) = self.robot.pedestal_side, self.robot.X_TB.translation()
+        height = z - self.table_height
         if not side or height <= 0.01:
             return None
-        x, y = X_TB.translation()[:2]
-        return RigidTransform(X_TB.rotation(), [x, y, height / 2 + self.table_height]), (side, side, height - 0.002)
+        X_TS = RigidTransform(self._upright.rotation(), [x, y, height / 2 + self.table_height])
+        return X_TS, (side, side, height - 0.002)
+
+    @property
+    def _upright(self) -> RigidTransform:
+        """The turn of the base about the vertical alone."""
+        return PoseSpec(rpy_deg=(0.0, 0.0, self.robot.base.rpy_deg[2])).transform
 
     @property
     def pedestal_in_support(self) -> bool:
         """Whether the pedestal, or the base if it has none, would stand in the support."""
-        if not self.robot.pedestal_side and self.robot.X_TB.translation()[2] > self.support.wall_height:
+        side, p_TB = self.robot.pedestal_side, self.robot.X_TB.translation()
+        if not side and p_TB[2] > self.support.wall_height:
             return False  # from a ceiling, or a wall
-        x, y = np.abs(self.robot.X_TB.translation()[:2])
-        beside = self.support.half_size + self.support.wall_thickness + self.robot.pedestal_side / 2
-        return bool(x < beside[0] and y < beside[1])
+        edges = self._upright.rotation().matrix()[:2, :2].T
+        support = self.support.half_size + self.support.wall_thickness
+        axes = np.vstack([np.eye(2), edges])  # across each edge of either
+        reach = np.abs(axes) @ support + np.abs(axes @ edges.T).sum(axis=1) * side / 2
+        return bool((np.abs(axes @ p_TB[:2]) < reach).all())
 
     def with_support(self, support: Support) -> "WorkCell":
         """Return the cell with another support."""

@@ -1,0 +1,54 @@
+"""The work cell's own geometry: poses, pedestal, and what it stands in."""
+
+import numpy as np
+import pytest
+from conftest import cell_with
+from pydrake.math import RollPitchYaw
+
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.pose import PoseSpec
+
+
+@pytest.mark.parametrize("rpy_deg", [(180.0, 0.0, 30.0), (0.0, 90.0, -17.0), (12.0, 20.0, 31.0), (-90.0, 180.0, 270.0)])
+def test_a_pose_is_roll_pitch_and_yaw(rpy_deg: tuple[float, float, float]) -> None:
+    R = PoseSpec(rpy_deg=rpy_deg).transform.rotation().matrix()
+    assert pytest.approx(RollPitchYaw(np.radians(rpy_deg)).ToRotationMatrix().matrix(), abs=1e-12) == R
+
+
+@pytest.mark.parametrize("yaw", [0.0, 30.0, -45.0, 90.0])
+def test_a_camera_that_looks_straight_down_is_vertical_at_any_yaw(yaw: float) -> None:
+    assert Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(180.0, 0.0, yaw))).vertical
+    assert not Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(179.0, 0.0, yaw))).vertical
+
+
+def test_a_pedestal_stands_upright_under_a_tilted_base() -> None:
+    cell = cell_with("robot.base={translation: [-0.7, 0.1, 0.4], rpy_deg: [10, 20, 30]}")
+    assert cell.pedestal is not None
+    X_TS, (x, y, height) = cell.pedestal
+    upright = RollPitchYaw(0, 0, np.radians(30)).ToRotationMatrix().matrix()
+    assert X_TS.rotation().matrix() == pytest.approx(upright, abs=1e-12)
+    assert X_TS.translation() == pytest.approx([-0.7, 0.1, (0.4 + cell.table_height) / 2])
+    assert (x, y, height) == pytest.approx((0.16, 0.16, 0.4 - cell.table_height - 0.002))
+
+
+def test_a_base_over_the_support_without_a_pedestal_is_not_in_it() -> None:
+    over = "robot.base={translation: [-0.2, 0, 1.3], rpy_deg: [180, 0, 0]}"
+    assert cell_with(over).pedestal_in_support
+    assert not cell_with(over, "robot.pedestal_side=0").pedestal_in_support
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "yaw", "stands_in"),
+    [
+        (-0.437, 0.0, 0.0, True),
+        (-0.439, 0.0, 0.0, False),
+        (-0.439, 0.0, 45.0, True),  # half a diagonal is 0.113
+        (-0.470, 0.0, 45.0, True),
+        (-0.472, 0.0, 45.0, False),
+        (-0.437, 0.437, 0.0, True),
+        (-0.437, 0.437, 45.0, False),  # beside the corner
+    ],
+)
+def test_whether_a_turned_pedestal_stands_in_the_support(x: float, y: float, yaw: float, stands_in: bool) -> None:
+    base = f"robot.base={{translation: [{x}, {y}, 0.3], rpy_deg: [0, 0, {yaw}]}}"
+    assert cell_with(base).pedestal_in_support is stands_in
