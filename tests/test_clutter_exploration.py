@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import CATALOGUE, DEFAULT_CELL, random_scene, training_script
+from conftest import CATALOGUE, DEFAULT_CELL, cell_with, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
@@ -381,3 +381,13 @@ def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig
     assert task.hidden_at_start
     assert task.end is EpisodeEnd.ALL_FOUND
     assert task.steps[-1].newly_found
+
+
+def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) -> None:
+    camera = "cameras.overhead.pose={translation: [0.0, 0.3, 1.5], rpy_deg: [170, 0, 0]}"
+    save_scene_set(tmp_path / "tilted.json", {"objects": "ycb7"}, [entry(22)], cell_with(camera, "support.size=[0.75, 0.75]"))
+    environment = ClutterExploration(tmp_path / "tilted.json")
+    environment.reset(options={"scene": 0})
+    observation = environment.backend.look.observation
+    assert observation.camera == environment.scenes.cell.camera
+    assert observation.support.size == (0.75, 0.75)

@@ -1,15 +1,20 @@
 """Comparing explorers: what is played, and what is refused before anything is."""
 
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import world_with
+from conftest import cell_with, random_scene, world_with
+from typer.testing import CliRunner
 
-from drake_clutter.commands.evaluate import PlayableScene, evaluate, playable
+from drake_clutter.cli import app
+from drake_clutter.commands.evaluate import PlayableScene, cell_of, evaluate, playable
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
+from drake_clutter.scenes.interfaces import Verdict
+from drake_clutter.scenes.scene_file import save_scene
 
 CONFIG = ClutterConfig()
 
@@ -53,3 +58,24 @@ def test_what_hides_nothing_from_the_config_s_camera_is_left_out() -> None:
     assert row["episodes"] == 1
     with pytest.raises(InputError, match="none of 1 hides anything"):
         rows_of(scenes[1:], "random", config=config)
+
+
+def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) -> None:
+    """A camera that calls nothing hidden but what it sees nothing of."""
+    scene = random_scene(22)
+    cells = [cell_with(f"cameras.overhead.visibility_threshold={least}") for least in (0.3, 0.000001)]
+    for number, cell in enumerate(cells):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 0.0), scene.names)
+        save_scene(folder / f"{number}.yaml", scene, cell, verdict)
+        assert cell_of(playable(str(folder), None)) == cell
+        out = folder / "out.json"
+        command = ["evaluate", str(folder), "--agents", "random", "--fidelity", "fast", "--max-moves", "1", "--out", str(out)]
+        told = CliRunner().invoke(app, command)
+        assert told.exit_code == 0, told.output
+        camera = json.loads(out.read_text())["config"]["cell"]["cameras"]["overhead"]
+        assert camera["visibility_threshold"] == cell.camera.visibility_threshold
+    mixed = [playable(str(tmp_path / str(number)), None)[0] for number in (0, 1)]
+    with pytest.raises(InputError, match=r"1\.yaml was made in another cell than 0\.yaml; allowed are scenes of one cell"):
+        cell_of(mixed)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from conftest import CATALOGUE, DEFAULT_CELL, GRAMMARS, random_scene, rng
+from conftest import CATALOGUE, DEFAULT_CELL, GRAMMARS, random_scene, rng, tray
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -84,3 +84,10 @@ def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
         if not path.stem.startswith("train_"):
             assert all(scene.settled is not None for scene in held.scenes)
             assert not forms & learned_from, path.name
+
+
+def test_a_frozen_scene_stands_on_the_support_of_its_set(tmp_path: Path) -> None:
+    small = DEFAULT_CELL.with_support(tray(0.65))
+    save_scene_set(tmp_path / "set.json", {"objects": "ycb7"}, [entry(0, frozen=True)], small)
+    held = load_scene_set(tmp_path / "set.json", CATALOGUE)
+    assert held.settled(0, held.grammar, WORLD).support == small.support

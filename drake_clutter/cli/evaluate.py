@@ -65,8 +65,8 @@ def evaluate(
         raise InputError(
             "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
         )
-    world = load_world(config, cell, settings)
     played = command.playable(named, catalogue)[:count]
+    world = load_world(config, cell, settings, None if cell else command.cell_of(played))
     names = [name for some in agents or BASELINES for name in some.split(",")]
     limit = max_moves or world.exploration.max_moves
 

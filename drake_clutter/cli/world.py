@@ -41,16 +41,29 @@ def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
         raise InputError(f"{file or '--set'}: {error}") from error
 
 
-def load_world(config: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "ClutterConfig":
-    """Return the world: the defaults with the cell, over them the config's fields, and single fields."""
+def load_world(
+    config: Path | None,
+    cell: Path | None,
+    settings: Sequence[str] | None,
+    of_scenes: "WorkCell | None" = None,
+) -> "ClutterConfig":
+    """Return the world: the defaults with the cell, over them the config's fields, and single fields.
+
+    Args:
+        config: File of the config.
+        cell: File of the cell.
+        settings: Single fields.
+        of_scenes: Stands for the default cell; or None.
+    """
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import ClutterConfig, upgrade
     from drake_clutter.validation import load_typed
 
-    default = ClutterConfig() if cell is None else replace(ClutterConfig(), cell=load_cell(cell))
-    world = load_typed(default, config, convert=upgrade)
+    default = ClutterConfig() if of_scenes is None else ClutterConfig(cell=of_scenes)
+    base = default if cell is None else replace(default, cell=load_cell(cell))
+    world = load_typed(base, config, convert=upgrade)
     world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
-    check_cell(world.cell, ClutterConfig().cell, cell or config)
+    check_cell(world.cell, default.cell, cell or config)
     return world
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, summarise_episodes
 from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, sha256_of, write_json
 from drake_clutter.resources import git_commit, shipped_path
@@ -34,11 +35,13 @@ class PlayableScene:
         file: a scene file, or a set.
         number: in the set; None for a scene file.
         classes: names of those that its objects may have.
+        cell: that it was made with.
     """
 
     file: Path
     number: int | None
     classes: frozenset[str]
+    cell: WorkCell
 
 
 def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
@@ -60,7 +63,7 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
     if scenes.is_file():
         held = load_scene_set(scenes, catalogue)
         classes = frozenset(c.name for c in held.classes)
-        return [PlayableScene(scenes, number, classes) for number in range(len(held.scenes))]
+        return [PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
@@ -70,10 +73,25 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
     for path in paths:
         file = load_scene(path, catalogue)
         if file.verdict is not None and file.verdict.hidden:
-            found.append(PlayableScene(path, None, frozenset(o.object_class.name for o in file.scene.objects)))
+            names = frozenset(o.object_class.name for o in file.scene.objects)
+            found.append(PlayableScene(path, None, names, file.cell))
     if not found:
         raise InputError(f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes")
     return found
+
+
+def cell_of(scenes: Sequence[PlayableScene]) -> WorkCell:
+    """Return the cell in which all of the scenes were made; its support is the first one's.
+
+    Raises:
+        InputError: Two were made in different cells.
+    """
+    first = scenes[0]
+    for scene in scenes:
+        if scene.cell.with_support(first.cell.support) != first.cell:
+            found = f"{scene.file.name} was made in another cell than {first.file.name}"
+            raise InputError(f"--scenes: {found}; allowed are scenes of one cell, or --cell")
+    return first.cell
 
 
 def evaluate(

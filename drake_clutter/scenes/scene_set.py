@@ -7,7 +7,7 @@ all that, so that nobody compares agents on different work without noticing.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ class SceneSet:
         return Derivation(grammar.replay(rules), rules)
 
     def settled(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
-        """A scene of a frozen set, as it came to rest.
+        """A scene of a frozen set, as it came to rest, on the set's support.
 
         Raises:
             InputError: the set has no poses.
@@ -86,7 +86,8 @@ class SceneSet:
             raise InputError(
                 f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
             )
-        scene = lay_anew(self.derivation(index, grammar), grammar, config, np.random.default_rng(index))
+        world = replace(config, cell=config.cell.with_support(self.cell.support))
+        scene = lay_anew(self.derivation(index, grammar), grammar, world, np.random.default_rng(index))
         return scene.at(dict(zip(scene.names, poses, strict=True)))
 
 

@@ -66,11 +66,12 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             fidelity: one of `TELEPORT_FIDELITIES`, or what starts episodes on other backends.
             max_moves: after which an episode ends; None: the config's.
             most_objects: that a scene may have.
-            config: the world.
+            config: the world; None: the default one, in the cell that the scenes were made with.
         """
         if not isinstance(scenes, SceneSet):
             scenes = load_scene_set(shipped_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue())
-        self._config, self._privileged, self.scenes = config or ClutterConfig(), privileged, scenes
+        self._config = config or ClutterConfig(cell=scenes.cell)
+        self._privileged, self.scenes = privileged, scenes
         self._max_moves = max_moves or self._config.exploration.max_moves
         self._nodes = most_objects + 1
         self.grammar = scenes.grammar
