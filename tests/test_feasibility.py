@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
@@ -120,6 +121,40 @@ def test_the_map_agrees_with_the_poses() -> None:
     near, in_tray = base_scores(DEFAULT_CELL, [(-0.65, 0.0), (0.0, 0.0)])
     assert near[0] == 1.0
     assert in_tray == (0.0, 0.0)
+
+
+def test_the_map_covers_the_support_and_no_more() -> None:
+    found = Reachability(cell_with("support.size=[0.4, 0.8]")).map((0.1,), 0.15)
+    assert found.x == pytest.approx([-0.15, 0.0, 0.15])
+    assert found.y == pytest.approx(np.linspace(-0.35, 0.35, 6))
+    assert found.share.shape == found.manipulability.shape == (1, 3, 6)
+
+
+def test_all_moves_are_in_the_picture_over_the_support() -> None:
+    row = {"setup": "it", "result": PLANNED}
+    moves = [row | {"pick_x": 0.1, "pick_y": 0.45}, row | {"pick_x": -0.14, "pick_y": -0.4}]
+    figure = feasibility_report._over_tray(moves, {"it": cell_with("support.size=[0.3, 1.0]")})
+    (panel, _) = figure.axes
+    assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
+    assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
+    plt.close(figure)
+
+
+def test_another_base_keeps_the_roll_and_pitch_of_the_cell_s() -> None:
+    hanging = cell_with("robot.base.roll=180")
+    (cell,) = command.setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
+    assert cell.robot.base.translation == (0.1, -0.2, 1.4)
+    assert cell.robot.base.rpy_deg == (180.0, 0.0, 30.0)
+
+
+def test_cells_of_one_name_are_refused(scenes: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / folder / "cell.yaml" for folder in ("a", "b")]
+    arguments = ["feasibility", str(scenes / "pile.yaml"), "--out", str(tmp_path / "study")]
+    for path in paths:
+        arguments += ["--cell", str(path)]
+    told = CliRunner().invoke(app, arguments)
+    assert isinstance(told.exception, InputError)
+    assert "cell is there twice; allowed are files with names of their own" in str(told.exception)
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
 TIME_LIMIT = 5.0
 """s, for each move."""
 BASE_X, BASE_Y = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(), np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
-"""m, of the bases that are compared, on one side of the tray: the tray is square, so the other sides are like it."""
+"""m, of the bases that are compared, on one side of the tray: the other sides of a square one are like it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,8 @@ def setups(
     """Return cells by name: the files', and the default one with other bases; the default one if nothing is given.
 
     Args:
-        bases: X_TB as x, y, z (m) and yaw (deg). trays: X_BT likewise.
+        bases: X_TB as x, y, z (m) and yaw (deg), roll and pitch as they are.
+        trays: X_BT as x, y, z (m) and yaw (deg), without roll and pitch.
         files: YAML with fields of `WorkCell` over those of the default; whole cells if they name
             a robot's model.
         default: A cell.
@@ -121,12 +122,15 @@ def setups(
         InputError: A file that is none, or a robot that cannot be loaded.
     """
     found = {path.stem: _cell(path, default) for path in files}
-    for base in bases:
-        found[f"base {', '.join(f'{v:g}' for v in base)}"] = _moved(default, base)
+    roll, pitch, _ = default.robot.base.rpy_deg
+    for x, y, z, yaw in bases:
+        base = PoseSpec(translation=(x, y, z), rpy_deg=(roll, pitch, yaw))
+        found[f"base {x:g}, {y:g}, {z:g}, {yaw:g}"] = _moved(default, base)
     for x, y, z, yaw in trays:
         c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
-        seen_from_tray = [-(c * x + s * y), -(c * y - s * x), -z, -yaw]
-        found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = _moved(default, seen_from_tray)
+        place = (-(c * x + s * y), -(c * y - s * x), -z)
+        base = PoseSpec(translation=place, rpy_deg=(0.0, 0.0, -yaw))
+        found[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = _moved(default, base)
     return found or {"default": default}
 
 
@@ -140,10 +144,8 @@ def _cell(path: Path, default: WorkCell) -> WorkCell:
     return cell
 
 
-def _moved(cell: WorkCell, base: Sequence[float]) -> WorkCell:
-    x, y, z, yaw = base
-    pose = PoseSpec(translation=(x, y, z), rpy_deg=(0.0, 0.0, yaw))
-    return cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": pose})})
+def _moved(cell: WorkCell, base: PoseSpec) -> WorkCell:
+    return cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": base})})
 
 
 class _TargetEntry(Model):
@@ -223,7 +225,8 @@ class Worker:
                 }
             )
         return {
-            "along": found.along.tolist(),
+            "x": found.x.tolist(),
+            "y": found.y.tolist(),
             "heights": list(found.heights),
             "share": found.share.tolist(),
             "manipulability": found.manipulability.tolist(),
@@ -304,8 +307,8 @@ def _written(job: FeasibilityJob, out: Path, results: dict[Part, Any]) -> dict[s
         {"setup": setup, "height": z, "x": x, "y": y, **{name: f[name][k][i][j] for name in ("share", "manipulability")}}
         for setup, f in reach.items()
         for k, z in enumerate(f["heights"])
-        for i, x in enumerate(f["along"])
-        for j, y in enumerate(f["along"])
+        for i, x in enumerate(f["x"])
+        for j, y in enumerate(f["y"])
     ]
     tables = {"moves": (moves, MoveRow), "noise": (noise, NoiseRow), "reach": (cells, None), "bases": (bases, None)}
     for name, (rows, kind) in (tables | {"targets": (targets, None)}).items():

@@ -75,17 +75,18 @@ class Reachability:
             heights: m, of the lip over the tray's floor.
             spacing: m, of the grid.
         """
-        half = max(self._cell.support.half_size) - MARGIN
-        along = np.linspace(-half, half, max(2, round(2 * half / spacing) + 1))
-        share, best = np.zeros((2, len(heights), len(along), len(along)))
+        half_size = self._cell.support.half_size
+        ends = np.maximum(half_size - MARGIN, half_size / 2).tolist()
+        along_x, along_y = (np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in ends)
+        share, best = np.zeros((2, len(heights), len(along_x), len(along_y)))
         yaws = np.arange(YAWS) * (2 * np.pi / YAWS)
         for k, height in enumerate(heights):
-            for i, x in enumerate(along):
-                for j, y in enumerate(along):
+            for i, x in enumerate(along_x):
+                for j, y in enumerate(along_y):
                     found = self.poses(np.array([downwards(yaw, np.array([x, y, height])) for yaw in yaws]))
                     share[k, i, j] = np.mean(found.branches > 0)
                     best[k, i, j] = found.manipulability.max()
-        return ReachMap(tuple(heights), along, share, best)
+        return ReachMap(tuple(heights), along_x, along_y, share, best)
 
 
 @dataclass(frozen=True)
@@ -93,12 +94,13 @@ class ReachMap:
     """Where over the tray a cup that points down can go.
 
     Attributes:
-        heights: m. along: (n,) m, x as well as y, in T.
-        share: (heights, n, n) of the yaws that are reached; manipulability: m^3, the best at any of them. By height, x, y.
+        heights: m. x: (n,) m, in T. y: (m,) m, in T.
+        share: (heights, n, m) of the yaws that are reached; manipulability: m^3, the best at any of them. By height, x, y.
     """
 
     heights: tuple[float, ...]
-    along: Floats
+    x: Floats
+    y: Floats
     share: Floats
     manipulability: Floats
 

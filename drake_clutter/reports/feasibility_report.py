@@ -69,7 +69,7 @@ def write_report(
         parts += [
             _figure("Results of all moves", _reasons(moves, list(setups))),
             _figure("Planned, of all legal moves of a kind (bars: 95 %)", _kinds(moves, list(setups))),
-            _figure("Planned, of the moves that pick there (number of moves)", _over_tray(moves, list(setups))),
+            _figure("Planned, of the moves that pick there (number of moves)", _over_tray(moves, setups)),
         ]
     for setup, found in reach.items():
         parts.append(_figure(f"{setup}: where a cup that points down can go, in the empty cell", _reach(found)))
@@ -186,19 +186,21 @@ def _heat(axes: Any, values: NDArray[np.float64], extent: Sequence[float], top: 
     return axes.imshow(values.T, origin="lower", extent=extent, vmin=0, vmax=top, cmap="viridis", aspect="equal")
 
 
-def _over_tray(moves: Rows, setups: Sequence[str]) -> Figure:
-    edges = np.linspace(-0.35, 0.35, 8)
+def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
+    picked = np.abs([(row["pick_x"], row["pick_y"]) for row in moves])
+    half_x, half_y = np.max([*picked, *(cell.support.half_size for cell in setups.values())], axis=0)
+    edges_x, edges_y = np.linspace(-half_x, half_x, 8), np.linspace(-half_y, half_y, 8)
     figure, axes = plt.subplots(1, len(setups), figsize=(6.6 * len(setups), 5.6), squeeze=False)
     for panel, setup in zip(axes[0], setups, strict=True):
         rows = [row for row in moves if row["setup"] == setup]
         x, y = np.array([row["pick_x"] for row in rows]), np.array([row["pick_y"] for row in rows])
         good = np.array([row["result"] == PLANNED for row in rows], float)
-        count, _, _ = np.histogram2d(x, y, bins=(edges, edges))
-        planned, _, _ = np.histogram2d(x, y, bins=(edges, edges), weights=good)
+        count, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y))
+        planned, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y), weights=good)
         with np.errstate(invalid="ignore"):
-            image = _heat(panel, planned / count, (-0.35, 0.35, -0.35, 0.35), 1.0)
-        for i, cx in enumerate((edges[1:] + edges[:-1]) / 2):
-            for j, cy in enumerate((edges[1:] + edges[:-1]) / 2):
+            image = _heat(panel, planned / count, (-half_x, half_x, -half_y, half_y), 1.0)
+        for i, cx in enumerate((edges_x[1:] + edges_x[:-1]) / 2):
+            for j, cy in enumerate((edges_y[1:] + edges_y[:-1]) / 2):
                 if count[i, j]:
                     panel.text(cx, cy, f"{count[i, j]:.0f}", ha="center", va="center", color="white", fontsize=11)
         panel.set(title=setup, xlabel="x of the tray, m", ylabel="y, m")
@@ -207,13 +209,14 @@ def _over_tray(moves: Rows, setups: Sequence[str]) -> Figure:
 
 
 def _reach(found: Mapping[str, Any]) -> Figure:
-    heights, along = found["heights"], found["along"]
-    half = along[-1] + (along[1] - along[0]) / 2
+    heights = found["heights"]
+    half_x, half_y = (along[-1] + (along[1] - along[0]) / 2 for along in (found["x"], found["y"]))
+    extent = (-half_x, half_x, -half_y, half_y)
     figure, axes = plt.subplots(2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True)
     best = max(0.01, float(np.max(found["manipulability"])))
     for k, height in enumerate(heights):
-        top = _heat(axes[0][k], np.array(found["share"][k]), (-half, half, -half, half), 1.0)
-        bottom = _heat(axes[1][k], np.array(found["manipulability"][k]), (-half, half, -half, half), best)
+        top = _heat(axes[0][k], np.array(found["share"][k]), extent, 1.0)
+        bottom = _heat(axes[1][k], np.array(found["manipulability"][k]), extent, best)
         axes[0][k].set_title(f"{100 * height:g} cm above the floor", fontsize=13)
         axes[1][k].set_xlabel("x of the tray, m")
     for row, name in ((0, "y, m"), (1, "y, m")):
