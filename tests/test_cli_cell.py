@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.cli import app
+from drake_clutter.cli.run import _load_scenario
 from drake_clutter.cli.world import load_world
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
@@ -61,6 +62,12 @@ def test_options_go_over_the_scene_s_cell_but_for_its_support(scene_file: Path, 
     assert plan["cell"]["robot"]["payload"] == 9.0
     assert plan["cell"]["robot"]["base"]["translation"][2] == 0.35
     assert plan["cell"]["support"]["size"] == [0.6, 0.6]
+
+
+def test_a_scenario_has_the_support_of_its_scene(scene_file: Path) -> None:
+    scenario = _load_scenario(None, UR5E, [f"scene={scene_file}"])
+    assert scenario.world.cell == load_cell(UR5E).with_support(SCENE.support)
+    assert _load_scenario(None, UR5E, []).world.cell == load_cell(UR5E)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, executed, resting, rng, scene_of
+from conftest import DEFAULT_CELL, executed, resting, rng, scene_of, tray
 from typer.testing import CliRunner
 
 from drake_clutter.catalogue import load_catalogue
@@ -50,6 +50,14 @@ def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Out
         for name in scene.names:
             assert frame.poses[name].translation == other.poses[name].translation
             assert frame.poses[name].quaternion == pytest.approx(other.poses[name].quaternion)
+
+
+def test_the_cell_has_the_support_that_the_objects_stand_on(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> None:
+    path, other = tmp_path / "trajectory.h5", DEFAULT_CELL.with_support(tray(0.9))
+    write_trajectories(path, SCENE, outcomes, other)
+    scene, cell, _ = read_trajectories(path, load_catalogue())
+    assert cell.support == scene.support == SCENE.support
+    assert cell == DEFAULT_CELL
 
 
 def test_the_arrays_belong_together(file: Path) -> None:

@@ -40,7 +40,10 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
         base = replace(base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell))
     scenario = load_typed(base, file, convert=upgrade)
     if cell is not None:
-        scenario = replace(scenario, world=replace(scenario.world, cell=load_cell(cell)))
+        given = load_cell(cell)
+        if named.scene:  # the objects stand on its support
+            given = given.with_support(base.world.cell.support)
+        scenario = replace(scenario, world=replace(scenario.world, cell=given))
     scenario = load_typed(scenario, settings=names, convert=upgrade)
     check_cell(scenario.world.cell, base.world.cell, cell or file)
     return scenario

@@ -119,7 +119,7 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
             )
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
-    write_json(out / "plan.json", {"seed": seed, "cell": to_plain(config.cell), "plans": plans})
+    write_json(out / "plan.json", {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans})
     return plans
 
 
@@ -191,10 +191,11 @@ def write_episode(
     At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `more` is put over what is known of the episode.
     """
     fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
-    save_scene(out / "after.yaml", task.scene, config.cell)
-    write_episode_page(out, title, task.start, task.first_look, task.steps, fields, config.cell)
+    cell = config.cell.with_support(task.start.support)
+    save_scene(out / "after.yaml", task.scene, cell)
+    write_episode_page(out, title, task.start, task.first_look, task.steps, fields, cell)
     if fidelity == "arm":
-        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], config.cell)
-    fields["cell"] = to_plain(config.cell)
+        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], cell)
+    fields["cell"] = to_plain(cell)
     write_json(out / "episode.json", fields)
     return fields

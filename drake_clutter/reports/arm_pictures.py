@@ -52,7 +52,7 @@ def quarter_turn_to_base(cell: WorkCell) -> NDArray[np.float64]:
 
 def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.uint8]:
     """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
-    builder = DiagramBuilder()
+    builder, cell = DiagramBuilder(), cell.with_support(scene.support)
     made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.support, 0.01, visuals=True)
     plant = made.plant
     arm = add_work_cell(plant, made.scene_graph, cell, compliant=True, visuals=True)

@@ -153,7 +153,7 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"
         figures += pictures.figure(
             f"move_{number:02d}_arm",
-            strip(scene, moments, cell.with_support(scene.support)),
+            strip(scene, moments, cell),
             alt,
             "The arm: lift, carry, place, retreat.",
         )

@@ -162,7 +162,7 @@ def _shown(scene: Scene, cell: WorkCell, *, arm: bool = False) -> tuple[Meshcat,
     plant = scene_plant.plant
     links, added = {}, None
     if arm:
-        added = add_work_cell(plant, scene_plant.scene_graph, cell, compliant=False, visuals=True)
+        added = add_work_cell(plant, scene_plant.scene_graph, cell.with_support(scene.support), compliant=False, visuals=True)
         links = {f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body for body in added.bodies}
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))

@@ -42,11 +42,13 @@ def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Out
         path: the file.
         start: the scene before the first move.
         moves: and what they led to.
-        cell: in which they were carried out.
+        cell: in which they were carried out; its support is the scene's.
     """
     count = 0
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update({"version": VERSION, "scene": scene_text(start, cell), "cell": config_yaml(cell)})
+        file.attrs.update(
+            {"version": VERSION, "scene": scene_text(start, cell), "cell": config_yaml(cell.with_support(start.support))}
+        )
         for move, outcome in moves:
             states = [frame.arm for frame in outcome.motion if frame.arm]
             if not states:
@@ -78,7 +80,7 @@ def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell
         if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
             raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
         scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
-        cell = _cell(path, file.attrs)
+        cell = _cell(path, file.attrs).with_support(scene.support)
         joints = load_robot(cell.robot).num_joints
         return scene, cell, [_move(path, name, file[name], scene, joints) for name in sorted(file)]
 
