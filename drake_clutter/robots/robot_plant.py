@@ -5,13 +5,13 @@ Frames: T the support, which is the world; B the robot's base.
 
 from collections import defaultdict
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_clutter.robots.model_file import parse_model
 from drake_clutter.robots.robot_model import RobotModel
@@ -20,6 +20,10 @@ _SAMPLES = 200
 """Configurations at which links two joints apart are looked at."""
 _NEXT = 0.01
 """Outlines that are no further apart are next to each other [m]."""
+_IN_PLACE = 0.25
+"""A link that the first joint turns, and that reaches no further from its axis, stays in place [m]."""
+PEDESTAL = "pedestal"
+"""Name of the box under the base."""
 
 
 def add_robot(plant: MultibodyPlant, robot: RobotModel, *, visuals: bool) -> ModelInstanceIndex:
@@ -57,19 +61,53 @@ def filter_collisions(
 ) -> None:
     """Leave out what cannot collide, once everything that stands in the cell is registered.
 
-    That is `unmeeting_links`, and what the first joint turns in place against the surroundings.
+    That is `unmeeting_links`, and against the surroundings what stands on the base, see
+    `links_in_place`; of what else the first joint moves, the pedestal alone.
     """
 
     def shapes(body: RigidBody) -> GeometrySet:
         return GeometrySet(plant.GetCollisionGeometriesForBody(body))
 
     bodies = {name: plant.GetBodyByName(name, instance) for name in robot.links}
-    on_base = [bodies[name] for name, moved_by in robot.links.items() if moved_by <= 1]
-    excluded = [(plant.world_body(), body) for body in on_base]
-    excluded += [(bodies[first], bodies[second]) for first, second in unmeeting_links(robot)]
+    in_place, world = links_in_place(robot), shapes(plant.world_body())
+    inspector = scene_graph.model_inspector()
+    solids = plant.GetCollisionGeometriesForBody(plant.world_body())
+    pedestal = GeometrySet([g for g in solids if inspector.GetName(g).split("::")[-1] == PEDESTAL])
+    excluded = [(world, bodies[name]) for name in in_place]
+    excluded += [(pedestal, bodies[name]) for name, moved_by in robot.links.items() if moved_by == 1 and name not in in_place]
+    excluded += [(shapes(bodies[first]), bodies[second]) for first, second in unmeeting_links(robot)]
     filters = scene_graph.collision_filter_manager()
     for first, second in excluded:
-        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(shapes(first), shapes(second)))
+        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(first, shapes(second)))
+
+
+@lru_cache(maxsize=32)
+def links_in_place(robot: RobotModel) -> tuple[str, ...]:
+    """Return the links that stay where they are: no joint moves them, or the first turns them and
+    they do not reach out.
+    """
+    plant, scene_graph, diagram = _alone(robot)
+    root = diagram.CreateDefaultContext()
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(root))
+    X_TJ = robot.X_TB.GetAsMatrix4() @ robot.chain.joint_frames(np.zeros(robot.num_joints))[0]
+    p_TJ, axis_T = X_TJ[:3, 3], X_TJ[:3, 2]
+
+    def reach(name: str) -> float:
+        """From the first joint's axis, in any position of that joint [m]."""
+        found = 0.0
+        for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name)):
+            box = query.inspector().GetObbInGeometryFrame(geometry)
+            if box is None:
+                return np.inf
+            X_TG = query.GetPoseInWorld(geometry) @ box.pose()
+            corners = [X_TG @ (box.half_width() * signs) for signs in product((-1, 1), repeat=3)]
+            away = np.cross(np.array(corners) - p_TJ, axis_T)
+            found = max(found, float(np.linalg.norm(away, axis=1).max()))
+        return found
+
+    turns = bool(robot.chain.revolute[0])
+    moved = robot.links.items()
+    return tuple(name for name, by in moved if by == 0 or (by == 1 and turns and reach(name) < _IN_PLACE))
 
 
 @lru_cache(maxsize=32)
@@ -91,17 +129,21 @@ def unmeeting_links(robot: RobotModel) -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
-def _distances(robot: RobotModel) -> dict[frozenset[str], list[float]]:
-    """Return distances of two links, where less than `_NEXT`, in random configurations."""
+def _alone(robot: RobotModel) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    instance = add_robot(plant, robot, visuals=False)
+    add_robot(plant, robot, visuals=False)
     plant.Finalize()
-    diagram = builder.Build()
+    return plant, scene_graph, builder.Build()
+
+
+def _distances(robot: RobotModel) -> dict[frozenset[str], list[float]]:
+    """Return distances of two links, where less than `_NEXT`, in random configurations."""
+    plant, scene_graph, diagram = _alone(robot)
     root = diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
     inspector = scene_graph.model_inspector()
-    joints = [plant.GetJointByName(name, instance) for name in robot.joint_names]
+    joints = [plant.GetJointByName(name) for name in robot.joint_names]
     lower, upper = robot.position_limits.T
     found = defaultdict[frozenset[str], list[float]](list)
     for q in np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, robot.num_joints)):
