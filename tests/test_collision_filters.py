@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL
+from conftest import DEFAULT_CELL, resting
+from pydrake.math import RigidTransform
 from test_robot_model import CELLS, robot
 
 from drake_clutter.cell.robot import RobotSpec
@@ -78,3 +79,17 @@ def test_a_first_link_that_reaches_out_or_slides_may_hit_a_fixture(
 
     assert close_to_boom(0.0) == set()
     assert close_to_boom(q) == {"post"}
+
+
+def test_an_object_may_have_the_name_of_a_link() -> None:
+    """Of how near it is, and how that changes with the joints, its name changes nothing."""
+    found = {}
+    for name in ("cup", "other"):
+        held, near = resting("gelatin_box", floor=0.2, name="held"), resting("sugar_box", xy=(0.1, 0.0), name=name)
+        scene = ClearanceScene(DEFAULT_CELL, [(o.name, o.object_class) for o in (held, near)])
+        scene.put([held, near])
+        q = np.array([-2.9, -1.5, 2.0, -2.0, -1.6, 0.0])
+        scene.hold("held", RigidTransform([0.0, 0.0, -0.02]))
+        found[name] = {here.pair: gradient for here, gradient in scene.gradients(q, 2.0)}
+    assert np.abs(found["other"]["held", "other"]).max() > 0.01
+    assert found["cup"]["held", "cup"] == pytest.approx(found["other"]["held", "other"])

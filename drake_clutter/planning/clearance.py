@@ -1,6 +1,6 @@
 """How far the arm, and what it holds, is from everything else."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +68,7 @@ class ClearanceScene:
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
         self._at, self._v_at = joint_numbers(self.plant, self._arm)
-        self._moved_by = load_robot(cell.robot).links
+        self._moved_by = self._joints_by_geometry(load_robot(cell.robot).links)
         self._fixed = (*self._arm.fixed, self.plant.GetBodyByName("tray"))
         self._names = self._name_geometries()
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
@@ -83,6 +83,17 @@ class ClearanceScene:
         found = GeometrySet()
         for body in bodies:
             found.Add(self.plant.GetCollisionGeometriesForBody(body))
+        return found
+
+    def _joints_by_geometry(self, links: Mapping[str, int]) -> dict[GeometryId, int]:
+        """Return how many of the joints, from the base on, move each geometry of arm and tool.
+
+        By geometry, as a link of the arm, one of the tool and an object may have one name.
+        """
+        found = dict[GeometryId, int]()
+        for body in self._arm.bodies:
+            moved_by = links[body.name()] if body.model_instance() == self._arm.robot else len(self._at)
+            found |= dict.fromkeys(self.plant.GetCollisionGeometriesForBody(body), moved_by)
         return found
 
     def _name_geometries(self) -> dict[GeometryId, str]:
@@ -154,8 +165,11 @@ class ClearanceScene:
 
     def _named(self, pair: SignedDistancePair) -> Clearance:
         first, second = self._names[pair.id_A], self._names[pair.id_B]
-        moves = first in self.arm_names or (self._held is not None and first == self._held[0])
+        moves = pair.id_A in self._moved_by or self._is_held(pair.id_A)
         return Clearance(float(pair.distance), (first, second) if moves else (second, first))
+
+    def _is_held(self, geometry: GeometryId) -> bool:
+        return self._held is not None and geometry not in self._moved_by and self._names[geometry] == self._held[0]
 
     def close(self, q: Floats, within: float) -> list[Clearance]:
         """At joint positions (n,): all that is closer than `within`, m."""
@@ -175,7 +189,7 @@ class ClearanceScene:
         for pair in pairs:
             gradient = np.zeros(len(self._at))
             for geometry, p_S, sign in ((pair.id_A, pair.p_ACa, 1.0), (pair.id_B, pair.p_BCb, -1.0)):
-                if joints := self._joints_that_move(self._names[geometry]):
+                if joints := self._joints_that_move(geometry):
                     nx, ny, nz = sign * pair.nhat_BA_W
                     x, y, z = query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
                     moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
@@ -197,7 +211,5 @@ class ClearanceScene:
         )
         return np.asarray(J[:, self._v_at])
 
-    def _joints_that_move(self, name: str) -> int:
-        if name in self.arm_names:
-            return self._moved_by.get(name, len(self._at))
-        return len(self._at) if self._held is not None and name == self._held[0] else 0
+    def _joints_that_move(self, geometry: GeometryId) -> int:
+        return len(self._at) if self._is_held(geometry) else self._moved_by.get(geometry, 0)
