@@ -1,5 +1,6 @@
 """Robots as data: kinematics and limits of the robot of every shipped cell, and of a URDF."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -301,3 +302,22 @@ def test_the_closed_form_serves_a_ur_with_other_base_and_tool_frames(tmp_path: P
     found = arm.ik.solve(X_BF)
     apart = np.abs((found - q[:, None] + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
     assert (np.nanmin(apart, axis=1) < 1e-6).all()
+
+
+def test_motors_are_in_the_order_of_the_joints_whatever_the_file_s(tmp_path: Path) -> None:
+    own = robot("iiwa14").spec
+    text = shipped_path("models/robots/iiwa14.sdf").read_text()
+    joints = re.findall(r"    <joint .*?</joint>\n", text, re.DOTALL)
+    for joint in joints:
+        text = text.replace(joint, "")
+    path = tmp_path / "backwards.sdf"
+    path.write_text(text.replace("  </model>", "".join(joints[::-1]) + "  </model>"))
+    torque = own.limits.model_copy(update={"torque": tuple(float(k) for k in range(100, 107))})
+    for limits in (own.limits, torque):
+        arm = load_robot(own.model_copy(update={"model": str(path), "limits": limits}))
+        plant = MultibodyPlant(0.001)
+        instance = add_robot(plant, arm, visuals=False)
+        plant.Finalize()
+        motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices(instance)]
+        assert tuple(motor.joint().name() for motor in motors) == arm.joint_names == robot("iiwa14").joint_names
+        assert [motor.effort_limit() for motor in motors] == arm.torque_limits.tolist()

@@ -29,7 +29,7 @@ PEDESTAL = "pedestal"
 def add_robot(plant: MultibodyPlant, robot: RobotModel, *, visuals: bool) -> ModelInstanceIndex:
     """Add a robot to a plant that is not finalized.
 
-    Each joint gets an actuator of the joint's name, if the model has none, and the cell's limits.
+    Each joint gets an actuator, if the model has none, and the cell's limits.
 
     Args:
         plant: What to add to.
@@ -39,18 +39,31 @@ def add_robot(plant: MultibodyPlant, robot: RobotModel, *, visuals: bool) -> Mod
     spec = robot.spec
     instance = parse_model(plant, spec.model, visuals=visuals)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(spec.base_link, instance), spec.X_TB)
-    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    by_joint = {a.joint().name(): a for a in actuators if a.joint().model_instance() == instance}
+    _add_motors(plant, robot, instance)
     for k, name in enumerate(robot.joint_names):
-        joint, torque = plant.GetJointByName(name, instance), float(robot.torque_limits[k])
-        if name not in by_joint:
-            plant.AddJointActuator(name, joint, torque)
-        elif spec.limits.torque is not None:
-            by_joint[name].set_effort_limit(torque)
+        joint = plant.GetJointByName(name, instance)
         if spec.limits.position is not None:
             lower, upper = robot.position_limits[k]
             joint.set_position_limits([lower], [upper])
     return instance
+
+
+def _add_motors(plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex) -> None:
+    """Give each joint a motor, in the order of the joints, which is that of commands to the plant."""
+    motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    motors = [motor for motor in motors if motor.model_instance() == instance]
+    by_joint = {motor.joint().name(): (motor.default_rotor_inertia(), motor.default_gear_ratio()) for motor in motors}
+    in_order = tuple(by_joint) == robot.joint_names
+    for k, motor in enumerate(motors):
+        if not in_order:
+            plant.RemoveJointActuator(motor)
+        elif robot.spec.limits.torque is not None:
+            motor.set_effort_limit(float(robot.torque_limits[k]))
+    for name, torque in () if in_order else zip(robot.joint_names, robot.torque_limits.tolist(), strict=True):
+        motor = plant.AddJointActuator(name, plant.GetJointByName(name, instance), torque)
+        inertia, ratio = by_joint.get(name, (0.0, 1.0))
+        motor.set_default_rotor_inertia(inertia)
+        motor.set_default_gear_ratio(ratio)
 
 
 def filter_collisions(

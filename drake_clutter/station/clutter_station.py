@@ -13,7 +13,6 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_numbers
@@ -188,19 +187,11 @@ class ClutterStation(Diagram):
 
 
 def _control_positions(plant: MultibodyPlant, arm: Arm) -> None:
-    """Give the arm's motors position control.
-
-    Raises:
-        InputError: The model's motors are not in the order of the joints.
-    """
-    motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
-    motors = [motor for motor in motors if motor.model_instance() == arm.robot]
-    driven = [motor.joint().name() for motor in motors]
-    if tuple(driven) != arm.joints:
-        given = f"robot.model: motors of {', '.join(driven)}"
-        raise InputError(f"{given}; allowed is one for each of {', '.join(arm.joints)}, in order")
+    """Give the arm's motors position control."""
+    motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     for motor in motors:
-        motor.set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
+        if motor.model_instance() == arm.robot:
+            motor.set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
 
 
 def _grasp_constraint(plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], jointed: str) -> GraspConstraint:
