@@ -1,6 +1,7 @@
 """Cameras at any pose: the model, against Drake's images, and what they tell of free space."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -311,3 +312,17 @@ def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
     assert not scenario.world.cell.camera.depth_noise
     assert scenario.world.cell.camera.pose == DEFAULT_CELL.camera.pose
     assert Scenario().world.cell.camera.depth_noise
+
+
+@pytest.mark.parametrize("height", [0.10, 0.15, 0.30, 0.60])
+def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(height: float) -> None:
+    """A stranger that stands higher than the camera hides nothing behind the camera."""
+    camera = Camera(pose=PoseSpec(translation=(0.0, -1.0, height), rpy_deg=(-90.0 - 20.0 * height, 0.0, 0.0)))
+    detector, stranger = LabelDetector(camera), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0))
+    empty = np.where(camera.floor_depth < 5, camera.floor_depth, np.float32(np.inf))
+    blocks = unseen_blocks([], replace(detector.look(scene_of(stranger)).observation, detections=()), empty)
+    assert blocks
+    for block in blocks:
+        low, high = np.array(block.middle) - np.array(block.size) / 2, np.array(block.middle) + np.array(block.size) / 2
+        assert np.abs([low[:2], high[:2]]).max() < 0.36 * math.sqrt(2)
+        assert high[2] < 0.25

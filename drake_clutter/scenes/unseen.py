@@ -128,11 +128,21 @@ def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDA
         mine = p_TP[part == k]
         if len(mine) >= _FEWEST and np.ptp(mine[:, :2], axis=0).min() > 0:
             top = float(np.quantile(mine[:, 2], _HIGHEST))
-            if not observation.camera.vertical:  # down to the floor along the rays
-                eye = observation.camera.X_TC.translation()
-                mine = np.vstack([mine, eye + (mine - eye) * (eye[2] / (eye[2] - mine[:, 2:]))])
+            if not observation.camera.vertical:
+                mine = np.vstack([mine, _ends_of_rays(mine, observation)])
             blocks.append(UnseenBlock.under(mine, top))
     return blocks
+
+
+def _ends_of_rays(p_TP: NDArray[np.float64], observation: Observation) -> NDArray[np.float64]:
+    """Return where rays through points over the support (N, 3) meet its floor or leave it [m]. Shape (N, 3)."""
+    eye = observation.camera.X_TC.translation()
+    ray = p_TP - eye
+    ends = np.copysign([*observation.support.half_size, 0.0], ray)
+    ends[:, 2] = np.where(ray[:, 2] < 0, 0.0, np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.nan_to_num((ends - eye) / ray, nan=np.inf, posinf=np.inf, neginf=np.inf)
+    return np.asarray(eye + ray * np.maximum(along.min(axis=1), 1.0)[:, None])
 
 
 def _nameless_points(
