@@ -316,8 +316,9 @@ def _fields(config: Any) -> dict[str, Any]:
 def override(defaults: Schema, given: Any, source: str) -> Schema:
     """Return a config with the fields of a document over its own.
 
-    A list, and a part of another kind, replaces the whole. So does a collection by names, such as
-    cameras; but an entry whose name is there keeps the fields that are not given.
+    A list, and a part of another kind, replaces the whole. So does what is given with another
+    model, such as a robot, unless only the model is given; and a collection by names, such as
+    cameras, but an entry whose name is there keeps the fields that are not given.
 
     Raises:
         InputError: The first field that cannot be used.
@@ -332,5 +333,7 @@ def _merged(config: Any, given: Any) -> Any:
         return {key: _merged(config.get(key), value) for key, value in given.items()}
     fields = _fields(config)
     if given.get("kind", fields.get("kind")) != fields.get("kind"):
+        return given
+    if len(given) > 1 and given.get("model", fields.get("model")) != fields.get("model"):
         return given
     return {**fields, **{key: _merged(fields.get(key), value) for key, value in given.items()}}

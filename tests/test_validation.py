@@ -11,7 +11,10 @@ from pydantic import Field
 
 import drake_clutter
 from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.config import load_config
 from drake_clutter.files import InputError
+from drake_clutter.resources import shipped_path
 from drake_clutter.validation import (
     Between,
     Finite,
@@ -214,6 +217,17 @@ def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> No
 def test_another_kind_is_not_merged_with_the_one_before() -> None:
     assert override(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(width=0.1)
     assert override(Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room").tool == Cup(radius=0.5)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "iiwa14"])
+def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path) -> None:
+    path = shipped_path(f"models/cells/{name}_epick_tray.yaml")
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml_text({"cell": read_yaml(path, "a cell")}))
+    config = load_config(file)
+    assert config.cell.robot == load_cell(path).robot
+    own = load_typed(config, settings=["cell.robot.model=own.sdf"]).cell.robot
+    assert own == config.cell.robot.model_copy(update={"model": "own.sdf"})
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
