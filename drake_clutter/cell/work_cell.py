@@ -109,6 +109,10 @@ class WorkCell(Model):
         """Return the cell with another support."""
         return self if support == self.support else self.model_copy(update={"support": support})
 
+    def __eq__(self, other: object) -> bool:
+        """Whether all is the same, the order of the cameras included."""
+        return super().__eq__(other) and isinstance(other, WorkCell) and [*self.cameras] == [*other.cameras]
+
     def __hash__(self) -> int:
         """Hash of the whole content, so that what is derived from a cell can be kept."""
         return hash(self.model_dump_json())

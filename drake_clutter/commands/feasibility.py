@@ -272,7 +272,8 @@ def feasibility(
     for path in job.scenes:
         load_scene(path, load_catalogue(job.catalogue_folder))
     if (out / JOB_FILE).exists():
-        if json.loads((out / JOB_FILE).read_text()) != json.loads(json.dumps(job.fields())):
+        earlier = json.loads((out / JOB_FILE).read_text())
+        if json.dumps(earlier) != json.dumps(job.fields()):  # the order of cameras counts, too
             raise InputError(f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder")
     else:
         output_directory(out)

@@ -74,7 +74,7 @@ def generate(
     output_directory(out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES}))
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
-        if earlier != json.loads(json.dumps(job.fields)):
+        if json.dumps(earlier) != json.dumps(job.fields):  # the order of cameras counts, too
             raise InputError(
                 f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
             )
