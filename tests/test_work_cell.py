@@ -1,12 +1,17 @@
 """The work cell's own geometry: poses, pedestal, and what it stands in."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from conftest import cell_with
+from conftest import TRAY, cell_with, resting, scene_of, world_with
+from PIL import Image
 from pydrake.math import RollPitchYaw
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.commands.render import render_scene
+from drake_clutter.grammar import Orientation
 
 
 @pytest.mark.parametrize("rpy_deg", [(180.0, 0.0, 30.0), (0.0, 90.0, -17.0), (12.0, 20.0, 31.0), (-90.0, 180.0, 270.0)])
@@ -52,3 +57,25 @@ def test_a_base_over_the_support_without_a_pedestal_is_not_in_it() -> None:
 def test_whether_a_turned_pedestal_stands_in_the_support(x: float, y: float, yaw: float, stands_in: bool) -> None:
     base = f"robot.base={{translation: [{x}, {y}, 0.3], rpy_deg: [0, 0, {yaw}]}}"
     assert cell_with(base).pedestal_in_support is stands_in
+
+
+def test_which_camera_is_the_first_counts() -> None:
+    one, two = (f"{name}: {{pose: {{translation: [0, 0, {z}], rpy_deg: [180, 0, 0]}}}}" for name, z in (("a", 1.6), ("b", 1.8)))
+    first, second = cell_with(f"cameras={{{one}, {two}}}"), cell_with(f"cameras={{{two}, {one}}}")
+    assert dict(first) == dict(second)
+    assert first.camera != second.camera
+    assert first != second
+
+
+def test_a_camera_must_be_near_enough_to_see_the_support() -> None:
+    assert Camera.over(9.9, fov_y_deg=10.0).sees(TRAY)
+    assert not Camera.over(10.1, fov_y_deg=10.0).sees(TRAY)
+
+
+def test_depth_beyond_sixteen_bits_is_none(tmp_path: Path) -> None:
+    """Of a box under a camera at 6.6 m the top is within 6.55 m, the tray's floor is not."""
+    world = world_with("cell.cameras.overhead.pose.z=6.6", "cell.cameras.overhead.fov_y_deg=10.0")
+    render_scene(scene_of(resting("cracker_box", Orientation.UPRIGHT_0)), world, tmp_path)
+    depth = np.asarray(Image.open(tmp_path / "depth.png"))
+    assert set(np.unique(depth[depth > 0] // 1000)) <= {63, 64, 65}
+    assert np.count_nonzero(depth) < 0.05 * depth.size

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell.pinhole import NEAREST, Floats, Pinhole
+from drake_clutter.cell.pinhole import FARTHEST, NEAREST, Floats, Pinhole
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.support import Support
 from drake_clutter.validation import Between, Flag, Model
@@ -166,10 +166,11 @@ class Camera(Model):
         return (low + high) / 2, float((high - low).max())
 
     def sees(self, support: Support) -> bool:
-        """Return whether any part of the support's floor is in the image."""
+        """Return whether any part of the support's floor is in the image, and near enough."""
         x, y = (np.linspace(-half, half, 41) for half in support.half_size)
         p_T = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
-        p_T = p_T[self.depth(p_T) > NEAREST]
+        depth = self.depth(p_T)
+        p_T = p_T[(depth > NEAREST) & (depth < FARTHEST)]
         if self.X_TC.translation()[2] <= 0 or not len(p_T):
             return False
         pixels = self.project(p_T)

@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 
 NEAREST = 0.01
 """What is not so far before the camera is out of its sight [m]."""
+FARTHEST = 10.0
+"""What is farther has no depth in a rendered image [m]."""
 
 
 class Pinhole(NamedTuple):

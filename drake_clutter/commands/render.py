@@ -13,7 +13,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera import OverheadCamera
 
 DEPTH_UNIT = 1e-4
-"""m per step of depth.png; 0 where nothing is seen."""
+"""m per step of depth.png, of 16 bits; 0 where nothing is seen, or what is too far for them."""
 
 
 def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, float]:
@@ -34,9 +34,10 @@ def _render(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, f
     """Writes what one camera sees; returns the visible share of each object."""
     camera = OverheadCamera(config)
     images, shares = camera.render(scene), camera.visible_shares(scene)
-    depth = np.where(np.isfinite(images.depth), images.depth / DEPTH_UNIT, 0)
+    depth = np.rint(images.depth / DEPTH_UNIT)
+    depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
     Image.fromarray(images.color).save(out / f"{prefix}color.png")
-    Image.fromarray(np.rint(depth).astype(np.uint16)).save(out / f"{prefix}depth.png")
+    Image.fromarray(depth.astype(np.uint16)).save(out / f"{prefix}depth.png")
     Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
     hidden = list(camera.hidden(shares))
     write_json(out / f"{prefix}visible.json", {"visible_share": shares, "hidden": hidden, "names": list(scene.names)})

@@ -25,6 +25,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.pinhole import FARTHEST
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
@@ -76,7 +77,7 @@ class Intrinsics:
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
         over_tray = RenderCameraCore(RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform())
-        depth = DepthRenderCamera(anywhere, DepthRange(0.1, 10.0))
+        depth = DepthRenderCamera(anywhere, DepthRange(0.1, FARTHEST))
         return Intrinsics(ColorRenderCamera(anywhere, False), depth, ColorRenderCamera(over_tray, False), config.X_TC)
 
 
