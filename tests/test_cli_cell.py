@@ -70,6 +70,18 @@ def test_a_scenario_has_the_support_of_its_scene(scene_file: Path) -> None:
     assert _load_scenario(None, UR5E, []).world.cell == load_cell(UR5E)
 
 
+@pytest.mark.parametrize("setting", ["support.size=[0.8, 0.8]", "cell.support.floor_height=0.2", "layout.tray_side=0.8"])
+def test_scenes_keep_the_support_on_which_their_objects_stand(setting: str, scene_file: Path, tmp_path: Path) -> None:
+    commands: list[list[str | Path]] = [
+        ["feasibility", scene_file],
+        ["evaluate", tmp_path],
+        ["run", "--set", f"scene={scene_file}"],
+    ]
+    for command in commands:
+        with pytest.raises(InputError, match="the objects stand on their scene's support; allowed are other fields"):
+            run(*command, "--set", setting, "--out", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -23,7 +23,7 @@ from drake_clutter.cli.options import (
     WorkersOption,
 )
 from drake_clutter.cli.output import out_console, progress_bar
-from drake_clutter.cli.world import load_world
+from drake_clutter.cli.world import load_world, refuse_support
 from drake_clutter.files import InputError
 
 
@@ -65,6 +65,7 @@ def evaluate(
         raise InputError(
             "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
         )
+    refuse_support(settings)
     played = command.playable(named, catalogue)[:count]
     world = load_world(config, cell, settings, None if cell else command.cell_of(played))
     names = [name for some in agents or BASELINES for name in some.split(",")]

@@ -9,7 +9,7 @@ import typer
 
 from drake_clutter.cli.options import CatalogueOption, ConfigOption, JsonOption, SeedOption, SetOption, WorkersOption
 from drake_clutter.cli.output import progress_bar, show
-from drake_clutter.cli.world import load_scene_and_world, load_world
+from drake_clutter.cli.world import load_scene_and_world, load_world, refuse_support
 from drake_clutter.files import InputError
 
 PLACE = "X,Y,Z,YAW"
@@ -54,6 +54,7 @@ def feasibility(
     stems = Counter(path.stem for path in [*(cell or []), *(arm or [])])
     if twice := [name for name, count in stems.items() if count > 1]:
         raise InputError(f"--cell, --arm: {twice[0]} is there twice; allowed are files with names of their own")
+    refuse_support(settings)
     files = command.scene_files(scenes)
     _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
     command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])

@@ -9,7 +9,7 @@ import typer
 
 from drake_clutter.cli.options import CellOption, JsonOption, NodesOption, OutOption, SeedOption, SetOption
 from drake_clutter.cli.output import report_step, show_episode
-from drake_clutter.cli.world import check_cell, in_world
+from drake_clutter.cli.world import check_cell, in_world, refuse_support
 from drake_clutter.files import output_directory
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
     which_scene = [name for name in names if name.startswith(("scene=", "catalogue="))]
     base, named = Scenario(), load_typed(Scenario(), file, which_scene, upgrade)
     if named.scene:
+        refuse_support(names)
         catalogue = load_catalogue(Path(named.catalogue) if named.catalogue else None)
         base = replace(base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell))
     scenario = load_typed(base, file, convert=upgrade)

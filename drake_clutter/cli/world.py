@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drake_clutter.files import refusal
+
 if TYPE_CHECKING:
     from drake_clutter.cell.work_cell import WorkCell
     from drake_clutter.config import ClutterConfig
@@ -39,6 +41,17 @@ def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
         check_models(cell)
     except InputError as error:
         raise InputError(f"{file or '--set'}: {error}") from error
+
+
+def refuse_support(settings: Sequence[str] | None) -> None:
+    """Refuse settings of the support, on which the objects of scenes stand already.
+
+    Raises:
+        InputError: There is one.
+    """
+    for setting in settings or ():
+        if in_world(setting).startswith(("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")):
+            raise refusal(f"--set {setting}", "the objects stand on their scene's support; allowed are other fields")
 
 
 def load_world(
