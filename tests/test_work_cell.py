@@ -4,14 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TRAY, cell_with, resting, scene_of, world_with
+from conftest import TRAY, cell_with, resting, scene_of, tray, world_with
 from PIL import Image
 from pydrake.math import RollPitchYaw
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.commands.render import render_scene
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.station.station_simulation import StationSimulation
 
 
 @pytest.mark.parametrize("rpy_deg", [(180.0, 0.0, 30.0), (0.0, 90.0, -17.0), (12.0, 20.0, 31.0), (-90.0, 180.0, 270.0)])
@@ -79,3 +85,23 @@ def test_depth_beyond_sixteen_bits_is_none(tmp_path: Path) -> None:
     depth = np.asarray(Image.open(tmp_path / "depth.png"))
     assert set(np.unique(depth[depth > 0] // 1000)) <= {63, 64, 65}
     assert np.count_nonzero(depth) < 0.05 * depth.size
+
+
+def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
+    """As a bin for what has been sorted out: model and link have the support's own names."""
+    path = tmp_path / "tray.sdf"
+    path.write_text(support_sdf(tray(0.3)))
+    cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
+    objects = (resting("sugar_box"), resting("pudding_box", xy=(0.2, 0.0)))
+    X_TO_place = objects[0].X_TO.moved((0.0, -0.2, 0.001))
+    plan = PickPlacePlanner(cell, PlannerConfig(optimise=False)).plan(objects, "sugar_box", X_TO_place)
+    assert isinstance(plan, Plan)
+    done = StationSimulation(cell, scene_of(*objects)).execute(plan)
+    assert done.poses["sugar_box"].p == pytest.approx(objects[0].X_TO.moved((0.0, -0.2, 0.0)).p, abs=2e-3)
+
+
+def test_a_camera_is_not_called_like_another_part() -> None:
+    camera = "{pose: {translation: [0, 0, 1.6], rpy_deg: [180, 0, 0]}}"
+    with pytest.raises(InputError, match=r"cameras\.pedestal: a camera's name; allowed are names that differ from tray"):
+        cell_with(f"cameras={{pedestal: {camera}, side: {camera}}}")
+    assert cell_with(f"cameras={{camera: {camera}}}").camera == cell_with().camera

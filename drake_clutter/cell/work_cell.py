@@ -60,6 +60,8 @@ class WorkCell(Model):
     def _first_sees_support(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
         if unfit := [name for name in cameras if not name.isidentifier()]:
             raise refused(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
+        if taken := [name for name in cameras if name in _RESERVED and name != "camera"]:
+            raise refused(f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED)}")
         name, camera = next(iter(cameras.items()))
         if "support" in info.data and not camera.sees(info.data["support"]):
             raise refused(f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image")

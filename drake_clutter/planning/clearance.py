@@ -18,7 +18,7 @@ from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.cell_plant import Arm, add_work_cell, fixture_name, joint_numbers
-from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+from drake_clutter.simulation.plant import add_scene_plant, rigid_transform, support_body
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class ClearanceScene:
         self._q = self.plant.GetPositions(self._context)
         self._at, self._v_at = joint_numbers(self.plant, self._arm)
         self._moved_by = self._joints_by_geometry(load_robot(cell.robot).links)
-        self._fixed = (*self._arm.fixed, self.plant.GetBodyByName("tray"))
+        self._fixed = (*self._arm.fixed, support_body(self.plant))
         self._names = self._name_geometries()
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         standing = self._geometries(*self._fixed, *self._bodies.values())

@@ -60,6 +60,11 @@ class ScenePlant:
         return {n: float(np.linalg.norm(self.bodies[n].EvalSpatialVelocityInWorld(context).translational())) for n in names}
 
 
+def support_body(plant: MultibodyPlant) -> RigidBody:
+    """The support's body; others may have its name in models of their own."""
+    return plant.GetBodyByName("tray", plant.GetModelInstanceByName("tray"))
+
+
 def add_scene_plant(
     builder: DiagramBuilder,
     objects: Sequence[tuple[str, ObjectClass]],

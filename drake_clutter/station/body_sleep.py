@@ -14,6 +14,7 @@ from drake_clutter.planning.plan import Plan
 from drake_clutter.scenes.geometry import carried, touching_groups
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.plant import support_body
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import DWELL, CommandSchedule
 from drake_clutter.station.gripper_actuator import GraspStatus
@@ -146,7 +147,7 @@ class BodySleepManager:
         station, plant = self._station, self._station.plant
         context = station.plant_context(root)
         locked, fixed = GeometrySet(), GeometrySet()
-        for body in (*station.arm.fixed, plant.GetBodyByName("tray")):
+        for body in (*station.arm.fixed, support_body(plant)):
             fixed.Add(plant.GetCollisionGeometriesForBody(body))
         for name, joint in station.free_joints.items():
             if name in awake:
