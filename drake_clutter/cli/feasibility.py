@@ -1,6 +1,5 @@
 """`drake-clutter feasibility`."""
 
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -51,14 +50,12 @@ def feasibility(
     """Ask an arm about every legal move of scenes: tables, pictures and a report. A study that was stopped goes on."""
     from drake_clutter.commands import feasibility as command
 
-    stems = Counter(path.stem for path in [*(cell or []), *(arm or [])])
-    if twice := [name for name, count in stems.items() if count > 1]:
-        raise InputError(f"--cell, --arm: {twice[0]} is there twice; allowed are files with names of their own")
     refuse_support(settings)
     files = command.scene_files(scenes)
     _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
     command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])
-    cells = {path.stem: load_world(config, path, settings).cell for path in cell or []}
+    support = world.cell.support
+    cells = {path.stem: load_world(config, path, settings).cell.with_support(support) for path in cell or []}
     setups = command.setups(
         [_numbers("--base", text) for text in base or []],
         [_numbers("--tray", text) for text in tray or []],

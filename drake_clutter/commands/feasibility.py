@@ -116,12 +116,12 @@ def setups(
         trays: X_BT as x, y, z (m) and yaw (deg), without roll and pitch.
         files: YAML with fields of `WorkCell` over those of the default; whole cells if they name
             a robot's model.
-        default: A cell.
+        default: A cell; all have its support, which is the scenes'.
 
     Raises:
         InputError: A file that is none, or a robot that cannot be loaded.
     """
-    found = {path.stem: _cell(path, default) for path in files}
+    found = {path.stem: _cell(path, default).with_support(default.support) for path in files}
     roll, pitch, _ = default.robot.base.rpy_deg
     for x, y, z, yaw in bases:
         base = PoseSpec(translation=(x, y, z), rpy_deg=(roll, pitch, yaw))
