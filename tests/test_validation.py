@@ -226,8 +226,9 @@ def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path
     file.write_text(yaml_text({"cell": read_yaml(path, "a cell")}))
     config = load_config(file)
     assert config.cell.robot == load_cell(path).robot
-    own = load_typed(config, settings=["cell.robot.model=own.sdf"]).cell.robot
-    assert own == config.cell.robot.model_copy(update={"model": "own.sdf"})
+    other = "package://drake_clutter_models/robots/ur3e.sdf"
+    changed = load_typed(config, settings=[f"cell.robot.model={other}"]).cell.robot
+    assert changed == config.cell.robot.model_copy(update={"model": other})
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
