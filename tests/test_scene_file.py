@@ -389,14 +389,13 @@ def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Pa
     ],
 )
 def test_a_graph_that_no_derivation_ends_with_is_refused(graph: str, tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(ONE_BOX + f"graph: {graph}\n")
+    (path := tmp_path / "scene.yaml").write_text(ONE_BOX + f"graph: {graph}\n")
     with pytest.raises(InputError, match=r"scene\.yaml: graph"):
         load_scene(path, CATALOGUE)
 
 
 def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(ONE_BOX.replace("name: a", "name: a, node: 0") + "graph: {nodes: [{id: 0, kind: tray}], edges: []}\n")
+    graph = "graph: {nodes: [{id: 0, kind: tray}], edges: []}\n"
+    (path := tmp_path / "scene.yaml").write_text(ONE_BOX.replace("name: a", "name: a, node: 0") + graph)
     with pytest.raises(InputError, match="node"):
         load_scene(path, CATALOGUE)
