@@ -91,8 +91,7 @@ def test_a_file_holds_the_cell_that_it_was_made_with(tmp_path: Path) -> None:
 
 
 def test_a_file_of_version_1_names_the_tray_alone(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(ONE_BOX + "tray: {side: 0.5}\n")
+    (path := tmp_path / "scene.yaml").write_text(ONE_BOX + "tray: {side: 0.5}\n")
     read = load_scene(path, CATALOGUE)
     assert read.scene.support == read.cell.support == tray(0.5)
     assert read.cell == DEFAULT_CELL.with_support(tray(0.5))
@@ -302,8 +301,7 @@ def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> 
     ids=lambda content: repr(content)[:20],
 )
 def test_what_is_no_document_is_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_bytes(content)
+    (path := tmp_path / "scene.yaml").write_bytes(content)
     with pytest.raises(InputError) as refusal:
         load_scene(path, CATALOGUE)
     assert str(refusal.value).startswith(str(path))
