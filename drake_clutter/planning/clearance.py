@@ -71,6 +71,7 @@ class ClearanceScene:
         self._moved_by = self._joints_by_geometry(load_robot(cell.robot).links)
         self._fixed = (*self._arm.fixed, support_body(self.plant))
         self._names = self._name_geometries()
+        self._parts = {geometry: (name, geometry in self._moved_by) for geometry, name in self._names.items()}
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
@@ -164,12 +165,9 @@ class ClearanceScene:
         return found
 
     def _named(self, pair: SignedDistancePair) -> Clearance:
-        first, second = self._names[pair.id_A], self._names[pair.id_B]
-        moves = pair.id_A in self._moved_by or self._is_held(pair.id_A)
+        (first, of_arm), (second, _) = self._parts[pair.id_A], self._parts[pair.id_B]
+        moves = of_arm or (self._held is not None and first == self._held[0])
         return Clearance(float(pair.distance), (first, second) if moves else (second, first))
-
-    def _is_held(self, geometry: GeometryId) -> bool:
-        return self._held is not None and geometry not in self._moved_by and self._names[geometry] == self._held[0]
 
     def close(self, q: Floats, within: float) -> list[Clearance]:
         """At joint positions (n,): all that is closer than `within`, m."""
@@ -212,4 +210,7 @@ class ClearanceScene:
         return np.asarray(J[:, self._v_at])
 
     def _joints_that_move(self, geometry: GeometryId) -> int:
-        return len(self._at) if self._is_held(geometry) else self._moved_by.get(geometry, 0)
+        name, of_arm = self._parts[geometry]
+        if of_arm:
+            return self._moved_by[geometry]
+        return len(self._at) if self._held is not None and name == self._held[0] else 0
