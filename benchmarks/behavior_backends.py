@@ -1,4 +1,4 @@
-"""What the package does with a case, told line by line: one function for each backend.
+"""What the package does with a case, as lines of text: one function for each backend.
 
 All that `behavior_hashes.py` asks of the package is here; when interfaces change, this follows.
 """
@@ -46,7 +46,7 @@ class Case:
 
     Attributes:
         scenes: name of a frozen set; of a generated scene, of its generator.
-        number: of the scene in the set or batch; it seeds all chances.
+        number: of the scene in the set or batch; the seed of every random choice.
         agent: the explorer, or "".
     """
 
@@ -60,7 +60,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Line:
-    """One move, or what else is told of an episode or scene.
+    """One move, or another fact of an episode or scene.
 
     Attributes:
         words: readable.
@@ -230,8 +230,8 @@ def _episode(
 
 def _move(step: Step) -> Line:
     outcome = step.outcome
-    told = [outcome.result.value, outcome.detail, outcome.instability, outcome.cannot_judge]
-    words = f"{step.move}: {'; '.join(str(text) for text in told if text)}"
+    texts = [outcome.result.value, outcome.detail, outcome.instability, outcome.cannot_judge]
+    words = f"{step.move}: {'; '.join(str(text) for text in texts if text)}"
     words += f"; found {_named(step.newly_found)}"
     parts = {"poses": _numbers(outcome.scene.poses.values())}
     if outcome.released is not None:

@@ -106,9 +106,9 @@ class Player:
 
     def __call__(self, case: Case) -> Played:
         """Plays one."""
-        begun = time.perf_counter()
+        start = time.perf_counter()
         lines = tuple(str(line) for line in self._play(case))
-        return Played(lines, time.perf_counter() - begun)
+        return Played(lines, time.perf_counter() - start)
 
 
 Entry = dict[str, Any]
@@ -166,7 +166,7 @@ def main(
         if only and name not in only:
             continue
         recorded, entries = record["backends"].get(name, []), list[Entry]()
-        cases, begun = backend.cases()[:count], time.perf_counter()
+        cases, start = backend.cases()[:count], time.perf_counter()
         fresh = backend.fresh_after
         made = map_ordered(partial(Player, name), cases, workers=workers, fresh_after=fresh)
         for case, played in zip(cases, made, strict=True):
@@ -176,7 +176,7 @@ def main(
                 different.append(f"{name}: {case}: {found}")
             head = f"{name} {len(entries)}/{len(cases)}: {case}, {played.seconds:.1f} s"
             print(f"{head}: {found or ('played' if write else 'equal')}", flush=True)
-        print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
+        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
         if write:
             record["backends"][name] = entries + recorded[len(entries) :]
             record["about"][name] = about()
