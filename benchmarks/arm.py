@@ -93,7 +93,11 @@ def judged(carried: PickPlaceResult) -> str:
         return "dropped"
     if max(carried.displaced.values(), default=0.0) > UNDISTURBED:
         return "disturbed others"
-    return "carried out" if carried.place_error < PLACED_WITHIN and carried.turn_error < TURNED_WITHIN else "misplaced"
+    return (
+        "carried out"
+        if carried.place_error < PLACED_WITHIN and carried.turn_error < TURNED_WITHIN
+        else "misplaced"
+    )
 
 
 def teleported_falls(scene: Scene, plan: Plan) -> bool:
@@ -101,7 +105,10 @@ def teleported_falls(scene: Scene, plan: Plan) -> bool:
     after = scene.at({plan.pick: plan.X_TO_place})
     verdict = DrakeJudge(WORLD).judge(after, np.random.default_rng(0))
     strict = replace(WORLD.settle, max_displacement=UNDISTURBED, max_tilt_deg=3.0)
-    return not verdict.stable or worst_fall(after.objects, after.at(verdict.settled), strict) is not None
+    return (
+        not verdict.stable
+        or worst_fall(after.objects, after.at(verdict.settled), strict) is not None
+    )
 
 
 class Scenes:
@@ -135,8 +142,13 @@ class Mover:
         observation = self._detector.look(scene).observation
         moves = legal_moves(observation)
         for executor in (self._executor, self._sure):
-            executor.planner(scene.support).clearance_scene(scene.objects)  # as when moves follow each other
-        return [self._tried(scene, moves[k], rng, observation) for k in rng.permutation(len(moves))[:MOVES_PER_SCENE]]
+            executor.planner(scene.support).clearance_scene(
+                scene.objects
+            )  # as when moves follow each other
+        return [
+            self._tried(scene, moves[k], rng, observation)
+            for k in rng.permutation(len(moves))[:MOVES_PER_SCENE]
+        ]
 
     def _tried(self, scene: Scene, move: Any, rng: np.random.Generator, observation: Any) -> Trial:
         name = scene[move.pick].object_class.name
@@ -147,7 +159,12 @@ class Mover:
         sure = self._sure.planner(scene.support).plan(scene.objects, move.pick, X_TO)
         plan = planner.plan(scene.objects, move.pick, X_TO)
         if isinstance(plan, NoPlan):
-            return Trial(str(plan.reason.value), planner.ends_exist(scene.objects, move.pick, X_TO), name, sure.seconds)
+            return Trial(
+                str(plan.reason.value),
+                planner.ends_exist(scene.objects, move.pick, X_TO),
+                name,
+                sure.seconds,
+            )
         begun = time.perf_counter()
         carried = StationSimulation(default_cell(), scene).execute(plan)
         wall, result = time.perf_counter() - begun, judged(carried)
@@ -179,7 +196,11 @@ def quantiles(values: Sequence[float]) -> dict[str, float]:
 
 def share(successes: int, count: int) -> dict[str, Any]:
     """With its 95 % interval."""
-    return {"of": count, "share": successes / count if count else None, "interval": wilson_interval(successes, count)}
+    return {
+        "of": count,
+        "share": successes / count if count else None,
+        "interval": wilson_interval(successes, count),
+    }
 
 
 def moves(
@@ -192,7 +213,9 @@ def moves(
     """Plans and carries out random legal moves."""
     scenes = range(math.ceil(count / MOVES_PER_SCENE))
     done = map_ordered(partial(Mover, nodes, seed), scenes, workers=workers)
-    trials = [trial for found in track(done, "scenes", len(scenes), console=console) for trial in found][:count]
+    trials = [
+        trial for found in track(done, "scenes", len(scenes), console=console) for trial in found
+    ][:count]
     planned = [t for t in trials if not math.isnan(t.motion)]
     fair = [t for t in planned if not t.unstable_anyway]
     good = sum(t.result == "carried out" for t in fair)
@@ -202,9 +225,13 @@ def moves(
         "cell": to_plain(default_cell()),
         "planner": asdict(PlannerConfig()),
         "results": Counter(t.result for t in trials),
-        "not_planned_by_class": Counter(f"{t.object_class}: {t.result}" for t in trials if math.isnan(t.motion)),
+        "not_planned_by_class": Counter(
+            f"{t.object_class}: {t.result}" for t in trials if math.isnan(t.motion)
+        ),
         "planned_of_possible": share(len(planned), sum(t.possible for t in trials)),
-        "carried_out_of_planned": share(sum(t.result == "carried out" for t in planned), len(planned)),
+        "carried_out_of_planned": share(
+            sum(t.result == "carried out" for t in planned), len(planned)
+        ),
         "carried_out_unless_unstable_anyway": share(good, len(fair)),
         "sure_planning_s": quantiles([t.sure_planning for t in planned]),
         "planning_s": quantiles([t.planning for t in planned]),
@@ -231,7 +258,11 @@ def parts(
 ) -> None:
     """Times the parts of planning and simulating a move, one by one, on one core."""
     detector, spent = LabelDetector(WORLD.cell.camera), dict[str, list[float]]()
-    sure, executor, scenes = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False)), ArmExecutor(WORLD), Scenes(25, seed)
+    sure, executor, scenes = (
+        ArmExecutor(WORLD, planner=PlannerConfig(optimise=False)),
+        ArmExecutor(WORLD),
+        Scenes(25, seed),
+    )
 
     def timed_as(name: str, call: Callable[[], Result], of: int = 1) -> Result:
         begun = time.perf_counter()
@@ -259,11 +290,23 @@ def parts(
         around = planner.clearance_scene(scene.objects)
         q = sampled(plan.phases[1].trajectory)
         poses = planner.tool.pose(q)
-        timed_as("forward kinematics of a pose", lambda: planner.tool.robot.forward_kinematics(q), len(q))
-        timed_as("inverse kinematics of a pose, eight branches", lambda: planner.tool.solve(poses), len(q))
-        timed_as("distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q))
-        timed_as("distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q))
-        timed_as("timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload()))
+        timed_as(
+            "forward kinematics of a pose", lambda: planner.tool.robot.forward_kinematics(q), len(q)
+        )
+        timed_as(
+            "inverse kinematics of a pose, eight branches",
+            lambda: planner.tool.solve(poses),
+            len(q),
+        )
+        timed_as(
+            "distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q)
+        )
+        timed_as(
+            "distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q)
+        )
+        timed_as(
+            "timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload())
+        )
         simulation = timed_as("simulation, built", lambda: StationSimulation(default_cell(), scene))
         timed_as("simulation, run", lambda: simulation.execute(plan))
         return True
@@ -287,7 +330,11 @@ def holds(
     seed: Annotated[int, typer.Option(help="Same seed, same moves.")] = 0,
 ) -> None:
     """Carries the same moves out with both ways to hold, of an object alone and in scenes of 25 nodes."""
-    detector, executor, rows = LabelDetector(WORLD.cell.camera), ArmExecutor(WORLD), list[dict[str, Any]]()
+    detector, executor, rows = (
+        LabelDetector(WORLD.cell.camera),
+        ArmExecutor(WORLD),
+        list[dict[str, Any]](),
+    )
     for kind, nodes in (("one object", 4), ("25 nodes", 25)):
         scenes, plans, number = Scenes(nodes, seed), list[tuple[Scene, Plan]](), 0
         while len(plans) < count:
@@ -319,7 +366,11 @@ def holds(
                     "wall_s": quantiles(walls),
                 }
             )
-    fields = {"command": f"benchmarks/arm.py holds --count {count} --seed {seed}", "commit": git_commit(), "rows": rows}
+    fields = {
+        "command": f"benchmarks/arm.py holds --count {count} --seed {seed}",
+        "commit": git_commit(),
+        "rows": rows,
+    }
     write_json(out, fields)
     console.print_json(data=fields)
 

@@ -40,8 +40,12 @@ def main(
     seed: int = 0,
     workers: int = 1,
     objects: str = "ycb7",
-    nodes: Annotated[list[int] | None, typer.Option(help="Sizes; the paper's four if not given.")] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML with fields to put over the defaults.")] = None,
+    nodes: Annotated[
+        list[int] | None, typer.Option(help="Sizes; the paper's four if not given.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML with fields to put over the defaults.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
 ) -> None:
     """Prints the table, and hidden objects by threshold, and writes both with what is needed to repeat them.
@@ -49,12 +53,20 @@ def main(
     A run that was stopped goes on with the sizes that its file lacks.
     """
     world = load_config(config)
-    head = {"count": count, "seed": seed, "objects": objects, "workers": workers, "config": config_yaml(world)}
+    head = {
+        "count": count,
+        "seed": seed,
+        "objects": objects,
+        "workers": workers,
+        "config": config_yaml(world),
+    }
     rows: list[dict[str, Any]] = []
     if out is not None and out.exists():
         earlier = json.loads(out.read_text())
         if {key: earlier[key] for key in head} != head:
-            raise InputError(f"--out {out}: holds results of other options; give the same options or another file")
+            raise InputError(
+                f"--out {out}: holds results of other options; give the same options or another file"
+            )
         rows = earlier["rows"]
     for size in nodes or PAPER_RG:
         if any(row["nodes"] == size for row in rows):
@@ -65,16 +77,29 @@ def main(
         made = list(track(scenes, f"{size} nodes", total=count, console=Console(stderr=True)))
         row = summarise(job, [(m.scene, m.verdict) for m in made])
         shares = [m.verdict.visible_share.values() for m in made if m.verdict.stable]
-        row["hidden_by_threshold"] = {str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS}
+        row["hidden_by_threshold"] = {
+            str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS
+        }
         failures = sum((m.layout_failures for m in made), start=type(made[0].layout_failures)())
-        row |= {"layout_failures": dict(failures), "seconds": time.monotonic() - start, "commit": git_commit()}
+        row |= {
+            "layout_failures": dict(failures),
+            "seconds": time.monotonic() - start,
+            "commit": git_commit(),
+        }
         rows.append(row)
         if out is not None:
             write_json(out, head | {"rows": rows})
-    table = Table("nodes", "stable", "paper", "hidden", "paper", *(f"< {t:g}" for t in THRESHOLDS), "s")
+    table = Table(
+        "nodes", "stable", "paper", "hidden", "paper", *(f"< {t:g}" for t in THRESHOLDS), "s"
+    )
     for row in rows:
         paper = PAPER_RG.get(row["nodes"], (float("nan"),) * 2)
-        cells = [f"{row['stability_rate']:.3f}", f"{paper[0]:.2f}", f"{row['hidden_mean']:.2f}", f"{paper[1]:.2f}"]
+        cells = [
+            f"{row['stability_rate']:.3f}",
+            f"{paper[0]:.2f}",
+            f"{row['hidden_mean']:.2f}",
+            f"{paper[1]:.2f}",
+        ]
         cells += [f"{h:.2f}" for h in row["hidden_by_threshold"].values()]
         table.add_row(str(row["nodes"]), *cells, f"{row['seconds']:.0f}")
     Console().print(table)

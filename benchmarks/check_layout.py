@@ -39,7 +39,9 @@ class _Layouts:
         return "laid out", deepest_penetration(scene.objects)[0]
 
 
-def main(count: Annotated[int, typer.Option(help="Graphs to lay out.")] = 10_000, workers: int = 1) -> None:
+def main(
+    count: Annotated[int, typer.Option(help="Graphs to lay out.")] = 10_000, workers: int = 1
+) -> None:
     """Prints how many were laid out and the deepest penetration among them; fails if any two objects overlap."""
     results: Counter[str] = Counter()
     deepest = -np.inf

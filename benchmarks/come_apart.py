@@ -30,34 +30,59 @@ OUT = Path(__file__).parent / "results" / "come_apart.json"
 
 def counted(folder: Path) -> dict[str, Any]:
     """A folder's row."""
-    job, catalogue, judge = json.loads((folder / JOB_FILE).read_text()), load_catalogue(), FastJudge(ClutterConfig())
+    job, catalogue, judge = (
+        json.loads((folder / JOB_FILE).read_text()),
+        load_catalogue(),
+        FastJudge(ClutterConfig()),
+    )
     counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
     answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(answers):
         file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
         if file.verdict is not None and file.verdict.stable:
-            counts[judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value] += 1
+            counts[
+                judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value
+            ] += 1
     told: dict[str, Any] = {"agent": job["agent"], "objects": job["objects"], "nodes": job["nodes"]}
     told |= {"seed": job["seed"], "scenes": len(answers)}
     for name, apart in (("comes_apart", True), ("does_not", False)):
         solved, total = counts[apart, True], counts[apart, True] + counts[apart, False]
-        told[name] = {"stable": total, "solvable": solved, "solvable_ci95": wilson_interval(solved, total)}
+        told[name] = {
+            "stable": total,
+            "solvable": solved,
+            "solvable_ci95": wilson_interval(solved, total),
+        }
     return told
 
 
 def main(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Of `drake-clutter generate`.")],
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Of `drake-clutter generate`.")
+    ],
     out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
 ) -> None:
     """Counts, and prints a table."""
     rows = [counted(folder) for folder in folders]
     write_json(out, {"commit": git_commit(), "rows": rows})
     table = Table(
-        "agent", "objects", "nodes", "scenes", "stable, come apart", "of these solvable", "stable, do not", "of these solvable"
+        "agent",
+        "objects",
+        "nodes",
+        "scenes",
+        "stable, come apart",
+        "of these solvable",
+        "stable, do not",
+        "of these solvable",
     )
     for row in rows:
-        cells = [f"{row[name][key]}" for name in ("comes_apart", "does_not") for key in ("stable", "solvable")]
-        table.add_row(Path(row["agent"]).stem, row["objects"], str(row["nodes"]), str(row["scenes"]), *cells)
+        cells = [
+            f"{row[name][key]}"
+            for name in ("comes_apart", "does_not")
+            for key in ("stable", "solvable")
+        ]
+        table.add_row(
+            Path(row["agent"]).stem, row["objects"], str(row["nodes"]), str(row["scenes"]), *cells
+        )
     Console().print(table)
 
 

@@ -97,7 +97,10 @@ class DrakeVerdicts:
         fields: dict[str, Any] = {"index": index, "groups": groups}
         if all(group["fall"] is None for group in groups):
             shares = self._judge.look(scene.at(settled)).visible_share
-            fields["settled"] = {name: [shares[name], *pose.translation, *pose.quaternion] for name, pose in settled.items()}
+            fields["settled"] = {
+                name: [shares[name], *pose.translation, *pose.quaternion]
+                for name, pose in settled.items()
+            }
         return fields
 
 
@@ -127,7 +130,11 @@ class _Factory:
 
 
 def _records(
-    path: Path, head: dict[str, Any], make_worker: Callable[[], Callable[[Any], Any]], items: Sequence[Any], pool: Pool
+    path: Path,
+    head: dict[str, Any],
+    make_worker: Callable[[], Callable[[Any], Any]],
+    items: Sequence[Any],
+    pool: Pool,
 ) -> Iterator[dict[str, Any]]:
     """The head, then a record per item."""
 
@@ -139,7 +146,10 @@ def _records(
 
 def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:
     """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch."""
-    path = folder / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
+    path = (
+        folder
+        / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
+    )
     head = asdict(batch) | {"config": config_yaml(config_of(batch))}
     yield from _records(path, head, _Factory(batch), range(count), pool)
 
@@ -166,7 +176,10 @@ class DrakeMoves:
 
     def __init__(self) -> None:
         config = ClutterConfig()
-        self._executor, self._detector = SettleExecutor(config, follow_falls=False), LabelDetector(config.cell.camera)
+        self._executor, self._detector = (
+            SettleExecutor(config, follow_falls=False),
+            LabelDetector(config.cell.camera),
+        )
 
     def __call__(self, item: RandomMove) -> dict[str, Any]:
         """The record of a move."""
@@ -191,7 +204,9 @@ class DrakeMoves:
             "draw": item.draw,
             "move": [move.pick, move.place],
             "result": outcome.result.value,
-            "fall": [fall.reason.value, fall.object, fall.displacement, fall.tilt] if fall else None,
+            "fall": [fall.reason.value, fall.object, fall.displacement, fall.tilt]
+            if fall
+            else None,
             "place": [*place.translation, *place.quaternion] if place else None,
         }
 
@@ -207,17 +222,32 @@ def move_rng(item: RandomMove) -> np.random.Generator:
     return item_rng(item.batch.seed, item.index, 3, item.draw)
 
 
-def drake_moves(batch: Batch, scenes: int, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:
+def drake_moves(
+    batch: Batch, scenes: int, count: int, folder: Path, pool: Pool
+) -> Iterator[dict[str, Any]]:
     """A head, then `count` random moves, spread over the batch's first `scenes` scenes that Drake calls stable."""
     stable = [r for r in list(drake_verdicts(batch, scenes, folder, pool))[1:] if "settled" in r]
-    items = [RandomMove(batch, stable[k % len(stable)]["index"], k // len(stable), stable[k % len(stable)]) for k in range(count)]
+    items = [
+        RandomMove(
+            batch, stable[k % len(stable)]["index"], k // len(stable), stable[k % len(stable)]
+        )
+        for k in range(count)
+    ]
     head = asdict(batch) | {"config": config_yaml(config_of(batch)), "scenes": scenes}
-    yield from _records(folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl", head, DrakeMoves, items, pool)
+    yield from _records(
+        folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl",
+        head,
+        DrakeMoves,
+        items,
+        pool,
+    )
 
 
 def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
     """The scene as it came to rest; the record is a stable one's."""
-    return scene.at({name: Pose(tuple(v[1:4]), tuple(v[4:])) for name, v in record["settled"].items()})
+    return scene.at(
+        {name: Pose(tuple(v[1:4]), tuple(v[4:])) for name, v in record["settled"].items()}
+    )
 
 
 def hidden(record: dict[str, Any], visibility_threshold: float) -> tuple[str, ...]:
@@ -230,7 +260,11 @@ def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:
     pool = Pool(workers, ray)
     for batch, count in BATCHES.items():
         if batch.variant == "default":
-            show(drake_verdicts(batch, count, folder, pool), f"{batch.objects}, {batch.nodes} nodes", count)
+            show(
+                drake_verdicts(batch, count, folder, pool),
+                f"{batch.objects}, {batch.nodes} nodes",
+                count,
+            )
     (batch, scenes), *_ = BATCHES.items()
     show(drake_moves(batch, scenes, MOVES, folder, pool), "moves", MOVES)
     for batch, count in BATCHES.items():

@@ -85,8 +85,12 @@ def measure(
     episodes = list[dict[str, Any]]()
     for number in track(EPISODES[1], "episodes", console=Console(stderr=True)):
         start = time.perf_counter()
-        task = explore(_frozen(number, config), EPISODES[2], "arm", 20, number, config, lambda _: None)
-        episodes.append({"scene": number, "moves": len(task.steps), "seconds": time.perf_counter() - start})
+        task = explore(
+            _frozen(number, config), EPISODES[2], "arm", 20, number, config, lambda _: None
+        )
+        episodes.append(
+            {"scene": number, "moves": len(task.steps), "seconds": time.perf_counter() - start}
+        )
     write_json(
         out,
         {
@@ -96,21 +100,36 @@ def measure(
             "seed": SEED,
             "nodes": NODES,
             "count": count,
-            "settle_seconds": {"median": float(np.median(seconds)), "mean": float(np.mean(seconds))},
+            "settle_seconds": {
+                "median": float(np.median(seconds)),
+                "mean": float(np.mean(seconds)),
+            },
             "step_ms": _step_milliseconds(config),
             "episodes": episodes,
-            "episode_seconds_per_move": sum(e["seconds"] for e in episodes) / sum(e["moves"] for e in episodes),
+            "episode_seconds_per_move": sum(e["seconds"] for e in episodes)
+            / sum(e["moves"] for e in episodes),
             "verdicts": verdicts,
         },
     )
 
 
 @app.command()
-def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measure` wrote; the first is the reference.")]) -> None:
+def compare(
+    files: Annotated[
+        list[Path], typer.Argument(help="Files that `measure` wrote; the first is the reference.")
+    ],
+) -> None:
     """Print how often verdicts agree with those of the first file, and what things cost."""
     found = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     table = Table(
-        "Drake", "Python", "stable", "same stable", "same hidden", "step, ms (asleep, awake)", "settle, s", "arm, s per move"
+        "Drake",
+        "Python",
+        "stable",
+        "same stable",
+        "same hidden",
+        "step, ms (asleep, awake)",
+        "settle, s",
+        "arm, s per move",
     )
     for one in found:
         pairs = list(zip(found[0]["verdicts"], one["verdicts"], strict=True))
@@ -120,7 +139,11 @@ def compare(files: Annotated[list[Path], typer.Argument(help="Files that `measur
         stable = np.mean([verdict["stable"] for verdict in one["verdicts"]])
         numbers = (f"{stable:.3f}", f"{same:.4f}", f"{hidden:.4f}")
         step = f"{one['step_ms']['asleep']:.2f}, {one['step_ms']['awake']:.2f}"
-        costs = (step, f"{one['settle_seconds']['median']:.3f}", f"{one['episode_seconds_per_move']:.2f}")
+        costs = (
+            step,
+            f"{one['settle_seconds']['median']:.3f}",
+            f"{one['episode_seconds_per_move']:.2f}",
+        )
         table.add_row(one["drake"], one["python"], *numbers, *costs)
     Console().print(table)
 

@@ -37,7 +37,10 @@ PARTS: dict[str, tuple[Any, str]] = {
 
 def measured(privileged: bool, episodes: int, seconds: dict[str, float]) -> dict[str, Any]:
     """Random moves that are allowed, until the episodes are over; the same ones whenever this is measured."""
-    environment, draw = ClutterExploration(shipped_path(SCENES), privileged=privileged), np.random.default_rng(0)
+    environment, draw = (
+        ClutterExploration(shipped_path(SCENES), privileged=privileged),
+        np.random.default_rng(0),
+    )
     moves, told = 0, hashlib.sha256()
     for episode in range(-1, episodes):
         if episode == 0:  # what is compiled and read at first is not counted
@@ -47,7 +50,9 @@ def measured(privileged: bool, episodes: int, seconds: dict[str, float]) -> dict
         over = out_of_moves = False
         while not (over or out_of_moves):
             allowed = np.argwhere(observation["allowed"])
-            observation, _, over, out_of_moves, _ = environment.step(allowed[draw.integers(len(allowed))])
+            observation, _, over, out_of_moves, _ = environment.step(
+                allowed[draw.integers(len(allowed))]
+            )
             moves += 1
             for array in observation.values():
                 told.update(array.tobytes())
@@ -71,7 +76,10 @@ def main(
     for name, (owner, method) in PARTS.items():
         setattr(owner, method, timed(getattr(owner, method), name, seconds))
     rows = [measured(privileged, episodes, seconds) for privileged in (False, True)]
-    heads = [f"{'all objects' if row['privileged'] else 'K_t'}: {row['moves']} moves, {row['episodes']} scenes" for row in rows]
+    heads = [
+        f"{'all objects' if row['privileged'] else 'K_t'}: {row['moves']} moves, {row['episodes']} scenes"
+        for row in rows
+    ]
     table = Table("", *heads)
     table.add_row("ms for a move", *[f"{row['ms_a_move']:.1f}" for row in rows])
     table.add_row("ms for a new scene", *[f"{row['ms_a_scene']:.1f}" for row in rows])

@@ -52,7 +52,11 @@ def measured(threads: int, steps: int) -> dict[str, Any]:
     classes = load_catalogue().object_set("ycb7")
     learning = SoftQConfig(temperature=0.25)
     learner = SoftQLearner(
-        lambda: ClutterGeneration(classes, GenerationTask(), ClutterConfig()), learning, 0, torch.device("cpu"), threads
+        lambda: ClutterGeneration(classes, GenerationTask(), ClutterConfig()),
+        learning,
+        0,
+        torch.device("cpu"),
+        threads,
     )
 
     def run() -> float:
@@ -73,22 +77,36 @@ def measured(threads: int, steps: int) -> dict[str, Any]:
     finally:
         for name, (owner, method) in TIMED.items():
             setattr(owner, method, originals[name])
-    return {"threads": threads, "steps_per_s": steps / whole, "seconds": parts, "parts": {name: seconds[name] for name in TIMED}}
+    return {
+        "threads": threads,
+        "steps_per_s": steps / whole,
+        "seconds": parts,
+        "parts": {name: seconds[name] for name in TIMED},
+    }
 
 
 def main(
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    steps: Annotated[int, typer.Option(help="Of the environments, in each of three rounds.")] = 8000,
+    steps: Annotated[
+        int, typer.Option(help="Of the environments, in each of three rounds.")
+    ] = 8000,
 ) -> None:
     """Measures and prints; with nothing else running."""
     one_thread_per_operation()
     rows = [measured(threads, steps) for threads in range(1, PARTS + 1)]
-    table = Table("part, share of the time", *[f"{row['threads']} thread(s), {row['steps_per_s']:.0f} steps/s" for row in rows])
+    table = Table(
+        "part, share of the time",
+        *[f"{row['threads']} thread(s), {row['steps_per_s']:.0f} steps/s" for row in rows],
+    )
     for name in TIMED:
         table.add_row(name, *[f"{row['parts'][name] / row['seconds']:.2f}" for row in rows])
     Console().print(table)
     if out is not None:
-        machine = {"processor": platform.processor(), "system": platform.platform(), "torch": torch.__version__}
+        machine = {
+            "processor": platform.processor(),
+            "system": platform.platform(),
+            "torch": torch.__version__,
+        }
         write_json(out, {"steps": steps, "rows": rows, "machine": machine, "commit": git_commit()})
 
 

@@ -75,9 +75,13 @@ class Confusion:
             "cannot_judge_share": 1 - count / total,
             "false_stable_rate": false_stable / count,
             "false_stable_of_falling": false_stable / falling if falling else None,
-            "false_stable_of_called_stable": false_stable / called_stable if called_stable else None,
+            "false_stable_of_called_stable": false_stable / called_stable
+            if called_stable
+            else None,
             "false_fall_rate": judged["falls", "stable"] / count,
-            "confusion": {f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(self.pairs.items())},
+            "confusion": {
+                f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(self.pairs.items())
+            },
         }
 
 
@@ -92,7 +96,9 @@ class Disagreement:
 
 def said(found: Any) -> str:
     """One word for what a judge found."""
-    return "cannot judge" if isinstance(found, CannotJudge) else "stable" if found is None else "falls"
+    return (
+        "cannot judge" if isinstance(found, CannotJudge) else "stable" if found is None else "falls"
+    )
 
 
 def compare_scenes(
@@ -121,7 +127,12 @@ def compare_scenes(
             whole = judge.stability(part)
             if isinstance(whole, CannotJudge) and whole.reason is CannotJudgeReason.FLOATING:
                 # What it misses stands in another group: asked again together with all that stands.
-                standing = tuple(scene[n] for other in record["groups"] if not other["fall"] for n in other["objects"])
+                standing = tuple(
+                    scene[n]
+                    for other in record["groups"]
+                    if not other["fall"]
+                    for n in other["objects"]
+                )
                 whole = judge.stability(replace(scene, objects=part.objects + standing))
             pair = said(whole), "stable" if fall is None else "falls"
             stacks.pairs[pair] += 1
@@ -132,37 +143,52 @@ def compare_scenes(
                 fast_reasons[whole.reason.value].pairs[pair] += 1
             if pair[0] not in ("cannot judge", pair[1]):
                 why = f"falls: {fall[0]}" if fall else "stable"
-                disagreements.append(Disagreement(part, "stable" if whole is None else str(whole.reason.value), why))
+                disagreements.append(
+                    Disagreement(part, "stable" if whole is None else str(whole.reason.value), why)
+                )
     row = scenes.row() | {
         "hidden_agreement": same_hidden / both_stable if both_stable else None,
         "hidden_agreement_ci95": wilson_interval(same_hidden, both_stable),
         "stacks": stacks.row(),
     }
     details = {
-        "by_drakes_reason": {reason: dict_of(confusion) for reason, confusion in sorted(by_reason.items())},
-        "by_class_that_falls": {name: dict_of(confusion) for name, confusion in sorted(by_class.items())},
-        "by_the_fast_judges_reason": {reason: dict_of(confusion) for reason, confusion in sorted(fast_reasons.items())},
+        "by_drakes_reason": {
+            reason: dict_of(confusion) for reason, confusion in sorted(by_reason.items())
+        },
+        "by_class_that_falls": {
+            name: dict_of(confusion) for name, confusion in sorted(by_class.items())
+        },
+        "by_the_fast_judges_reason": {
+            reason: dict_of(confusion) for reason, confusion in sorted(fast_reasons.items())
+        },
     }
     return row, details
 
 
 def dict_of(confusion: Confusion) -> dict[str, int]:
     """For JSON."""
-    return {f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(confusion.pairs.items())}
+    return {
+        f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(confusion.pairs.items())
+    }
 
 
-def compare_variants(batch: Batch, default: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def compare_variants(
+    batch: Batch, default: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
     """How often Drake, asked in another way, says the same of the same scenes."""
     pairs = list(zip(default, other, strict=False))
     equal = [("settled" in a) == ("settled" in b) for a, b in pairs]
     falls = [(fall(a), fall(b)) for a, b in pairs]
     below = config_of(batch).cell.camera.visibility_threshold
-    lists = [hidden(a, below) == hidden(b, below) for a, b in pairs if "settled" in a and "settled" in b]
+    lists = [
+        hidden(a, below) == hidden(b, below) for a, b in pairs if "settled" in a and "settled" in b
+    ]
     return {
         "count": len(pairs),
         "agreement": sum(equal) / len(pairs),
         "agreement_ci95": wilson_interval(sum(equal), len(pairs)),
-        "stacks_agreement": sum(x == y for a, b in falls for x, y in zip(a, b, strict=True)) / sum(len(a) for a, _ in falls),
+        "stacks_agreement": sum(x == y for a, b in falls for x, y in zip(a, b, strict=True))
+        / sum(len(a) for a, _ in falls),
         "hidden_agreement": sum(lists) / len(lists),
         "hidden_agreement_ci95": wilson_interval(sum(lists), len(lists)),
     }
@@ -170,10 +196,17 @@ def compare_variants(batch: Batch, default: Sequence[dict[str, Any]], other: Seq
 
 def fall(record: dict[str, Any]) -> list[bool]:
     """Whether each object's stack falls, in the order of the names."""
-    return [falls for _, falls in sorted((name, g["fall"] is not None) for g in record["groups"] for name in g["objects"])]
+    return [
+        falls
+        for _, falls in sorted(
+            (name, g["fall"] is not None) for g in record["groups"] for name in g["objects"]
+        )
+    ]
 
 
-def compare_moves(batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[int, dict[str, Any]]) -> dict[str, Any]:
+def compare_moves(
+    batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[int, dict[str, Any]]
+) -> dict[str, Any]:
     """Outcomes of random moves under the fast executor, each on its own observation, against Drake's."""
     config = config_of(batch)
     judge = FastJudge(config)
@@ -198,9 +231,16 @@ def compare_moves(batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[
             )
         )
         outcomes[outcome.result.value, record["result"]] += 1
-        if outcome.result is not MoveResult.CANNOT_JUDGE and outcome.result.value != record["result"]:
-            found = outcome.instability.reason.value if outcome.instability else outcome.result.value
-            by_reason[f"fast: {found}"][f"drake: {record['fall'][0] if record['fall'] else record['result']}"] += 1
+        if (
+            outcome.result is not MoveResult.CANNOT_JUDGE
+            and outcome.result.value != record["result"]
+        ):
+            found = (
+                outcome.instability.reason.value if outcome.instability else outcome.result.value
+            )
+            by_reason[f"fast: {found}"][
+                f"drake: {record['fall'][0] if record['fall'] else record['result']}"
+            ] += 1
         if command is not None and record["place"] is not None:
             placed += 1
             where = command.X_TO_place.translation
@@ -227,7 +267,9 @@ def sensitivity(batch: Batch, records: Sequence[dict[str, Any]]) -> list[dict[st
     for margin, friction in itertools.product(MARGINS, FRICTIONS):
         judge, confusion = FastJudge(config_of(batch), margin, friction), Confusion()
         for scene, record in zip(scenes, records, strict=True):
-            confusion.pairs[said(judge.stability(scene)), "stable" if "settled" in record else "falls"] += 1
+            confusion.pairs[
+                said(judge.stability(scene)), "stable" if "settled" in record else "falls"
+            ] += 1
         row = confusion.row()
         rates = {key: row[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}
         rows.append({"margin_mm": 1000 * margin, "friction": friction} | rates)
@@ -239,7 +281,11 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
     seen: set[Any] = set()
     chosen: list[Disagreement] = []
     for item in disagreements:
-        kind = (item.fast, item.drake, tuple(sorted(o.object_class.name for o in item.objects.objects)))
+        kind = (
+            item.fast,
+            item.drake,
+            tuple(sorted(o.object_class.name for o in item.objects.objects)),
+        )
         if kind not in seen:
             seen.add(kind)
             chosen.append(item)
@@ -261,31 +307,49 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
 def main(
     folder: Annotated[Path, typer.Argument(help="What drake_verdicts.py wrote.")],
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG of stacks that the judges see differently.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG of stacks that the judges see differently.")
+    ] = None,
 ) -> None:
     """Prints and writes the tables."""
     disagreements: list[Disagreement] = []
-    sides = {batch: list(drake_verdicts(batch, count, folder, Pool())) for batch, count in BATCHES.items()}
+    sides = {
+        batch: list(drake_verdicts(batch, count, folder, Pool()))
+        for batch, count in BATCHES.items()
+    }
     (first, scenes), *_ = BATCHES.items()
     moves = list(drake_moves(first, scenes, MOVES, folder, Pool()))
     agreement, details, itself = [], {}, []
     for batch, (head, *records) in sides.items():
-        key = {"objects": batch.objects, "nodes": batch.nodes, "seed": batch.seed, "drake_commit": head["commit"]}
+        key = {
+            "objects": batch.objects,
+            "nodes": batch.nodes,
+            "seed": batch.seed,
+            "drake_commit": head["commit"],
+        }
         if batch.variant == "default":
             row, found = compare_scenes(batch, records, disagreements)
             agreement.append(key | row)
             details[f"{batch.objects}, {batch.nodes} nodes"] = found
         else:
             default = sides[replace(batch, variant="default")][1:]
-            itself.append(key | {"variant": batch.variant} | compare_variants(batch, default, records))
+            itself.append(
+                key | {"variant": batch.variant} | compare_variants(batch, default, records)
+            )
     by_index = {record["index"]: record for record in sides[first][1:]}
     of_moves = {"drake_commit": moves[0]["commit"]} | compare_moves(first, moves[1:], by_index)
     result = {
         "commit": git_commit(),
         "config": sides[first][0]["config"],
-        "scene_agreement": {f"{r['objects']}, {r['nodes']} nodes": r["agreement"] for r in agreement},
-        "false_stable_rate": {f"{r['objects']}, {r['nodes']} nodes": r["false_stable_rate"] for r in agreement},
-        "hidden_agreement": {f"{r['objects']}, {r['nodes']} nodes": r["hidden_agreement"] for r in agreement},
+        "scene_agreement": {
+            f"{r['objects']}, {r['nodes']} nodes": r["agreement"] for r in agreement
+        },
+        "false_stable_rate": {
+            f"{r['objects']}, {r['nodes']} nodes": r["false_stable_rate"] for r in agreement
+        },
+        "hidden_agreement": {
+            f"{r['objects']}, {r['nodes']} nodes": r["hidden_agreement"] for r in agreement
+        },
         "move_agreement": of_moves["agreement"],
         "drake_self_agreement": {row["variant"]: row["agreement"] for row in itself},
         "scenes": agreement,
@@ -301,23 +365,54 @@ def main(
     show(agreement, itself, of_moves)
 
 
-def show(agreement: Sequence[dict[str, Any]], itself: Sequence[dict[str, Any]], of_moves: dict[str, Any]) -> None:
+def show(
+    agreement: Sequence[dict[str, Any]], itself: Sequence[dict[str, Any]], of_moves: dict[str, Any]
+) -> None:
     """The tables."""
     table = Table(
-        "objects", "nodes", "scenes", "verdicts", "95 %", "false stable", "cannot judge", "hidden lists", title="fast, Drake"
+        "objects",
+        "nodes",
+        "scenes",
+        "verdicts",
+        "95 %",
+        "false stable",
+        "cannot judge",
+        "hidden lists",
+        title="fast, Drake",
     )
     for row in agreement:
         low, high = row["agreement_ci95"]
-        shares = [f"{row[key]:.3f}" for key in ("false_stable_rate", "cannot_judge_share", "hidden_agreement")]
-        numbers = (str(row["nodes"]), str(row["count"]), f"{row['agreement']:.3f}", f"{low:.3f} to {high:.3f}")
+        shares = [
+            f"{row[key]:.3f}"
+            for key in ("false_stable_rate", "cannot_judge_share", "hidden_agreement")
+        ]
+        numbers = (
+            str(row["nodes"]),
+            str(row["count"]),
+            f"{row['agreement']:.3f}",
+            f"{low:.3f} to {high:.3f}",
+        )
         table.add_row(row["objects"], *numbers, *shares)
     Console().print(table)
-    table = Table("Drake, asked with", "scenes", "verdicts", "stacks", "hidden lists", title="Drake and itself")
+    table = Table(
+        "Drake, asked with",
+        "scenes",
+        "verdicts",
+        "stacks",
+        "hidden lists",
+        title="Drake and itself",
+    )
     for row in itself:
-        shares = [f"{row[key]:.3f}" for key in ("agreement", "stacks_agreement", "hidden_agreement")]
+        shares = [
+            f"{row[key]:.3f}" for key in ("agreement", "stacks_agreement", "hidden_agreement")
+        ]
         table.add_row(row["variant"], str(row["count"]), *shares)
     Console().print(table)
-    print(f"moves: {of_moves['agreement']:.3f} of {of_moves['count']}", of_moves["confusion"], of_moves["disagreements"])
+    print(
+        f"moves: {of_moves['agreement']:.3f} of {of_moves['count']}",
+        of_moves["confusion"],
+        of_moves["disagreements"],
+    )
 
 
 if __name__ == "__main__":

@@ -37,7 +37,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-def stacks(count: int, nodes: int, seed: int, config: ClutterConfig) -> list[tuple[list[SceneObject], list[SceneObject]]]:
+def stacks(
+    count: int, nodes: int, seed: int, config: ClutterConfig
+) -> list[tuple[list[SceneObject], list[SceneObject]]]:
     """RG stacks of two objects or more, each with two draws of its random offsets."""
     grammar = SceneGrammar(load_catalogue().object_set("ycb7"))
     found: list[tuple[list[SceneObject], list[SceneObject]]] = []
@@ -45,12 +47,19 @@ def stacks(count: int, nodes: int, seed: int, config: ClutterConfig) -> list[tup
     while len(found) < count:
         rng = item_rng(seed, index)
         index += 1
-        scene = lay_out(RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config, rng)
+        scene = lay_out(
+            RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config, rng
+        )
         if isinstance(scene, LayoutFailure):
             continue
         for group in touching_groups(scene.objects, TOUCHING_MARGIN):
             if len(group) > 1:
-                found.append((jittered(group, config.settle.jitter, rng), jittered(group, config.settle.jitter, rng)))
+                found.append(
+                    (
+                        jittered(group, config.settle.jitter, rng),
+                        jittered(group, config.settle.jitter, rng),
+                    )
+                )
     return found[:count]
 
 
@@ -62,7 +71,9 @@ def rests_on_lying(group: list[SceneObject]) -> str:
             continue
         loaded = any(abs(other.bounds_T[0][2] - o.top) < 1e-6 for other in group)
         beside = any(
-            other is not o and other.object_class is o.object_class and abs(other.X_TO.p[2] - o.X_TO.p[2]) < 1e-6
+            other is not o
+            and other.object_class is o.object_class
+            and abs(other.X_TO.p[2] - o.X_TO.p[2]) < 1e-6
             for other in group
         )
         if loaded:
@@ -91,11 +102,17 @@ def main(
     rows: list[dict[str, Any]] = []
     for name, verdicts in stable.items():
         agreement = float(np.mean(np.equal(verdicts, stable["default"])))
-        rows.append({"setting": name, "agreement": agreement, "stable_share": float(np.mean(verdicts))})
+        rows.append(
+            {"setting": name, "agreement": agreement, "stable_share": float(np.mean(verdicts))}
+        )
         table.add_row(name, f"{agreement:.3f}", f"{np.mean(verdicts):.3f}")
     lying = {}
     for kind in ("single", "pair"):
-        fates = [held for (group, _), held in zip(groups, stable["default"], strict=True) if rests_on_lying(group) == kind]
+        fates = [
+            held
+            for (group, _), held in zip(groups, stable["default"], strict=True)
+            if rests_on_lying(group) == kind
+        ]
         lying[kind] = {"stacks": len(fates), "stable": sum(fates)}
         table.add_row(f"on a {kind} of lying markers", "", f"{sum(fates)} of {len(fates)}")
     Console().print(table)

@@ -5,7 +5,9 @@ python benchmarks/speed.py --out benchmarks/results/speed.json
 
 import os
 
-os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"})  # before numpy is imported
+os.environ.update(
+    {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+)  # before numpy is imported
 
 import itertools
 import math
@@ -56,7 +58,13 @@ BUDGET = 2000
 """Moves that the search may try."""
 HIDDEN = ("0", "1", "2", "3", "4-5", "4-5", "6+")
 """Row of the search's table by hidden objects; the last for more."""
-FAST, WARM, DRAKE, ACCURATE, BULLET = "FastJudge, cold", "FastJudge, warm", "DrakeJudge", "DrakeJudge, accurate", "PyBullet"
+FAST, WARM, DRAKE, ACCURATE, BULLET = (
+    "FastJudge, cold",
+    "FastJudge, warm",
+    "DrakeJudge",
+    "DrakeJudge, accurate",
+    "PyBullet",
+)
 RAYS, VTK, TINY = "ray caster", "Drake VTK labels", "TinyRenderer"
 RAY_SHARES, VTK_SHARES = "shares, ray caster", "shares, Drake VTK"
 NOTES = {
@@ -102,7 +110,13 @@ class Size:
     scenes: int
 
 
-SIZES = (Size(5, 9, 0.7, 40), Size(10, 18, 0.7, 40), Size(16, 29, 0.7, 40), Size(30, 53, 1.0, 20), Size(60, 104, 1.2, 10))
+SIZES = (
+    Size(5, 9, 0.7, 40),
+    Size(10, 18, 0.7, 40),
+    Size(16, 29, 0.7, 40),
+    Size(30, 53, 1.0, 20),
+    Size(60, 104, 1.2, 10),
+)
 
 
 @dataclass(frozen=True)
@@ -115,7 +129,10 @@ class Case:
     @cached_property
     def start(self) -> Scene:
         """The scene with its offsets."""
-        return replace(self.scene, objects=tuple(jittered(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))))
+        return replace(
+            self.scene,
+            objects=tuple(jittered(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))),
+        )
 
 
 def generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
@@ -137,7 +154,9 @@ def half_stable(size: Size, count: int, seed: int) -> tuple[list[Case], float]:
         if min(len(cases) for cases in drawn.values()) >= count // 2:
             break
     pairs = itertools.islice(zip(drawn[True], drawn[False], strict=False), count // 2)
-    return list(itertools.chain(*pairs)), len(drawn[True]) / sum(len(cases) for cases in drawn.values())
+    return list(itertools.chain(*pairs)), len(drawn[True]) / sum(
+        len(cases) for cases in drawn.values()
+    )
 
 
 def timed(ask: Callable[..., T], *arguments: Any) -> tuple[float, T]:
@@ -195,13 +214,22 @@ def in_bullet(case: Case) -> tuple[float, float, float, Found]:
 def figures(seconds: Sequence[float]) -> Row:
     """What is said of some times."""
     ms = 1000 * np.array(seconds)
-    row = {"median_ms": np.median(ms), "mean_ms": ms.mean(), "p95_ms": np.percentile(ms, 95), "per_second": 1000 / ms.mean()}
+    row = {
+        "median_ms": np.median(ms),
+        "mean_ms": ms.mean(),
+        "p95_ms": np.percentile(ms, 95),
+        "per_second": 1000 / ms.mean(),
+    }
     return {"count": len(ms)} | {key: float(value) for key, value in row.items()}
 
 
-def judge_row(seconds: Sequence[float], found: Sequence[Found], truth: Sequence[Found] | None) -> Row:
+def judge_row(
+    seconds: Sequence[float], found: Sequence[Found], truth: Sequence[Found] | None
+) -> Row:
     """Figures of a judge, and how often it agrees with the truth."""
-    row = figures(seconds) | {"stable_share": float(np.mean([stable is True for stable, _ in found]))}
+    row = figures(seconds) | {
+        "stable_share": float(np.mean([stable is True for stable, _ in found]))
+    }
     on_stable = [s for s, (stable, _) in zip(seconds, found, strict=True) if stable]
     row["stable_median_ms"] = 1000 * float(np.median(on_stable)) if on_stable else None
     if truth:
@@ -222,16 +250,26 @@ def ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
     return image
 
 
-def measure(what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, FastJudge | DrakeJudge]) -> Row:
+def measure(
+    what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, FastJudge | DrakeJudge]
+) -> Row:
     """Figures by judge and by eye, those of Drake and PyBullet's judge only on the first `slow` cases."""
     found: dict[str, tuple[list[float], list[Found]]] = {}
     for name, judge in judges.items():
         if isinstance(judge, FastJudge):
             forget = judge._known.clear if name == FAST else lambda: None
-            seconds, verdicts = asked(f"{what}: {name}", judge.judge, cases, repeats=REPEATS, before=forget)
+            seconds, verdicts = asked(
+                f"{what}: {name}", judge.judge, cases, repeats=REPEATS, before=forget
+            )
         else:
             seconds, verdicts = asked(f"{what}: {name}", judge.judge, cases[:slow], SLOW)
-        found[name] = seconds, [(None, None) if isinstance(v, CannotJudge) else (v.stable, v.hidden) for v in verdicts]
+        found[name] = (
+            seconds,
+            [
+                (None, None) if isinstance(v, CannotJudge) else (v.stable, v.hidden)
+                for v in verdicts
+            ],
+        )
     progress = track(cases[:slow], f"{what}: {BULLET}", console=Console(stderr=True))
     loads, frames, steps, in_bullet_found = zip(*map(in_bullet, progress), strict=True)
     found[BULLET] = [*steps], [*in_bullet_found]
@@ -268,11 +306,20 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
         if part:
             search.solve(part[0].scene, budget=20)
             took, solutions = asked(
-                f"{name} hidden", lambda scene, _: search.solve(scene, 0, BUDGET), part, 0, before=judge._known.clear
+                f"{name} hidden",
+                lambda scene, _: search.solve(scene, 0, BUDGET),
+                part,
+                0,
+                before=judge._known.clear,
             )
             rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
-            rows[name]["median_moves_tried"] = float(np.median([solution.moves_tried for solution in solutions]))
-            rows[name] |= {answer.value: float(np.mean([s.answer is answer for s in solutions])) for answer in Solvability}
+            rows[name]["median_moves_tried"] = float(
+                np.median([solution.moves_tried for solution in solutions])
+            )
+            rows[name] |= {
+                answer.value: float(np.mean([s.answer is answer for s in solutions]))
+                for answer in Solvability
+            }
     return rows
 
 
@@ -282,7 +329,16 @@ def table(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     made.columns[0].no_wrap = True
     for name, row in rows.items():
         values = [row.get(key) for key in columns.values()]
-        texts = [v if isinstance(v, str) else "" if v is None else f"{v:,.0f}" if v >= 100 else f"{v:.3g}" for v in values]
+        texts = [
+            v
+            if isinstance(v, str)
+            else ""
+            if v is None
+            else f"{v:,.0f}"
+            if v >= 100
+            else f"{v:.3g}"
+            for v in values
+        ]
         made.add_row(name, *texts)
     return made
 
@@ -291,16 +347,37 @@ def show(result: Row, console: Console) -> None:
     """Prints the tables."""
     times = {"median": "median_ms", "mean": "mean_ms", "95 %": "p95_ms", "per s": "per_second"}
     agreement = {"stable": "stable_share", "agrees": "agrees", "on hidden": "agrees_on_hidden"}
-    console.print(table("ms per scene", result["judges"], times | {"of stable": "stable_median_ms"} | agreement))
+    console.print(
+        table(
+            "ms per scene", result["judges"], times | {"of stable": "stable_median_ms"} | agreement
+        )
+    )
     console.print(table("ms per frame", result["eyes"], times))
     grown = {}
     for part in ("judges", "eyes"):
         for name in result["growth"][0][part]:
-            grown[name] = {str(row["objects"]): row[part][name]["mean_ms"] for row in result["growth"]}
-    console.print(table("mean ms by objects", grown, {str(size.objects): str(size.objects) for size in SIZES}))
-    columns = {"scenes": "count", "median s": "median_s", "most": "max_s", "moves": "median_moves_tried"}
-    console.print(table("search: hidden", result["search"], columns | {answer.value: answer.value for answer in Solvability}))
-    targets = {name: {"aim": AIMS[name], "measured": value} for name, value in result["targets"].items()}
+            grown[name] = {
+                str(row["objects"]): row[part][name]["mean_ms"] for row in result["growth"]
+            }
+    console.print(
+        table("mean ms by objects", grown, {str(size.objects): str(size.objects) for size in SIZES})
+    )
+    columns = {
+        "scenes": "count",
+        "median s": "median_s",
+        "most": "max_s",
+        "moves": "median_moves_tried",
+    }
+    console.print(
+        table(
+            "search: hidden",
+            result["search"],
+            columns | {answer.value: answer.value for answer in Solvability},
+        )
+    )
+    targets = {
+        name: {"aim": AIMS[name], "measured": value} for name, value in result["targets"].items()
+    }
     console.print(table("target", targets, {"aim": "aim", "measured": "measured"}))
 
 
@@ -309,16 +386,28 @@ def draw_growth(growth: Sequence[Row], path: Path) -> None:
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
     objects = [row["objects"] for row in growth]
     figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained", sharey=True)
-    parts = (("judges", (BULLET, DRAKE, FAST), "scene judged"), ("eyes", (TINY, VTK, RAYS), "frame"))
+    parts = (
+        ("judges", (BULLET, DRAKE, FAST), "scene judged"),
+        ("eyes", (TINY, VTK, RAYS), "frame"),
+    )
     for panel, (part, names, what) in zip(panels, parts, strict=True):
         for name, marker in zip(names, "sDo", strict=True):
-            panel.loglog(objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name)
+            panel.loglog(
+                objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name
+            )
         panel.set_xticks(objects, objects)
         panel.minorticks_off()
         panel.set(xlabel="objects in the scene", ylabel=f"mean ms per {what}")
         panel.tick_params(labelleft=True)
         panel.grid(alpha=0.4)
-        panel.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, columnspacing=0.8, handletextpad=0.3, fontsize=16)
+        panel.legend(
+            loc="lower right",
+            bbox_to_anchor=(1, 1),
+            ncols=3,
+            columnspacing=0.8,
+            handletextpad=0.3,
+            fontsize=16,
+        )
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
@@ -327,14 +416,24 @@ def cpu() -> str:
     """The processor's model."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
+    return next(
+        (line.partition(": ")[2] for line in lines if line.startswith("model name")),
+        platform.processor(),
+    )
 
 
 def main(
-    count: Annotated[int, typer.Option(help=f"Scenes of {NODES} nodes; of the other sizes, no more than this.", min=2)] = 60,
+    count: Annotated[
+        int,
+        typer.Option(
+            help=f"Scenes of {NODES} nodes; of the other sizes, no more than this.", min=2
+        ),
+    ] = 60,
     seed: int = 0,
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG to write: the growth with the number of objects.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG to write: the growth with the number of objects.")
+    ] = None,
 ) -> None:
     """Measures everything in one go; prints the tables and writes them."""
     console = Console(file=os.fdopen(os.dup(1), "w"))
@@ -367,7 +466,10 @@ def main(
     result["growth"] = []
     for size in SIZES:
         grown, share = half_stable(size, min(size.scenes, count), seed)
-        row: Row = {"objects": size.objects, "objects_mean": float(np.mean([len(case.scene.objects) for case in grown]))}
+        row: Row = {
+            "objects": size.objects,
+            "objects_mean": float(np.mean([len(case.scene.objects) for case in grown])),
+        }
         row |= {"nodes": size.nodes, "tray_side": size.tray_side, "stable_share_of_drawn": share}
         result["growth"].append(row | measure(f"{size.objects} objects", grown, SLOW, judges))
     result["search"] = searched(cases)

@@ -188,7 +188,9 @@ class ObjectClass:
             raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
         mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
         if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
-            raise InputError(f"{self.sdf_path}: mass: {mass}; allowed is the catalogue's, {self.mass:g} kg; {remedy}")
+            raise InputError(
+                f"{self.sdf_path}: mass: {mass}; allowed is the catalogue's, {self.mass:g} kg; {remedy}"
+            )
         return self.sdf_path
 
     @cached_property
@@ -196,11 +198,18 @@ class ObjectClass:
         """Corners of its convex pieces in O, each (V, 3) m; a cylinder is a prism of 32 sides inscribed in it."""
         half = np.asarray(self.size) / 2
         if self.shape is Shape.BOX:
-            return (half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),)
+            return (
+                half
+                * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),
+            )
         if self.shape is Shape.CYLINDER:
             angle = np.arange(_CYLINDER_SIDES) * (2 * math.pi / _CYLINDER_SIDES)
             ring = half[0] * np.column_stack([np.cos(angle), np.sin(angle)])
-            return (np.vstack([np.column_stack([ring, np.full(len(ring), z)]) for z in (-half[2], half[2])]),)
+            return (
+                np.vstack(
+                    [np.column_stack([ring, np.full(len(ring), z)]) for z in (-half[2], half[2])]
+                ),
+            )
         pieces = sorted(self.folder.glob("convex_*.obj"))
         if not pieces:
             raise InputError(
@@ -235,19 +244,25 @@ class Catalogue:
             InputError: no such set.
         """
         if name not in self.object_sets:
-            raise InputError(f"object set {name!r} is unknown; known are {', '.join(self.object_sets)}")
+            raise InputError(
+                f"object set {name!r} is unknown; known are {', '.join(self.object_sets)}"
+            )
         return tuple(self.classes[class_name] for class_name in self.object_sets[name])
 
 
 def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
     if not path.is_file():
-        raise InputError(f"{where}.mesh: no file {path}; give a mesh that lies beside the catalogue")
+        raise InputError(
+            f"{where}.mesh: no file {path}; give a mesh that lies beside the catalogue"
+        )
     try:
         mesh = trimesh.load_mesh(path)
     except Exception as error:  # trimesh's readers raise whatever their formats suggest
         raise InputError(f"{where}.mesh: {path} cannot be read as a mesh ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.is_watertight or mesh.volume <= 0:
-        raise InputError(f"{where}.mesh: {path} is not watertight; give a closed surface with outward normals")
+        raise InputError(
+            f"{where}.mesh: {path} is not watertight; give a closed surface with outward normals"
+        )
     x, y, z = (float(extent) for extent in mesh.extents)
     if not 0.003 <= min(x, y, z) <= max(x, y, z) <= 1.0:
         raise InputError(
@@ -289,7 +304,9 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
         InputError: the catalogue is missing or broken; the message names file, field and what is allowed.
     """
     shipped = shipped_path("sdf_assets")
-    folders = (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
+    folders = (
+        (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
+    )
     classes: dict[str, ObjectClass] = {}
     object_sets: dict[str, tuple[str, ...]] = {}
     for asset_folder in folders:

@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from drake_clutter.cell.work_cell import WorkCell, default_cell
-from drake_clutter.validation import Between, NonNegative, config_class, load_typed, override, to_plain
+from drake_clutter.validation import (
+    Between,
+    NonNegative,
+    config_class,
+    load_typed,
+    override,
+    to_plain,
+)
 
 
 @config_class
@@ -162,7 +169,11 @@ def upgrade_cell(old: Any) -> Any:
     if not isinstance(old, dict):
         return old
     robot = {key: old[key] for key in ("home", "payload") if key in old}
-    made = {key: value for key, value in old.items() if key not in ("home", "payload", "suction", "base")}
+    made = {
+        key: value
+        for key, value in old.items()
+        if key not in ("home", "payload", "suction", "base")
+    }
     base = old.get("base")
     if isinstance(base, list) and len(base) == 4:
         robot["base"] = {"translation": base[:3], "rpy_deg": [0.0, 0.0, base[3]]}

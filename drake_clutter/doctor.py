@@ -43,7 +43,9 @@ def checks() -> list[Check]:
         _tried(probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"),
         _tried(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
         _tried(probe_torch, "needed by the learned agents: pip install 'drake-clutter[train]'"),
-        _tried(probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"),
+        _tried(
+            probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"
+        ),
         _tried(probe_machine, f"use fewer workers; one may take {_NEEDED_MEMORY:g} GiB"),
     ]
 
@@ -79,8 +81,12 @@ def probe_rendering() -> str:
     properties = PerceptionProperties()
     properties.AddProperty("label", "id", RenderLabel(1))
     X_WO = RigidTransform(np.array([0.0, 0.0, 2.5]))  # the camera is at W and looks along z
-    engine.RegisterVisual(GeometryId.get_new_id(), Box(1.0, 1.0, 1.0), properties, X_WO, needs_updates=False)
-    core = RenderCameraCore("probe", CameraInfo(64, 48, 0.8), ClippingRange(0.1, 10.0), RigidTransform())
+    engine.RegisterVisual(
+        GeometryId.get_new_id(), Box(1.0, 1.0, 1.0), properties, X_WO, needs_updates=False
+    )
+    core = RenderCameraCore(
+        "probe", CameraInfo(64, 48, 0.8), ClippingRange(0.1, 10.0), RigidTransform()
+    )
     image = ImageDepth32F(64, 48)
     engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(0.1, 9.0)), image)
     depth = float(image.data[24, 32, 0])
@@ -94,7 +100,9 @@ def probe_solvers() -> str:
     from pydrake.solvers import ClarabelSolver, IpoptSolver, SnoptSolver
 
     solvers = {"SNOPT": SnoptSolver(), "IPOPT": IpoptSolver(), "Clarabel": ClarabelSolver()}
-    missing = [name for name, solver in solvers.items() if not (solver.available() and solver.enabled())]
+    missing = [
+        name for name, solver in solvers.items() if not (solver.available() and solver.enabled())
+    ]
     if missing:
         raise MissingError(f"{', '.join(missing)} not available")
     return ", ".join(solvers)
@@ -104,7 +112,11 @@ def probe_torch() -> str:
     """The version of PyTorch and what it computes on."""
     import torch
 
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device, computes on the CPU"
+    device = (
+        torch.cuda.get_device_name()
+        if torch.cuda.is_available()
+        else "no CUDA device, computes on the CPU"
+    )
     return f"PyTorch {torch.__version__}, {device}"
 
 
@@ -114,9 +126,15 @@ def probe_assets() -> str:
     from drake_clutter.resources import shipped_path
 
     catalogue = load_catalogue()
-    unbuilt = [name for name, object_class in catalogue.classes.items() if not object_class.sdf_path.is_file()]
+    unbuilt = [
+        name
+        for name, object_class in catalogue.classes.items()
+        if not object_class.sdf_path.is_file()
+    ]
     if unbuilt:
-        raise MissingError(f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}")
+        raise MissingError(
+            f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}"
+        )
     return f"{len(catalogue.classes)} object classes in {shipped_path('sdf_assets')}"
 
 
@@ -136,15 +154,29 @@ def _tried(probe: Callable[[], str], remedy: str) -> Check:
     code = f"from drake_clutter import doctor; print(doctor.{probe.__name__}())"
     try:
         run = subprocess.run(
-            [sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_PROBE_TIMEOUT
+            [sys.executable, "-c", code],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_TIMEOUT,
         )
     except subprocess.TimeoutExpired:
         return Check(name, False, f"no answer in {_PROBE_TIMEOUT:g} s", remedy)
     if run.returncode == 0:
         return Check(name, True, _last_line(run.stdout))
     if run.returncode < 0:
-        return Check(name, False, f"died of {signal.Signals(-run.returncode).name} {_last_line(run.stderr)}".rstrip(), remedy)
-    return Check(name, False, _last_line(run.stderr).removeprefix("drake_clutter.doctor.MissingError: "), remedy)
+        return Check(
+            name,
+            False,
+            f"died of {signal.Signals(-run.returncode).name} {_last_line(run.stderr)}".rstrip(),
+            remedy,
+        )
+    return Check(
+        name,
+        False,
+        _last_line(run.stderr).removeprefix("drake_clutter.doctor.MissingError: "),
+        remedy,
+    )
 
 
 def _last_line(text: str) -> str:

@@ -93,12 +93,16 @@ def output_directory(path: Path, *, may_hold: frozenset[str] = frozenset()) -> P
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"--out {path}: is a file; give a folder that is new or empty") from error
     except OSError as error:
-        raise InputError(f"--out {path}: cannot be made ({error.strerror}); give a folder that you may write") from error
+        raise InputError(
+            f"--out {path}: cannot be made ({error.strerror}); give a folder that you may write"
+        ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"--out {path}: is not writable; give a folder that you may write")
     strangers = sorted(entry.name for entry in path.iterdir() if entry.name not in may_hold)
     if strangers:
-        raise InputError(f"--out {path}: is not empty (holds {strangers[0]}); give a folder that is new or empty")
+        raise InputError(
+            f"--out {path}: is not empty (holds {strangers[0]}); give a folder that is new or empty"
+        )
     return path
 
 

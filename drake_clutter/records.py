@@ -36,7 +36,9 @@ def recorded(
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(f"{path}: another run is adding to it; wait for it, or give another folder") from error
+            raise InputError(
+                f"{path}: another run is adding to it; wait for it, or give another folder"
+            ) from error
         file.seek(0)
         lines = file.readlines()
         if lines and not lines[-1].endswith("\n"):
@@ -50,7 +52,9 @@ def recorded(
         upgraded = upgrade(head)
         differing = ", ".join(key for key, value in asked.items() if upgraded.get(key) != value)
         if differing:
-            raise InputError(f"{path}: holds records of something else ({differing}); give the same options or another folder")
+            raise InputError(
+                f"{path}: holds records of something else ({differing}); give the same options or another folder"
+            )
         yield head
         yield from records
         for record in make(len(records)):

@@ -38,5 +38,10 @@ def git_commit() -> str:
 
 def _git(*arguments: str) -> str:
     return subprocess.run(
-        ["git", *arguments], capture_output=True, text=True, check=True, cwd=_PACKAGE_DIR, timeout=10
+        ["git", *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=_PACKAGE_DIR,
+        timeout=10,
     ).stdout.strip()

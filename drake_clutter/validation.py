@@ -21,6 +21,7 @@ from pydantic import (
     Strict,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
@@ -60,7 +61,9 @@ class Between:
     low: float = 0.0
     high: float = math.inf
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         """Return the schema of a number in the range."""
         low = None if self.low == -math.inf else self.low
         high = None if self.high == math.inf else self.high
@@ -107,6 +110,48 @@ Text = Annotated[str, Field(strict=True, min_length=1)]
 """A text that is not empty."""
 Vector3 = tuple[Finite, Finite, Finite]
 """Three finite numbers."""
+
+
+_RENAMED: dict[type, Mapping[str, str]] = {}
+"""Current names of fields by earlier ones, of each class that has renamed fields."""
+
+
+def renamed_fields(**current: str) -> Callable[[type[Schema]], type[Schema]]:
+    """Return a decorator, below `config_class`, by which files may use earlier names of fields.
+
+    Args:
+        current: Current name of a field by its earlier name.
+    """
+
+    def decorate(cls: type[Schema]) -> type[Schema]:
+        def take_earlier_names(cls: type, given: Any) -> Any:
+            return with_current_names(cls, given)
+
+        _RENAMED[cls] = current
+        validator: Any = model_validator(mode="before")(cast(Any, classmethod(take_earlier_names)))
+        setattr(cls, take_earlier_names.__name__, validator)
+        return cls
+
+    return decorate
+
+
+def with_current_names(schema: type, given: Any) -> Any:
+    """Return a document with the fields of a schema under their current names.
+
+    A field that stands there under both names keeps the earlier one too, which is then refused as
+    unknown.
+
+    Args:
+        schema: The class of `given`; classes of its fields are left alone.
+        given: What was read.
+    """
+    current = _RENAMED.get(schema)
+    if not current or not isinstance(given, dict):
+        return given
+    return {
+        current[key] if key in current and current[key] not in given else key: value
+        for key, value in given.items()
+    }
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
@@ -332,6 +377,7 @@ def _merged(config: Any, given: Any) -> Any:
     if isinstance(config, dict):
         return {key: _merged(config.get(key), value) for key, value in given.items()}
     fields = _fields(config)
+    given = with_current_names(type(config), given)
     if given.get("kind", fields.get("kind")) != fields.get("kind"):
         return given
     if len(given) > 1 and given.get("model", fields.get("model")) != fields.get("model"):

@@ -17,7 +17,13 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig, load_config
-from drake_clutter.grammar import NodeBudget, Orientation, SceneGrammar, resting_rotation, uniform_choice
+from drake_clutter.grammar import (
+    NodeBudget,
+    Orientation,
+    SceneGrammar,
+    resting_rotation,
+    uniform_choice,
+)
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import (
     Move,
@@ -59,7 +65,9 @@ def resting(
     object_class = CLASSES[class_name]
     R_TO = resting_rotation(object_class, orientation)
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
-    return SceneObject(name or class_name, object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest)))
+    return SceneObject(
+        name or class_name, object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest))
+    )
 
 
 def tray(side: float) -> Support:

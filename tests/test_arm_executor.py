@@ -58,7 +58,9 @@ def test_placed_where_it_should_be(plan: Plan) -> None:
     assert math.isnan(carried.dropped)
     assert carried.place_error < 0.003
     assert carried.turn_error < math.radians(1)
-    assert carried.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), "it stands on the tray"
+    assert carried.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), (
+        "it stands on the tray"
+    )
     assert carried.slip < 0.001
     assert max(carried.displaced.values()) < 0.001
     assert carried.tracking < 0.02
@@ -86,7 +88,9 @@ def test_without_a_seal_nothing_is_lifted(plan: Plan) -> None:
     assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
 
 
-@pytest.mark.parametrize(("xy", "result"), [((0.2, -0.2), MoveResult.PLACED), ((0.2, 0.0), MoveResult.DROPPED)])
+@pytest.mark.parametrize(
+    ("xy", "result"), [((0.2, -0.2), MoveResult.PLACED), ((0.2, 0.0), MoveResult.DROPPED)]
+)
 def test_what_comes_off_where_it_is_put_down_is_placed(
     xy: tuple[float, float], result: MoveResult, config: ClutterConfig
 ) -> None:
@@ -98,7 +102,13 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
 
 def test_the_schedule(plan: Plan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
-    assert [name for name, _ in schedule.starts] == ["approach", "grasp", "carry", "release", "retreat"]
+    assert [name for name, _ in schedule.starts] == [
+        "approach",
+        "grasp",
+        "carry",
+        "release",
+        "retreat",
+    ]
     assert schedule.end == pytest.approx(plan.duration + 2 * DWELL)
     assert schedule.phase(0.0) == "approach"
     assert schedule.phase(schedule.suction_on) == "grasp"
@@ -110,11 +120,19 @@ def test_the_schedule(plan: Plan) -> None:
 
 
 @pytest.mark.parametrize("too_tall", [0.065, 0.0])
-def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(too_tall: float) -> None:
+def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(
+    too_tall: float,
+) -> None:
     """A pudding box that stands shows the top of a sugar box; or it is known, and 3 mm above where it will stand."""
     stands = resting("pudding_box", Orientation.UPRIGHT_0)
-    taken_for = resting("sugar_box", Orientation.UPRIGHT_0, floor=-too_tall, name=stands.name) if too_tall else stands
-    X_TO = Pose((0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion)
+    taken_for = (
+        resting("sugar_box", Orientation.UPRIGHT_0, floor=-too_tall, name=stands.name)
+        if too_tall
+        else stands
+    )
+    X_TO = Pose(
+        (0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion
+    )
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, Plan)
@@ -138,7 +156,9 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
 
 
 def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
-    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08)).plan(SCENE.objects, "sugar_box", PLACE)
+    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08)).plan(
+        SCENE.objects, "sugar_box", PLACE
+    )
     assert isinstance(guarded, Plan)
     assert guarded.depth == pytest.approx(0.08)
     carried = StationSimulation(cell_with("gripper.unevenness=0"), SCENE).execute(guarded)
@@ -168,7 +188,9 @@ def test_cameras_see_things_where_they_are(jointed: str) -> None:
 def test_an_executor_without_a_plan_stays_at_home() -> None:
     executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
-    assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(DEFAULT_CELL.robot.home)
+    assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(
+        DEFAULT_CELL.robot.home
+    )
     assert executor.GetOutputPort("suction").Eval(context)[0] == 0
     assert executor.GetOutputPort("status").Eval(context) == ExecutorStatus()
 
@@ -184,11 +206,15 @@ def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     simulator.AdvanceTo(2.0)
     clone.AdvanceTo(2.0)
     for port in ("command", "suction"):
-        first, second = (executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone))
+        first, second = (
+            executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone)
+        )
         assert (first == second).all()
     phase = build_command_schedule(plan, DEFAULT_CELL).phase(2.0)
     assert executor.GetOutputPort("status").Eval(clone.get_context()) == ExecutorStatus(1, phase)
-    assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(DEFAULT_CELL.robot.home)
+    assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(
+        DEFAULT_CELL.robot.home
+    )
 
 
 def test_the_same_plan_has_the_same_outcome(plan: Plan) -> None:
@@ -210,7 +236,9 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
     assert placed.instability is None
     assert "mm" in placed.detail
     assert placed.scene["gelatin_box"].bounds_T[0][2] == pytest.approx(0.0, abs=0.001)
-    assert placed.scene["pudding_box"].X_TO.p == pytest.approx(scene["pudding_box"].X_TO.p, abs=0.002)
+    assert placed.scene["pudding_box"].X_TO.p == pytest.approx(
+        scene["pudding_box"].X_TO.p, abs=0.002
+    )
     assert placed.motion
     for name, why in (("large_marker", "no seal"), ("pudding_box", "carries others")):
         outcome = executed(executor, scene, observation, Move(name), rng())
@@ -235,7 +263,12 @@ def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None
     quarters = np.split(picture.astype(int), 4, axis=1)
     assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"
     write_recording(tmp_path / "with.html", SCENE, motion[::8], DEFAULT_CELL)
-    write_recording(tmp_path / "without.html", SCENE, [replace(frame, arm=None) for frame in motion[::8]], DEFAULT_CELL)
+    write_recording(
+        tmp_path / "without.html",
+        SCENE,
+        [replace(frame, arm=None) for frame in motion[::8]],
+        DEFAULT_CELL,
+    )
     with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))
     assert with_arm > without + 20_000, "its links, and their key frames"
 
@@ -252,7 +285,9 @@ def test_pictures_are_taken_from_where_the_arm_is_not_in_the_way() -> None:
 
 def test_what_is_put_on_an_edge_falls() -> None:
     """A box is put on the edge of a slim one: it goes down when it is let go."""
-    scene = scene_of(resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0)))
+    scene = scene_of(
+        resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0))
+    )
     beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
     plan = planned(scene, "gelatin_box", beside)
     carried = StationSimulation(DEFAULT_CELL, scene).execute(plan)

@@ -40,7 +40,10 @@ def plant_of(model: str, package: Path) -> tuple[MultibodyPlant, list[ProximityP
     parser.AddModels(url=model)
     plant.Finalize()
     inspector = scene_graph.model_inspector()
-    return plant, [inspector.GetProximityProperties(geometry) for geometry in inspector.GetAllGeometryIds(Role.kProximity)]
+    return plant, [
+        inspector.GetProximityProperties(geometry)
+        for geometry in inspector.GetAllGeometryIds(Role.kProximity)
+    ]
 
 
 def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
@@ -48,7 +51,9 @@ def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
     assert properties.HasProperty("hydroelastic", "compliance_type")
     assert properties.HasProperty("hydroelastic", "hydroelastic_modulus") is not rigid
     if not rigid:
-        assert properties.GetProperty("hydroelastic", "hydroelastic_modulus") == HYDROELASTIC_MODULUS
+        assert (
+            properties.GetProperty("hydroelastic", "hydroelastic_modulus") == HYDROELASTIC_MODULUS
+        )
     friction = properties.GetProperty("material", "coulomb_friction")
     assert friction.static_friction() == friction.dynamic_friction() == FRICTION
 
@@ -74,7 +79,10 @@ def user_class(folder: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("entry", CLASSES.values(), ids=list(CLASSES))
 def test_shipped_model(entry: ObjectClass) -> None:
-    plant, contacts = plant_of(f"package://drake_clutter_objects/{entry.name}/model.sdf", shipped_path("sdf_assets/package.xml"))
+    plant, contacts = plant_of(
+        f"package://drake_clutter_objects/{entry.name}/model.sdf",
+        shipped_path("sdf_assets/package.xml"),
+    )
     body = plant.GetBodyByName("body")
     assert body.default_mass() == pytest.approx(entry.mass, rel=1e-9)
     inertia = body.default_spatial_inertia()
@@ -111,9 +119,13 @@ def test_triangles_face_outwards(name: str) -> None:
     gltf = document(CLASSES[name].folder)
     buffer = base64.b64decode(gltf["buffers"][0]["uri"].partition(",")[2])
     arrays = []
-    for view, width, kind in zip(gltf["bufferViews"], (3, 3, 2, 3), ("<f4", "<f4", "<f4", "<u4"), strict=True):
+    for view, width, kind in zip(
+        gltf["bufferViews"], (3, 3, 2, 3), ("<f4", "<f4", "<f4", "<u4"), strict=True
+    ):
         start = view["byteOffset"]
-        arrays.append(np.frombuffer(buffer[start : start + view["byteLength"]], kind).reshape(-1, width))
+        arrays.append(
+            np.frombuffer(buffer[start : start + view["byteLength"]], kind).reshape(-1, width)
+        )
     points, normals, uv, triangles = arrays
     a, b, c = (points[triangles[:, i]].astype(float) for i in range(3))
     across = np.cross(b - a, c - a)
@@ -127,9 +139,13 @@ def test_the_committed_assets_are_what_the_code_builds(tmp_path: Path) -> None:
     for name in ("gelatin_box", "large_marker"):
         built = build_class(CLASSES[name], tmp_path)
         committed = CLASSES[name].folder
-        assert sorted(file.name for file in built.iterdir()) == sorted(file.name for file in committed.iterdir())
+        assert sorted(file.name for file in built.iterdir()) == sorted(
+            file.name for file in committed.iterdir()
+        )
         for file in built.iterdir():
-            assert file.read_bytes() == (committed / file.name).read_bytes(), f"{name}/{file.name}: build the assets again"
+            assert file.read_bytes() == (committed / file.name).read_bytes(), (
+                f"{name}/{file.name}: build the assets again"
+            )
 
 
 def test_labels_differ() -> None:
@@ -139,7 +155,9 @@ def test_labels_differ() -> None:
         texture = draw_texture(entry)
         u0, v0, u1, v1 = texture.regions["front" if entry.shape is Shape.BOX else "side"]
         width, height = texture.image.size
-        front = texture.image.crop((round(u0 * width), round(v0 * height), round(u1 * width), round(v1 * height)))
+        front = texture.image.crop(
+            (round(u0 * width), round(v0 * height), round(u1 * width), round(v1 * height))
+        )
         means[name] = np.asarray(front, float).mean(axis=(0, 1))
     distances = {(a, b): np.linalg.norm(means[a] - means[b]) for a in means for b in means if a < b}
     assert min(distances.values()) > 20, min(distances, key=lambda pair: distances[pair])
@@ -150,7 +168,9 @@ def test_every_motif_draws(tmp_path: Path) -> None:
     for motif in MOTIFS:
         folder = tmp_path / motif
         folder.mkdir()
-        user_class(folder, f"{{shape: box, size_mm: [20, 30, 40], mass_g: 50, label: {{motif: {motif}}}}}")
+        user_class(
+            folder, f"{{shape: box, size_mm: [20, 30, 40], mass_g: 50, label: {{motif: {motif}}}}}"
+        )
         image = draw_texture(load_catalogue(folder).classes["block"]).image
         assert isinstance(image, Image.Image)
         pictures.add(image.tobytes())
@@ -172,11 +192,18 @@ def test_example_is_in_pieces_that_cover_it(built_example: Path) -> None:
     solid = trimesh.load_mesh(EXAMPLE / "mug.stl").volume
     assert solid <= sum(hull.volume for hull in hulls) < 1.3 * solid
     on_axis = np.array([-0.0175, 0.0, 0.0])  # where the coffee is
-    assert all(np.any(hull.face_normals @ on_axis > np.sum(hull.face_normals * hull.triangles[:, 0], axis=1)) for hull in hulls)
+    assert all(
+        np.any(
+            hull.face_normals @ on_axis > np.sum(hull.face_normals * hull.triangles[:, 0], axis=1)
+        )
+        for hull in hulls
+    )
 
 
 def test_example_loads_in_drake(built_example: Path) -> None:
-    plant, contacts = plant_of("package://custom_class/mug/model.sdf", built_example / "package.xml")
+    plant, contacts = plant_of(
+        "package://custom_class/mug/model.sdf", built_example / "package.xml"
+    )
     inertia = plant.GetBodyByName("body").default_spatial_inertia()
     assert inertia.get_mass() == pytest.approx(0.330, rel=1e-9)
     assert inertia.IsPhysicallyValid()
@@ -199,16 +226,24 @@ def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) ->
     inertia = plant.GetBodyByName("body").default_spatial_inertia()
     expected = 0.120 / 12 * np.diag([0.06**2 + 0.07**2, 0.05**2 + 0.07**2, 0.05**2 + 0.06**2])
     assert inertia.get_com() == pytest.approx(np.zeros(3), abs=1e-6)
-    assert inertia.CalcRotationalInertia().CopyToFullMatrix3() == pytest.approx(expected, rel=1e-4, abs=1e-9)
+    assert inertia.CalcRotationalInertia().CopyToFullMatrix3() == pytest.approx(
+        expected, rel=1e-4, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
     ("label", "complaint"),
     [
-        ("{motif: unicorns}", r"classes\.block\.label\.motif: 'unicorns'; allowed are dots, crackers"),
+        (
+            "{motif: unicorns}",
+            r"classes\.block\.label\.motif: 'unicorns'; allowed are dots, crackers",
+        ),
         ("{base: red}", r"classes\.block\.label\.base: 'red'; allowed is a colour"),
         ("{accent: '#12345'}", r"classes\.block\.label\.accent"),
-        ("{title: A title that nobody could ever read}", r"classes\.block\.label\.title: .*at most 24"),
+        (
+            "{title: A title that nobody could ever read}",
+            r"classes\.block\.label\.title: .*at most 24",
+        ),
     ],
 )
 def test_bad_label(tmp_path: Path, label: str, complaint: str) -> None:

@@ -22,7 +22,11 @@ SCATTERED = scene_of(
     resting("pudding_box", Orientation.SIDE_90, (0.0, -0.28), name="pudding"),
 )
 CROWDED = scene_of(
-    *(resting("gelatin_box", xy=(x, y), name=f"{x} {y}") for x in (-0.2, 0.0, 0.2) for y in (-0.2, 0.0, 0.2)),
+    *(
+        resting("gelatin_box", xy=(x, y), name=f"{x} {y}")
+        for x in (-0.2, 0.0, 0.2)
+        for y in (-0.2, 0.0, 0.2)
+    ),
     resting("cracker_box", xy=(0.1, 0.1), floor=0.028, name="cover"),
     # Not at a round place: where an edge meets the floor right in the middle of pixels, either may win.
     resting("cracker_box", UPRIGHT, (-0.3013, 0.1007), name="wall"),
@@ -41,7 +45,9 @@ def same(one: Images, other: Images) -> bool:
 
 
 def test_an_object_under_a_larger_one_is_hidden(camera: OverheadCamera) -> None:
-    scene = scene_of(resting("gelatin_box", name="gelatin"), resting("cracker_box", floor=0.028, name="cover"))
+    scene = scene_of(
+        resting("gelatin_box", name="gelatin"), resting("cracker_box", floor=0.028, name="cover")
+    )
     shares = camera.visible_shares(scene)
     assert shares == {"gelatin": 0.0, "cover": 1.0}
     assert camera.hidden(shares) == ("gelatin",)
@@ -54,14 +60,20 @@ def test_hidden_is_below_the_threshold_in_order() -> None:
 
 def test_half_covered(camera: OverheadCamera) -> None:
     """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
-    shares = camera.visible_shares(scene_of(BELOW, resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above")))
+    shares = camera.visible_shares(
+        scene_of(BELOW, resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"))
+    )
     assert shares["below"] == pytest.approx(0.5, abs=1 / 92)  # the box is 92 pixels long
     assert shares["above"] == 1.0
 
 
 @pytest.mark.parametrize(
     ("name", "length", "width", "height"),
-    [("sugar_box", 0.175, 0.089, 0.038), ("granola_box", 0.200, 0.140, 0.055), ("gelatin_box", 0.085, 0.073, 0.028)],
+    [
+        ("sugar_box", 0.175, 0.089, 0.038),
+        ("granola_box", 0.200, 0.140, 0.055),
+        ("gelatin_box", 0.085, 0.073, 0.028),
+    ],
 )
 def test_a_smaller_box_in_the_middle_hides_what_its_top_covers(
     name: str, length: float, width: float, height: float, camera: OverheadCamera
@@ -94,9 +106,16 @@ def test_an_object_out_of_the_frame_is_not_hidden(camera: OverheadCamera) -> Non
 
 @pytest.mark.parametrize(
     ("objects", "top"),
-    [([], 0.0), ([BELOW], 0.060), ([resting("tomato_soup_can")], 0.101), ([resting("cracker_box", UPRIGHT)], 0.230)],
+    [
+        ([], 0.0),
+        ([BELOW], 0.060),
+        ([resting("tomato_soup_can")], 0.101),
+        ([resting("cracker_box", UPRIGHT)], 0.230),
+    ],
 )
-def test_depth_in_the_middle_is_the_distance_to_the_top(objects: list[SceneObject], top: float, camera: OverheadCamera) -> None:
+def test_depth_in_the_middle_is_the_distance_to_the_top(
+    objects: list[SceneObject], top: float, camera: OverheadCamera
+) -> None:
     corner = resting("large_marker", xy=(0.3, 0.3), name="marker")
     images = camera.render(scene_of(*objects, corner))
     middle = images.depth[239:241, 319:321]
@@ -115,7 +134,9 @@ def test_shapes_and_types(camera: OverheadCamera) -> None:
     assert np.array_equal(camera.label(SCATTERED), images.label)
 
 
-def outline(camera: OverheadCamera, o: SceneObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def outline(
+    camera: OverheadCamera, o: SceneObject
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners of the object's convex outline in the image, and its centroid, in pixels."""
     points = camera.config.project(o.corners_T)
     around = points[ConvexHull(points).vertices]
@@ -152,9 +173,13 @@ def test_project_is_not_shifted(camera: OverheadCamera) -> None:
 def test_project_by_hand(camera: OverheadCamera) -> None:
     """x to the right, y up in the image; a point at half the altitude is twice as far from the middle, half a pixel off."""
     f = camera.config.focal_length
-    points = camera.config.project(np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.0, 0.16, 0.0], [0.16, 0.16, 0.8]]))
+    points = camera.config.project(
+        np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.0, 0.16, 0.0], [0.16, 0.16, 0.8]])
+    )
     middle = np.array([319.0, 239.0])
-    assert points - middle == pytest.approx(f * np.array([[0, 0], [0.1, 0], [0, -0.1], [0.2, -0.2]]))
+    assert points - middle == pytest.approx(
+        f * np.array([[0, 0], [0.1, 0], [0, -0.1], [0.2, -0.2]])
+    )
 
 
 def test_images_do_not_depend_on_what_was_rendered_before(config_camera: Camera) -> None:
@@ -203,7 +228,10 @@ def test_a_picture_from_elsewhere(camera: OverheadCamera) -> None:
 
 def test_the_detector_reports_what_is_not_hidden(detector: LabelDetector) -> None:
     scene = scene_of(
-        *(resting("gelatin_box", name="gelatin"), resting("cracker_box", floor=0.028, name="cover")),
+        *(
+            resting("gelatin_box", name="gelatin"),
+            resting("cracker_box", floor=0.028, name="cover"),
+        ),
         resting("large_marker", Orientation.FLAT_90, (0.2, 0.1), name="marker"),
     )
     look, images = detector.look(scene), detector.camera.render(scene)
@@ -227,7 +255,11 @@ def test_detections_of_a_random_heap_are_those_above_the_threshold(detector: Lab
     heap = scene_of(
         *(
             resting(
-                "pudding_box", Orientation.FLAT_60, generator.uniform(-0.1, 0.1, 2).tolist(), floor=0.035 * k, name=f"pudding {k}"
+                "pudding_box",
+                Orientation.FLAT_60,
+                generator.uniform(-0.1, 0.1, 2).tolist(),
+                floor=0.035 * k,
+                name=f"pudding {k}",
             )
             for k in range(8)
         )

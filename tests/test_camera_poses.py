@@ -51,8 +51,15 @@ def tilted() -> LabelDetector:
 def anywhere(seed: int) -> Camera:
     """A camera at a random pose."""
     generator = rng(seed)
-    translation, rpy_deg = (tuple(generator.uniform(-most, most, 3).tolist()) for most in (2.0, 180.0))
-    return Camera(pose=PoseSpec(translation=translation, rpy_deg=rpy_deg), width=320 + seed, height=240 - seed, fov_y_deg=50.0)
+    translation, rpy_deg = (
+        tuple(generator.uniform(-most, most, 3).tolist()) for most in (2.0, 180.0)
+    )
+    return Camera(
+        pose=PoseSpec(translation=translation, rpy_deg=rpy_deg),
+        width=320 + seed,
+        height=240 - seed,
+        fov_y_deg=50.0,
+    )
 
 
 # --- The model ---
@@ -84,7 +91,9 @@ def test_a_pose_in_the_camera_s_frame(seed: int) -> None:
     R, p = Rotation.random(rng=generator).as_matrix(), generator.uniform(-1, 1, 3)
     R_CO, p_CO = pose_in_camera(camera.pinhole, R, p)
     corner = generator.uniform(-0.1, 0.1, 3)
-    assert R_CO @ corner + p_CO == pytest.approx(camera.to_camera((R @ corner + p)[None])[0], abs=1e-12)
+    assert R_CO @ corner + p_CO == pytest.approx(
+        camera.to_camera((R @ corner + p)[None])[0], abs=1e-12
+    )
 
 
 def test_a_camera_that_looks_straight_down_is_exact() -> None:
@@ -92,7 +101,9 @@ def test_a_camera_that_looks_straight_down_is_exact() -> None:
     camera, p_T = DEFAULT_CELL.camera, rng(0).uniform(-0.5, 0.5, (100, 3))
     assert camera.vertical
     assert not CAMERA.vertical
-    assert np.array_equal(camera.to_camera(p_T), np.column_stack([p_T[:, 0], -p_T[:, 1], 1.6 - p_T[:, 2]]))
+    assert np.array_equal(
+        camera.to_camera(p_T), np.column_stack([p_T[:, 0], -p_T[:, 1], 1.6 - p_T[:, 2]])
+    )
     depth = rng(1).uniform(1.0, 1.6, 100).astype(np.float32)
     pixels = rng(2).integers(0, 400, (100, 2)).astype(np.float32)
     assert camera.backproject(pixels, depth).dtype == np.dtype(np.float32)
@@ -102,12 +113,16 @@ def test_a_camera_that_looks_straight_down_is_exact() -> None:
 
 def test_the_floor_s_depth_and_its_horizon() -> None:
     pixels = pixel_grid((480, 640))
-    assert CAMERA.backproject(pixels, CAMERA.floor_depth.astype(float))[..., 2] == pytest.approx(0.0, abs=1e-6)
+    assert CAMERA.backproject(pixels, CAMERA.floor_depth.astype(float))[..., 2] == pytest.approx(
+        0.0, abs=1e-6
+    )
     level = Camera(pose=PoseSpec(translation=(0.0, -2.0, 0.4), rpy_deg=(-90.0, 0.0, 0.0)))
     row = level.principal_point[1]
     assert np.isinf(level.floor_depth[: int(row) + 1]).all()
     below = np.arange(480) > row + 1
-    assert level.floor_depth[below, 0] == pytest.approx(0.4 * level.focal_length / (np.arange(480)[below] - row), rel=1e-5)
+    assert level.floor_depth[below, 0] == pytest.approx(
+        0.4 * level.focal_length / (np.arange(480)[below] - row), rel=1e-5
+    )
     assert np.array_equal(RayCaster(level).observe(scene_of())[0].depth, level.floor_depth)
 
 
@@ -124,7 +139,9 @@ def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: Labe
     cast = labels(scene, OPEN_MINDED)
     assert (cast == rendered).mean() >= 0.9999
     errors = [
-        np.abs(observation.depth - look.observation.depth)[binary_erosion((rendered == k) & (cast == k))]
+        np.abs(observation.depth - look.observation.depth)[
+            binary_erosion((rendered == k) & (cast == k))
+        ]
         for k in range(len(scene.objects))
     ]
     error = np.concatenate(errors)
@@ -144,10 +161,14 @@ def test_the_floor_of_a_tilted_camera_is_the_rendered_one(tilted: LabelDetector)
 def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]) -> None:
     """Each at 1.3 m from a point above the tray's middle; some objects are cut off by the frame."""
     axis = Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()[:, 2]
-    pose = PoseSpec(translation=tuple((np.array([0.0, 0.0, 0.1]) - 1.3 * axis).tolist()), rpy_deg=rpy_deg)
+    pose = PoseSpec(
+        translation=tuple((np.array([0.0, 0.0, 0.1]) - 1.3 * axis).tolist()), rpy_deg=rpy_deg
+    )
     config = Camera(pose=pose, width=320, height=240, visibility_threshold=1e-9)
     scene, camera, caster = SCENES["tumbled 0"], OverheadCamera(config), RayCaster(config)
-    assert caster.visible_shares(scene.objects) == pytest.approx(camera.visible_shares(scene), abs=0.02)
+    assert caster.visible_shares(scene.objects) == pytest.approx(
+        camera.visible_shares(scene), abs=0.02
+    )
     assert (labels(scene, caster) == camera.label(scene)).mean() >= 0.9995
 
 
@@ -164,16 +185,23 @@ def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDet
     assert np.abs(np.mean(shifts, axis=0)).max() < 0.25  # pixels
 
 
-def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(detector: LabelDetector, tilted: LabelDetector) -> None:
+def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(
+    detector: LabelDetector, tilted: LabelDetector
+) -> None:
     """What stands close behind a high box, from where the camera is."""
-    scene = scene_of(resting("cracker_box", Orientation.UPRIGHT_0, (0.0, 0.0), name="wall"), resting("gelatin_box", xy=(0, 0.08)))
+    scene = scene_of(
+        resting("cracker_box", Orientation.UPRIGHT_0, (0.0, 0.0), name="wall"),
+        resting("gelatin_box", xy=(0, 0.08)),
+    )
     assert tilted.look(scene).visible_share["gelatin_box"] < 0.3
     assert detector.look(scene).visible_share["gelatin_box"] == 1.0
 
 
 def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
     low = Camera(pose=PoseSpec(translation=(0.0, 0.0, 0.3), rpy_deg=(-100.0, 0.0, 0.0)))
-    beneath = scene_of(resting("sugar_box", xy=(0.0, -0.05), name="beneath"), resting("gelatin_box", xy=(0.0, 0.9)))
+    beneath = scene_of(
+        resting("sugar_box", xy=(0.0, -0.05), name="beneath"), resting("gelatin_box", xy=(0.0, 0.9))
+    )
     assert RayCaster(low).visible_shares(beneath.objects) == {"beneath": 1.0, "gelatin_box": 1.0}
     assert [d.name for d in RayCaster(low).observe(beneath)[0].detections] == ["gelatin_box"]
 
@@ -204,7 +232,9 @@ def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelD
 @pytest.mark.parametrize("camera", [CAMERA, DEFAULT_CELL.camera], ids=["tilted", "vertical"])
 def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
     window = Window.of(camera, tray(0.70))
-    corners = camera.project(np.array([[x, y, z] for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)]))
+    corners = camera.project(
+        np.array([[x, y, z] for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)])
+    )
     assert (corners >= [window.columns.start, window.rows.start]).all()
     assert (corners < [window.columns.stop, window.rows.stop]).all()
     assert window.side % 16 == 0
@@ -235,9 +265,18 @@ def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetecto
 
 def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
     """Behind a wall the air is unseen although nothing is above it, and so it is out of the frame."""
-    observation = tilted.look(scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))).observation
+    observation = tilted.look(
+        scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))
+    ).observation
     points = np.array(
-        [[0.0, 0.06, 0.05], [0.0, -0.06, 0.05], [0.0, 0.30, 0.05], [0.0, 0.0, 0.24], [0.0, 3.0, 0.0], [0.0, -2.0, 2.0]]
+        [
+            [0.0, 0.06, 0.05],
+            [0.0, -0.06, 0.05],
+            [0.0, 0.30, 0.05],
+            [0.0, 0.0, 0.24],
+            [0.0, 3.0, 0.0],
+            [0.0, -2.0, 2.0],
+        ]
     )
     assert seen_through(observation, points).tolist() == [False, True, True, True, False, False]
     assert has_clear_top(observation, observation["wall"])
@@ -251,7 +290,9 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
     observation = tilted.look(scene_of(wall, hidden)).observation
     assert [d.name for d in observation.detections] == ["wall"]
     blocks = unseen_blocks([wall], observation, empty)
-    grid = np.stack(np.meshgrid(*(np.linspace(-0.9, 0.9, 9) for _ in range(3))), axis=-1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(*(np.linspace(-0.9, 0.9, 9) for _ in range(3))), axis=-1).reshape(
+        -1, 3
+    )
     p_T = hidden.X_TO.apply(grid * np.asarray(hidden.object_class.size) / 2)
     beside = (np.abs(p_T - wall.X_TO.p) < np.ptp(wall.corners_T, axis=0) / 2 + 0.03).all(axis=1)
     unseen = p_T[~seen_through(observation, p_T) & ~beside & (p_T[:, 2] > 0.012)]
@@ -281,8 +322,14 @@ def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("cameras.overhead.pose.roll=0", r"cameras\.overhead: sees nothing of the support; allowed is a pose"),
-        ("cameras.overhead.pose.x=5", r"cameras\.overhead: sees nothing of the support; allowed is a pose"),
+        (
+            "cameras.overhead.pose.roll=0",
+            r"cameras\.overhead: sees nothing of the support; allowed is a pose",
+        ),
+        (
+            "cameras.overhead.pose.x=5",
+            r"cameras\.overhead: sees nothing of the support; allowed is a pose",
+        ),
     ],
 )
 def test_a_camera_that_sees_nothing_of_the_support_is_refused(setting: str, message: str) -> None:
@@ -300,7 +347,9 @@ def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
     shares = render_scene(scene, world, tmp_path)
     assert shares == {"sugar_box": 1.0}
     files = {
-        f"{name}_{kind}" for name in ("overhead", "aside") for kind in ("color.png", "depth.png", "label.png", "visible.json")
+        f"{name}_{kind}"
+        for name in ("overhead", "aside")
+        for kind in ("color.png", "depth.png", "label.png", "visible.json")
     }
     assert {path.name for path in tmp_path.iterdir()} == {*files, "picture.png"}
     with pytest.raises(InputError, match="a camera's name"):
@@ -308,21 +357,35 @@ def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
 
 
 def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
-    scenario = load_typed(Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], convert=upgrade)
+    scenario = load_typed(
+        Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], convert=upgrade
+    )
     assert not scenario.world.cell.camera.depth_noise
     assert scenario.world.cell.camera.pose == DEFAULT_CELL.camera.pose
     assert Scenario().world.cell.camera.depth_noise
 
 
 @pytest.mark.parametrize("height", [0.10, 0.15, 0.30, 0.60])
-def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(height: float) -> None:
+def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(
+    height: float,
+) -> None:
     """A stranger that stands higher than the camera hides nothing behind the camera."""
-    camera = Camera(pose=PoseSpec(translation=(0.0, -1.0, height), rpy_deg=(-90.0 - 20.0 * height, 0.0, 0.0)))
-    detector, stranger = LabelDetector(camera), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0))
+    camera = Camera(
+        pose=PoseSpec(translation=(0.0, -1.0, height), rpy_deg=(-90.0 - 20.0 * height, 0.0, 0.0))
+    )
+    detector, stranger = (
+        LabelDetector(camera),
+        resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0)),
+    )
     empty = np.where(camera.floor_depth < 5, camera.floor_depth, np.float32(np.inf))
-    blocks = unseen_blocks([], replace(detector.look(scene_of(stranger)).observation, detections=()), empty)
+    blocks = unseen_blocks(
+        [], replace(detector.look(scene_of(stranger)).observation, detections=()), empty
+    )
     assert blocks
     for block in blocks:
-        low, high = np.array(block.middle) - np.array(block.size) / 2, np.array(block.middle) + np.array(block.size) / 2
+        low, high = (
+            np.array(block.middle) - np.array(block.size) / 2,
+            np.array(block.middle) + np.array(block.size) / 2,
+        )
         assert np.abs([low[:2], high[:2]]).max() < 0.36 * math.sqrt(2)
         assert high[2] < 0.25

@@ -29,24 +29,34 @@ def test_canonical_form_ignores_the_order_of_siblings() -> None:
 
 @pytest.mark.parametrize("class_name", ["tomato_soup_can", "master_chef_can"])
 def test_a_can_looks_the_same_in_all_ten(class_name: str) -> None:
-    assert len({form(single(class_name, orientation.name.lower())) for orientation in Orientation}) == 1
+    assert (
+        len({form(single(class_name, orientation.name.lower())) for orientation in Orientation})
+        == 1
+    )
 
 
 def test_a_markers_symmetric_orientations() -> None:
     """It lies in all ten, and looks the same rolled about its axis."""
     by_form: dict[str, set[str]] = {}
     for orientation in Orientation:
-        by_form.setdefault(form(single("large_marker", orientation.name.lower())), set()).add(orientation.name.lower())
+        by_form.setdefault(form(single("large_marker", orientation.name.lower())), set()).add(
+            orientation.name.lower()
+        )
     assert sorted(map(sorted, by_form.values())) == [
         *(["flat_0", "side_0", "upright_0"], ["flat_120"], ["flat_150"], ["flat_30"], ["flat_60"]),
         ["flat_90", "side_90", "upright_90"],
     ]
 
 
-@pytest.mark.parametrize("class_name", [name for name, entry in CLASSES.items() if entry.shape.value == "box"])
+@pytest.mark.parametrize(
+    "class_name", [name for name, entry in CLASSES.items() if entry.shape.value == "box"]
+)
 def test_a_boxs_ten_orientations_differ(class_name: str) -> None:
     grammar = GRAMMARS["pantry14"]
-    forms = {canonical_form(grammar.replay(single(class_name, orientation.name.lower())), CLASSES) for orientation in Orientation}
+    forms = {
+        canonical_form(grammar.replay(single(class_name, orientation.name.lower())), CLASSES)
+        for orientation in Orientation
+    }
     assert len(forms) == 10
 
 
@@ -55,7 +65,9 @@ def test_canonical_form_tells_structures_apart() -> None:
     one_flat = single("gelatin_box", "flat_0")
     forms = [
         form(one_flat + one_flat),  # side by side
-        form(("drop_object", "stack_object", "end", two, two, "orient_flat_0", "orient_flat_0")),  # one on the other
+        form(
+            ("drop_object", "stack_object", "end", two, two, "orient_flat_0", "orient_flat_0")
+        ),  # one on the other
         form(("drop_object", "end", pair)),  # side by side, as a pair
         form(("drop_object", "stack_object", "end", pair, two, "orient_flat_0")),  # on a pair
         form(("drop_object", "stack_object", "end", two, pair, "orient_flat_0")),  # a pair on top
@@ -76,7 +88,11 @@ def test_canonical_form_of_a_tower_of_pairs_stays_short() -> None:
 @pytest.mark.parametrize("entry", CLASSES.values(), ids=list(CLASSES))
 def test_resting_rotations(entry: ObjectClass) -> None:
     shortest, middle, longest = sorted(entry.size)
-    extents = {Rest.FLAT: (longest, shortest), Rest.SIDE: (longest, middle), Rest.UPRIGHT: (middle, longest)}
+    extents = {
+        Rest.FLAT: (longest, shortest),
+        Rest.SIDE: (longest, middle),
+        Rest.UPRIGHT: (middle, longest),
+    }
     for orientation in Orientation:
         R_TO = resting_rotation(entry, orientation)
         assert np.allclose(R_TO @ R_TO.T, np.eye(3), atol=1e-12)
@@ -88,5 +104,11 @@ def test_resting_rotations(entry: ObjectClass) -> None:
 
 
 def test_orientations_are_ten() -> None:
-    assert Counter(orientation.rest for orientation in Orientation) == {Rest.FLAT: 6, Rest.SIDE: 2, Rest.UPRIGHT: 2}
-    assert [np.degrees(o.yaw) for o in Orientation if o.rest is Rest.FLAT] == pytest.approx([0, 30, 60, 90, 120, 150])
+    assert Counter(orientation.rest for orientation in Orientation) == {
+        Rest.FLAT: 6,
+        Rest.SIDE: 2,
+        Rest.UPRIGHT: 2,
+    }
+    assert [np.degrees(o.yaw) for o in Orientation if o.rest is Rest.FLAT] == pytest.approx(
+        [0, 30, 60, 90, 120, 150]
+    )

@@ -29,7 +29,9 @@ def test_shipped_sets() -> None:
     assert pantry14[:7] == ycb7
     assert {entry.name for entry in pantry14} == set(catalogue.classes)
     # 3 structure rules, a single per class, a rule per pair, 10 orientations: the paper's 30 and 49.
-    assert [13 + sum(1 + len(entry.pairs) for entry in entries) for entries in (ycb7, pantry14)] == [30, 49]
+    assert [
+        13 + sum(1 + len(entry.pairs) for entry in entries) for entries in (ycb7, pantry14)
+    ] == [30, 49]
 
 
 @pytest.mark.parametrize(
@@ -45,7 +47,9 @@ def test_shipped_sets() -> None:
         ("pringles_can", Shape.CYLINDER, (0.075, 0.075, 0.250), 0.205),
     ],
 )
-def test_ycb_measures(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> None:
+def test_ycb_measures(
+    name: str, shape: Shape, size: tuple[float, float, float], mass: float
+) -> None:
     entry = load_catalogue().classes[name]
     assert entry.shape is shape
     assert entry.size == pytest.approx(size)
@@ -73,7 +77,9 @@ def test_corners_span_the_size(name: str) -> None:
 
 
 def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
-    user_catalogue(tmp_path, f"classes:\n  brick: {{{BOX}}}\nobject_sets:\n  mixed: [sugar_box, brick]\n")
+    user_catalogue(
+        tmp_path, f"classes:\n  brick: {{{BOX}}}\nobject_sets:\n  mixed: [sugar_box, brick]\n"
+    )
     catalogue = load_catalogue(tmp_path)
     assert [entry.name for entry in catalogue.object_set("mixed")] == ["sugar_box", "brick"]
     assert catalogue.classes["brick"].folder == tmp_path.resolve() / "brick"
@@ -91,22 +97,40 @@ def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
             "brick: {shape: box, size_mm: [10, 20], mass_g: 5}",
             r"size_mm: \[10, 20\]; allowed is a list of 3 numbers",
         ),
-        ("brick: {shape: box, size_mm: [10, -20, 30], mass_g: 5}", r"size_mm\[1\]: -20; allowed is .* from 3 to 1000"),
+        (
+            "brick: {shape: box, size_mm: [10, -20, 30], mass_g: 5}",
+            r"size_mm\[1\]: -20; allowed is .* from 3 to 1000",
+        ),
         ("brick: {shape: box, size_mm: [10, .nan, 30], mass_g: 5}", r"classes\.brick\.size_mm"),
         (
             "brick: {shape: cylinder, size_mm: [10, 20, 30], mass_g: 5}",
             r"size_mm: .*\[10, 20, 30\]; allowed is diameter, ",
         ),
-        ("brick: {shape: box, size_mm: [10, 20, 30]}", r"classes\.brick\.mass_g: is missing; needed are shape, mass_g"),
+        (
+            "brick: {shape: box, size_mm: [10, 20, 30]}",
+            r"classes\.brick\.mass_g: is missing; needed are shape, mass_g",
+        ),
         ("brick: {shape: box, size_mm: [10, 20, 30], mass_g: 0}", r"classes\.brick\.mass_g: 0"),
-        (f"brick: {{{BOX}, pairs: [leaning]}}", r"classes\.brick\.pairs\[0\]: 'leaning'; allowed is one of lying, standing"),
+        (
+            f"brick: {{{BOX}, pairs: [leaning]}}",
+            r"classes\.brick\.pairs\[0\]: 'leaning'; allowed is one of lying, standing",
+        ),
         (f"brick: {{{BOX}, pairs: [lying, lying]}}", r"classes\.brick\.pairs: .*once"),
-        (f"brick: {{{BOX}, colour: red}}", r"classes\.brick\.colour: is unknown; allowed are shape, size_mm"),
+        (
+            f"brick: {{{BOX}, colour: red}}",
+            r"classes\.brick\.colour: is unknown; allowed are shape, size_mm",
+        ),
         (f"Brick: {{{BOX}}}", r"classes\.Brick: 'Brick'; allowed is a name of lower-case letters"),
         (f"tray: {{{BOX}}}", r"classes\.tray: 'tray'; allowed is a name of .* none of .*tray"),
         (f"sugar_box: {{{BOX}}}", r"classes\.sugar_box: is shipped already"),
-        ("brick: {shape: mesh, mass_g: 5}", r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh"),
-        (f"brick: {{{BOX}, mesh: brick.stl}}", r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh"),
+        (
+            "brick: {shape: mesh, mass_g: 5}",
+            r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh",
+        ),
+        (
+            f"brick: {{{BOX}, mesh: brick.stl}}",
+            r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh",
+        ),
         ("brick: {shape: mesh, mesh: brick.stl, mass_g: 5}", r"classes\.brick\.mesh: no file"),
     ],
 )
@@ -120,7 +144,9 @@ def test_bad_class(tmp_path: Path, entry: str, complaint: str) -> None:
 @pytest.mark.parametrize("members", ["[sugar_box, teapot]", "[sugar_box, sugar_box]", "[]"])
 def test_bad_object_set(tmp_path: Path, members: str) -> None:
     user_catalogue(tmp_path, f"object_sets:\n  tea: {members}\n")
-    with pytest.raises(InputError, match=r"object_sets\.tea: .*allowed is a list, without repeats, of cracker_box"):
+    with pytest.raises(
+        InputError, match=r"object_sets\.tea: .*allowed is a list, without repeats, of cracker_box"
+    ):
         load_catalogue(tmp_path)
 
 
@@ -130,7 +156,9 @@ def test_unknown_object_set() -> None:
 
 
 def test_no_catalogue(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no such file; a catalogue is a folder that holds catalogue\.yaml"):
+    with pytest.raises(
+        InputError, match=r"no such file; a catalogue is a folder that holds catalogue\.yaml"
+    ):
         load_catalogue(tmp_path)
 
 
@@ -181,11 +209,15 @@ def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
         made = add_scene_plant(DiagramBuilder(), [("it", entry)], TRAY, 0.01, visuals=False)
         return float(made.bodies["it"].default_mass())
 
-    with pytest.raises(InputError, match="class block has no assets; run `drake-clutter assets build"):
+    with pytest.raises(
+        InputError, match="class block has no assets; run `drake-clutter assets build"
+    ):
         body_mass(block(100))
     build_assets(tmp_path)
     assert body_mass(block(100)) == pytest.approx(0.100)
-    with pytest.raises(InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalogue's, 0\.15 kg; run"):
+    with pytest.raises(
+        InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalogue's, 0\.15 kg; run"
+    ):
         body_mass(block(150))
     build_assets(tmp_path)
     assert body_mass(block(150)) == pytest.approx(0.150)

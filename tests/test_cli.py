@@ -17,14 +17,27 @@ from PIL import Image
 
 FLAT = [0.7071, 0.0, 0.7071, 0.0]
 ALONE = {"translation": [0.0, 0.0, 0.03], "quaternion": FLAT}
-BELOW = {"name": "below", "class": "gelatin_box", "X_TO": {"translation": [0.0, 0.0, 0.014], "quaternion": FLAT}}
-ABOVE = {"name": "above", "class": "cracker_box", "X_TO": {"translation": [0.0, 0.0, 0.058], "quaternion": FLAT}}
+BELOW = {
+    "name": "below",
+    "class": "gelatin_box",
+    "X_TO": {"translation": [0.0, 0.0, 0.014], "quaternion": FLAT},
+}
+ABOVE = {
+    "name": "above",
+    "class": "cracker_box",
+    "X_TO": {"translation": [0.0, 0.0, 0.058], "quaternion": FLAT},
+}
 SCENE = {"version": 1, "objects": [BELOW, ABOVE]}
 
 
 def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
     """Runs the command in a process of its own, as a user would."""
-    command = [sys.executable, "-c", "from drake_clutter.cli import main; main()", *map(str, arguments)]
+    command = [
+        sys.executable,
+        "-c",
+        "from drake_clutter.cli import main; main()",
+        *map(str, arguments),
+    ]
     result = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert result.returncode == code, f"{result.returncode}\n{result.stdout}\n{result.stderr}"
     return result
@@ -44,7 +57,19 @@ def scenes_of(folder: Path) -> dict[str, bytes]:
 
 def generate(out: Path, count: int, *more: str) -> dict[str, object]:
     summary: dict[str, object] = json.loads(
-        run("generate", "--nodes", "6", "--count", str(count), "--seed", "5", "--json", "--out", out, *more).stdout
+        run(
+            "generate",
+            "--nodes",
+            "6",
+            "--count",
+            str(count),
+            "--seed",
+            "5",
+            "--json",
+            "--out",
+            out,
+            *more,
+        ).stdout
     )
     return summary
 
@@ -54,9 +79,16 @@ def test_generate_resumes_and_is_the_same_for_any_number_of_workers(tmp_path: Pa
     generate(tmp_path / "parts", 2)
     parts = generate(tmp_path / "parts", 4)
     assert scenes_of(tmp_path / "whole") == scenes_of(tmp_path / "parts")
-    assert list(scenes_of(tmp_path / "whole")) == ["0000.yaml", "0001.yaml", "0002.yaml", "0003.yaml"]
+    assert list(scenes_of(tmp_path / "whole")) == [
+        "0000.yaml",
+        "0001.yaml",
+        "0002.yaml",
+        "0003.yaml",
+    ]
     timing = {"seconds", "workers"}
-    assert {k: v for k, v in whole.items() if k not in timing} == {k: v for k, v in parts.items() if k not in timing}
+    assert {k: v for k, v in whole.items() if k not in timing} == {
+        k: v for k, v in parts.items() if k not in timing
+    }
     fields = "nodes count stability_rate stability_ci95 hidden_mean hidden_ci95 distinct_share mean_stacks seconds seed config"
     assert set(fields.split()) <= set(whole)
     assert json.loads((tmp_path / "whole/summary.json").read_text()) == whole
@@ -109,7 +141,12 @@ def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: P
     out = tmp_path / "solution"
     printed = json.loads(run("solve", scene, "--json", "--out", out).stdout)
     assert printed == json.loads((out / "solution.json").read_text())
-    assert (printed["answer"], printed["moves"], printed["fewest"], printed["confirmed"]) == ("solvable", 1, True, True)
+    assert (printed["answer"], printed["moves"], printed["fewest"], printed["confirmed"]) == (
+        "solvable",
+        1,
+        True,
+        True,
+    )
     assert yaml.safe_load((out / "moves.yaml").read_text()) == [{"pick": "above", "place": "tray"}]
     assert json.loads((out / "episode.json").read_text())["found"] == ["below"]
     assert (out / "index.html").is_file()
@@ -117,19 +154,44 @@ def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: P
 
 def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
-    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": settled}
+    verdict = {
+        "stable": True,
+        "hidden": ["below"],
+        "visible_share": {"below": 0.0, "above": 1.0},
+        "settled": settled,
+    }
     (tmp_path / "scenes").mkdir()
     for name in ("one", "two"):
         (tmp_path / f"scenes/{name}.yaml").write_text(broken(verdict=verdict))
     alone, together = tmp_path / "alone.json", tmp_path / "together.json"
-    given = ("evaluate", "--scenes", tmp_path / "scenes", "--agents", "random,largest-first", "--max-moves", "2")
+    given = (
+        "evaluate",
+        "--scenes",
+        tmp_path / "scenes",
+        "--agents",
+        "random,largest-first",
+        "--max-moves",
+        "2",
+    )
     run(*given, "--out", alone)
     agents = ("--agent", "random", "--agent", "largest-first")
-    run("evaluate", tmp_path / "scenes", *agents, "--max-moves", "2", "--workers", "2", "--out", together)
+    run(
+        "evaluate",
+        tmp_path / "scenes",
+        *agents,
+        "--max-moves",
+        "2",
+        "--workers",
+        "2",
+        "--out",
+        together,
+    )
     assert alone.read_bytes() == together.read_bytes()
     written = json.loads(alone.read_text())
     files = [tmp_path / "scenes/one.yaml", tmp_path / "scenes/two.yaml"]
-    assert written["scenes"] == {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    assert written["scenes"] == {
+        str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+    }
     random, largest_first = written["rows"]
     assert random["agent"] == "random"
     assert largest_first["within_2"]["success"] == 1.0
@@ -138,7 +200,18 @@ def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
 
 
 def test_evaluate_knows_the_frozen_sets_by_name() -> None:
-    shown = run("evaluate", "--scenes", "sg_star_10", "--count", "2", "--agents", "largest-clear", "--fidelity", "fast", "--json")
+    shown = run(
+        "evaluate",
+        "--scenes",
+        "sg_star_10",
+        "--count",
+        "2",
+        "--agents",
+        "largest-clear",
+        "--fidelity",
+        "fast",
+        "--json",
+    )
     (row,) = json.loads(shown.stdout)
     assert (row["agent"], row["episodes"]) == ("largest-clear", 2)
     assert row["hidden"] > 0
@@ -151,7 +224,10 @@ def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
     run("move", scene, "--moves", moves, "--out", tmp_path / "out")
     episode = json.loads((tmp_path / "out/episode.json").read_text())
     assert [step["outcome"] for step in episode["moves"]] == ["placed", "placed"]
-    after = {o["name"]: o["X_TO"]["translation"] for o in yaml.safe_load((tmp_path / "out/after.yaml").read_text())["objects"]}
+    after = {
+        o["name"]: o["X_TO"]["translation"]
+        for o in yaml.safe_load((tmp_path / "out/after.yaml").read_text())["objects"]
+    }
     assert after["below"][2] == pytest.approx(0.060 + 0.014, abs=5e-4)
     assert np.allclose(after["below"][:2], after["above"][:2], atol=0.01)
 
@@ -201,16 +277,26 @@ def broken(**changes: object) -> str:
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_leaves_nothing(
-    tmp_path: Path, scene: Path, arguments: Sequence[str], says: Sequence[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    scene: Path,
+    arguments: Sequence[str],
+    says: Sequence[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
     (tmp_path / "config.yaml").write_text("camera: {visibility_threshold: -1}")
-    (tmp_path / "unknown.yaml").write_text(broken(objects=[{"name": "a", "class": "teapot", "X_TO": ALONE}]))
-    (tmp_path / "overlap.yaml").write_text(broken(objects=[BELOW, {**ABOVE, "X_TO": {**ALONE, "translation": [0.0, 0.0, 0.05]}}]))
+    (tmp_path / "unknown.yaml").write_text(
+        broken(objects=[{"name": "a", "class": "teapot", "X_TO": ALONE}])
+    )
+    (tmp_path / "overlap.yaml").write_text(
+        broken(objects=[BELOW, {**ABOVE, "X_TO": {**ALONE, "translation": [0.0, 0.0, 0.05]}}])
+    )
     high = {**ALONE, "translation": [0.0, 0.0, 0.3]}
-    (tmp_path / "unstable.yaml").write_text(broken(objects=[{"name": "a", "class": "cracker_box", "X_TO": high}]))
+    (tmp_path / "unstable.yaml").write_text(
+        broken(objects=[{"name": "a", "class": "cracker_box", "X_TO": high}])
+    )
     before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
     result = run(*arguments, code=2)
     assert result.stderr.startswith("error")

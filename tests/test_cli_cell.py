@@ -20,7 +20,9 @@ from drake_clutter.station.trajectory_file import read_trajectories
 from drake_clutter.validation import config_yaml, to_plain, validate
 
 UR5E = shipped_path("models/cells/ur5e_epick_tray.yaml")
-SCENE = scene_of(resting("gelatin_box", xy=(-0.1, 0.1)), resting("pudding_box", xy=(0.15, -0.1)), side=0.6)
+SCENE = scene_of(
+    resting("gelatin_box", xy=(-0.1, 0.1)), resting("pudding_box", xy=(0.15, -0.1)), side=0.6
+)
 
 
 @pytest.fixture
@@ -37,9 +39,22 @@ def run(*arguments: str | Path) -> None:
     assert told.exit_code == 0, told.output
 
 
-def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(scene_file: Path, tmp_path: Path) -> None:
+def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(
+    scene_file: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
-    run("move", scene_file, "--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--out", out)
+    run(
+        "move",
+        scene_file,
+        "--pick",
+        "gelatin_box",
+        "--place",
+        "tray",
+        "--fidelity",
+        "arm",
+        "--out",
+        out,
+    )
     expected = load_cell(UR5E).with_support(SCENE.support)
     _, cell, moves = read_trajectories(out / "trajectory.h5", load_catalogue())
     assert cell == expected
@@ -50,10 +65,14 @@ def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(scene_f
     assert episode["moves"][0]["outcome"] == "placed"
 
 
-def test_options_go_over_the_scene_s_cell_but_for_its_support(scene_file: Path, tmp_path: Path) -> None:
+def test_options_go_over_the_scene_s_cell_but_for_its_support(
+    scene_file: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     cell = tmp_path / "higher.yaml"
-    higher = DEFAULT_CELL.model_copy(update={"robot": DEFAULT_CELL.robot.model_copy(update={"payload": 9.0})})
+    higher = DEFAULT_CELL.model_copy(
+        update={"robot": DEFAULT_CELL.robot.model_copy(update={"payload": 9.0})}
+    )
     cell.write_text(config_yaml(higher))
     moves = ("--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--plan-only")
     run("move", scene_file, *moves, "--cell", cell, "--set", "robot.base.z=0.35", "--out", out)
@@ -70,15 +89,21 @@ def test_a_scenario_has_the_support_of_its_scene(scene_file: Path) -> None:
     assert _load_scenario(None, UR5E, []).world.cell == load_cell(UR5E)
 
 
-@pytest.mark.parametrize("setting", ["support.size=[0.8, 0.8]", "cell.support.floor_height=0.2", "layout.tray_side=0.8"])
-def test_scenes_keep_the_support_on_which_their_objects_stand(setting: str, scene_file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "setting", ["support.size=[0.8, 0.8]", "cell.support.floor_height=0.2", "layout.tray_side=0.8"]
+)
+def test_scenes_keep_the_support_on_which_their_objects_stand(
+    setting: str, scene_file: Path, tmp_path: Path
+) -> None:
     commands: list[list[str | Path]] = [
         ["feasibility", scene_file],
         ["evaluate", tmp_path],
         ["run", "--set", f"scene={scene_file}"],
     ]
     for command in commands:
-        with pytest.raises(InputError, match="the objects stand on their scene's support; allowed are other fields"):
+        with pytest.raises(
+            InputError, match="the objects stand on their scene's support; allowed are other fields"
+        ):
             run(*command, "--set", setting, "--out", tmp_path / "out")
 
 
@@ -94,17 +119,37 @@ def test_scenes_keep_the_support_on_which_their_objects_stand(setting: str, scen
         ({"robot": {"arm": 3}}, r"robot\.arm: is unknown; allowed are"),
         ({"gripper": {"kind": "hand"}}, r"gripper\.kind: 'hand'; allowed"),
         ({"support": {"size": [9.0, 0.5]}}, r"support\.size\[0\]: 9\.0; allowed"),
-        ({"cameras": {"overhead": {"pose": {"rpy_deg": [0, 0, 0]}}}}, r"sees nothing of the support; allowed"),
+        (
+            {"cameras": {"overhead": {"pose": {"rpy_deg": [0, 0, 0]}}}},
+            r"sees nothing of the support; allowed",
+        ),
         ({"fixtures": [{"name": "post"}]}, r"fixtures\[0\].*allowed"),
     ],
 )
-def test_a_cell_that_is_none_is_one_line(change: dict[str, object], message: str, scene_file: Path, tmp_path: Path) -> None:
+def test_a_cell_that_is_none_is_one_line(
+    change: dict[str, object], message: str, scene_file: Path, tmp_path: Path
+) -> None:
     cell = tmp_path / "cell.yaml"
     document = to_plain(DEFAULT_CELL)
     for part, fields in change.items():
-        document[part] = {**document[part], **fields} if isinstance(fields, dict) and part != "cameras" else fields
+        document[part] = (
+            {**document[part], **fields}
+            if isinstance(fields, dict) and part != "cameras"
+            else fields
+        )
     cell.write_text(yaml.safe_dump(document))
-    arguments = ("move", scene_file, "--pick", "gelatin_box", "--place", "tray", "--fidelity", "arm", "--cell", cell)
+    arguments = (
+        "move",
+        scene_file,
+        "--pick",
+        "gelatin_box",
+        "--place",
+        "tray",
+        "--fidelity",
+        "arm",
+        "--cell",
+        cell,
+    )
     with pytest.raises(InputError, match=message) as refusal:
         run(*arguments, "--out", tmp_path / "out")
     assert "\n" not in str(refusal.value)
@@ -112,17 +157,24 @@ def test_a_cell_that_is_none_is_one_line(change: dict[str, object], message: str
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
-@pytest.mark.parametrize("options", [("--cell", "own.yaml"), ("--config", "config.yaml"), ("--set", "robot.model=none.sdf")])
+@pytest.mark.parametrize(
+    "options",
+    [("--cell", "own.yaml"), ("--config", "config.yaml"), ("--set", "robot.model=none.sdf")],
+)
 def test_commands_that_need_no_arm_check_the_cell_too(
     options: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it fails hours later, with the scenes that were made with it."""
     monkeypatch.chdir(tmp_path)
-    own = DEFAULT_CELL.model_copy(update={"robot": DEFAULT_CELL.robot.model_copy(update={"model": "none.sdf"})})
+    own = DEFAULT_CELL.model_copy(
+        update={"robot": DEFAULT_CELL.robot.model_copy(update={"model": "none.sdf"})}
+    )
     Path("own.yaml").write_text(config_yaml(own))
     Path("config.yaml").write_text("cell: {robot: {model: none.sdf}}")
     source = "--set" if options[0] == "--set" else options[1]
-    with pytest.raises(InputError, match=rf"{source}: robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"):
+    with pytest.raises(
+        InputError, match=rf"{source}: robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"
+    ):
         run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
     assert not Path("out").exists()
 
@@ -150,5 +202,7 @@ def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> 
     (tmp_path / "other").mkdir()
     other = tmp_path / "other" / UR5E.name
     other.write_text(config_yaml(load_cell(UR5E)))
-    with pytest.raises(InputError, match="--cell, --arm: ur5e_epick_tray is there twice; allowed are files"):
+    with pytest.raises(
+        InputError, match="--cell, --arm: ur5e_epick_tray is there twice; allowed are files"
+    ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

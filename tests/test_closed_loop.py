@@ -79,7 +79,9 @@ class Bench:
 
 def a_plan() -> Plan:
     made = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimise=False)).plan(
-        COVERED.objects, "cracker_box", Pose((0.05, 0.25, 0.031), COVERED["cracker_box"].X_TO.quaternion)
+        COVERED.objects,
+        "cracker_box",
+        Pose((0.05, 0.25, 0.031), COVERED["cracker_box"].X_TO.quaternion),
     )
     assert isinstance(made, Plan)
     return made
@@ -153,7 +155,9 @@ def test_a_cloned_agent_goes_on_the_same() -> None:
 
 def test_what_was_seen_stays_known() -> None:
     known = Belief().update(AFTER).update(BEFORE).objects
-    assert {o.name: o.X_TO for o in known} == COVERED.poses, "the box under the other one is where it was seen"
+    assert {o.name: o.X_TO for o in known} == COVERED.poses, (
+        "the box under the other one is where it was seen"
+    )
 
 
 def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +232,12 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     fields = write(tmp_path, Scenario(agent="largest-clear"), task, timing, "A test")
     assert (fields["success"], fields["ended"]) == (True, "all found")
     assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
-    assert {path.name for path in tmp_path.iterdir()} >= {"index.html", "episode.json", "trajectory.h5", "scenario.yaml"}
+    assert {path.name for path in tmp_path.iterdir()} >= {
+        "index.html",
+        "episode.json",
+        "trajectory.h5",
+        "scenario.yaml",
+    }
 
 
 @pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
@@ -254,7 +263,11 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
     told = load_typed(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade)
     cell = told.world.cell
-    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == ((-0.65, 0.0, 0.3), 5.0, 0.015)
+    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == (
+        (-0.65, 0.0, 0.3),
+        5.0,
+        0.015,
+    )
     with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
         policy_of("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):
@@ -294,7 +307,10 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
         return Decision(None)
 
     box = resting("gelatin_box", xy=(-0.1, 0.0))
-    marker, can = resting("large_marker", xy=(-0.1, 0.0), floor=box.top), resting("tomato_soup_can", xy=(0.2, 0.2))
+    marker, can = (
+        resting("large_marker", xy=(-0.1, 0.0), floor=box.top),
+        resting("tomato_soup_can", xy=(0.2, 0.2)),
+    )
     loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
     loop.policy_system.policy = policy
     observation = loop.look.observation

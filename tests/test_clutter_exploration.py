@@ -63,17 +63,24 @@ def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -
 
 
 def test_it_is_a_gymnasium_environment(file: Path) -> None:
-    environment = gymnasium.make("drake_clutter.tasks:ClutterExploration-v0", scenes=file, max_moves=4)
+    environment = gymnasium.make(
+        "drake_clutter.tasks:ClutterExploration-v0", scenes=file, max_moves=4
+    )
     check_env(environment.unwrapped, skip_render_check=True)
 
 
 def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) -> None:
     """One object is put on the tray again and again."""
-    environment = gymnasium.make("drake_clutter.tasks:ClutterExploration-v0", scenes=str(file), max_moves=40).unwrapped
+    environment = gymnasium.make(
+        "drake_clutter.tasks:ClutterExploration-v0", scenes=str(file), max_moves=40
+    ).unwrapped
     assert isinstance(environment, ClutterExploration)
     observation, _ = environment.reset(options={"scene": 1})
     picked = 0
-    while environment.task.end is None and (moves := np.flatnonzero(observation["allowed"][:, 0])).size:
+    while (
+        environment.task.end is None
+        and (moves := np.flatnonzero(observation["allowed"][:, 0])).size
+    ):
         least = observation["feature"][:, FEATURES.index("z")][moves].argmin()
         observation, *_ = environment.step((moves[least], 0))
         picked += 1
@@ -83,20 +90,31 @@ def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) 
 
 @pytest.mark.parametrize("privileged", [False, True])
 def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> None:
-    environment, draw = ClutterExploration(scenes, privileged=privileged, max_moves=6), np.random.default_rng(0)
+    environment, draw = (
+        ClutterExploration(scenes, privileged=privileged, max_moves=6),
+        np.random.default_rng(0),
+    )
     ends = set()
     for seed in range(12):
         observation, _ = environment.reset(seed=seed)
         total, known = 0.0, environment.objects
         while environment.task.end is None:
             names = (TRAY, *known)
-            moves = [Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()]
+            moves = [
+                Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()
+            ]
             legal = set(legal_moves(environment.task.look.observation))
             assert len(moves) == len(set(moves))
             assert set(moves) == legal - set(environment.backend.belief.invalid_moves)
-            shown = environment.task.scene.names if privileged else tuple(sorted(environment.task.known))
+            shown = (
+                environment.task.scene.names
+                if privileged
+                else tuple(sorted(environment.task.known))
+            )
             assert (known if privileged else tuple(sorted(known))) == shown
-            observation, reward, over, out_of_moves, info = environment.step(random_move(observation, draw))
+            observation, reward, over, out_of_moves, info = environment.step(
+                random_move(observation, draw)
+            )
             total += float(reward)
             assert environment.objects[: len(known)] == known
             known = environment.objects
@@ -110,8 +128,12 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> No
 def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
     environment = ClutterExploration(scenes, privileged=True)
     observation, _ = environment.reset(options={"scene": 0})
-    hidden = next(k for k in range(1, len(environment.objects) + 1) if not observation["allowed"][k].any())
-    seen = next(k for k in range(1, len(environment.objects) + 1) if observation["allowed"][k].any())
+    hidden = next(
+        k for k in range(1, len(environment.objects) + 1) if not observation["allowed"][k].any()
+    )
+    seen = next(
+        k for k in range(1, len(environment.objects) + 1) if observation["allowed"][k].any()
+    )
     for move in ((0, seen), (seen, seen), (hidden, 0), (seen, hidden), (seen, 24), (24, 0)):
         again, reward, over, out_of_moves, _ = environment.step(move)
         assert (reward, over, out_of_moves) == (0.0, False, False)
@@ -136,7 +158,9 @@ def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
     environment = ClutterExploration(scenes, fidelity=backends(fidelity, ClutterConfig()))
     before, _ = environment.reset(options={"scene": 2})
     height = before["feature"][:, FEATURES.index("z")]
-    highest = max(np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node]))
+    highest = max(
+        np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node])
+    )
     after, *_, info = environment.step((highest, 0))
     assert info["step"].outcome.result is MoveResult.PLACED
     assert after["feature"][highest, FEATURES.index("z")] < height[highest] - 0.05
@@ -152,7 +176,9 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -
     assert starts[0].keys() == starts[1].keys()
     assert starts[0] != starts[1]
     assert starts[2] == starts[3]
-    assert [p.p for p in starts[2].values()] == [pytest.approx(p.p, abs=1e-6) for p in random_scene(10, 16, 20).poses.values()]
+    assert [p.p for p in starts[2].values()] == [
+        pytest.approx(p.p, abs=1e-6) for p in random_scene(10, 16, 20).poses.values()
+    ]
 
 
 def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
@@ -179,7 +205,9 @@ def test_the_environment_needs_no_arm() -> None:
 def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneSet) -> None:
     """Of four episodes, all moves of two are called good, and all of the others bad."""
     environment = ClutterExploration(scenes, privileged=True, max_moves=4)
-    learner = ActorCritic(environment, ActorCriticConfig(width=8, learning_rate=0.01), 0, torch.device("cpu"))
+    learner = ActorCritic(
+        environment, ActorCriticConfig(width=8, learning_rate=0.01), 0, torch.device("cpu")
+    )
     rng = np.random.default_rng(0)
     played = play_episodes(environment, 4, (0,), acting(learner.network, rng))
     for number, episode in enumerate(played):
@@ -200,11 +228,19 @@ def test_a_clone_does_more_and_more_what_its_teacher_would(dagger: bool, scenes:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(3)
     teacher = ExplorerNetwork(len(environment.numbers), 8)
-    config = CloningConfig(width=8, rounds=3, episodes=4, updates=60, batch=16, learning_rate=0.01, dagger=dagger)
-    learner, fresh = (Cloning(environment, teacher, config, 0, torch.device("cpu")) for _ in range(2))
+    config = CloningConfig(
+        width=8, rounds=3, episodes=4, updates=60, batch=16, learning_rate=0.01, dagger=dagger
+    )
+    learner, fresh = (
+        Cloning(environment, teacher, config, 0, torch.device("cpu")) for _ in range(2)
+    )
     first, second = learner.advance(), learner.advance()
     for played, student_plays in ((first, False), (second, dagger)):
-        differs = [(move != note).any() for episode in played for move, note in zip(episode.moves, episode.notes, strict=True)]
+        differs = [
+            (move != note).any()
+            for episode in played
+            for move, note in zip(episode.moves, episode.notes, strict=True)
+        ]
         assert any(differs) == student_plays
         wanted = [replace(episode, moves=episode.notes) for episode in played]
         assert likelihood(learner.network, wanted) > likelihood(fresh.network, wanted) + 0.5
@@ -213,7 +249,11 @@ def test_a_clone_does_more_and_more_what_its_teacher_would(dagger: bool, scenes:
 def likelihood(network: ExplorerNetwork, played: Sequence[Played]) -> float:
     """The mean log-probability of the moves."""
     with torch.no_grad():
-        found = network(stacked_graphs([observation for episode in played for observation in episode.observations]))
+        found = network(
+            stacked_graphs(
+                [observation for episode in played for observation in episode.observations]
+            )
+        )
         moves = torch.from_numpy(np.array([move for episode in played for move in episode.moves]))
         return float(log_probability(found, network.places(found, moves[:, 0]), moves).mean())
 
@@ -227,8 +267,12 @@ def test_episodes_are_the_same_for_the_same_seed(scenes: SceneSet) -> None:
         return play_episodes(environment, 7, (seed, 1), acting(network, None), side_by_side)
 
     one, other = played(3, 5), played(7, 5)
-    assert [[m.tolist() for m in e.moves] for e in one] == [[m.tolist() for m in e.moves] for e in other]
-    assert [e.rewards for e in one] == [e.rewards for e in other] != [e.rewards for e in played(7, 6)]
+    assert [[m.tolist() for m in e.moves] for e in one] == [
+        [m.tolist() for m in e.moves] for e in other
+    ]
+    assert (
+        [e.rewards for e in one] == [e.rewards for e in other] != [e.rewards for e in played(7, 6)]
+    )
     told = figures(one)
     assert told["success"] == sum(e.end is EpisodeEnd.ALL_FOUND for e in one) / 7
     assert told["score"] == pytest.approx(np.mean([sum(e.rewards) for e in one]))
@@ -236,9 +280,13 @@ def test_episodes_are_the_same_for_the_same_seed(scenes: SceneSet) -> None:
 
 def test_the_advantage_is_the_weighted_sum_of_what_comes() -> None:
     values, rewards, discount, trace = [1.0, -0.5, 2.0], [0.0, 3.0, -1.0], 0.9, 0.8
-    episode = Played(moves=[np.zeros(2, int)] * 3, rewards=rewards, notes=[(0.0, value) for value in values])
+    episode = Played(
+        moves=[np.zeros(2, int)] * 3, rewards=rewards, notes=[(0.0, value) for value in values]
+    )
     errors = [rewards[k] + discount * (*values, 0.0)[k + 1] - values[k] for k in range(3)]
-    expected = [sum((discount * trace) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)]
+    expected = [
+        sum((discount * trace) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)
+    ]
     assert advantage(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
 
 
@@ -254,19 +302,39 @@ def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneSet) -> None:
         told = ClutterExploration(scenes, privileged=True, max_moves=5)
         told.begin(environment.task.scene)
         ((a, b),) = acting(teacher, None)([told], [told.observe()])[0].tolist()
-        named = [TRAY if node == 0 else names[node - 1] for names, node in ((told.objects, a), (told.objects, b))]
+        named = [
+            TRAY if node == 0 else names[node - 1]
+            for names, node in ((told.objects, a), (told.objects, b))
+        ]
         assert [environment.objects[x - 1], TRAY if y == 0 else environment.objects[y - 1]] == named
 
 
-TEACHER_SETTINGS = ["learning.steps=240", "learning.episodes=6", "learning.width=8", "max_moves=4", "evaluate_every=40"]
+TEACHER_SETTINGS = [
+    "learning.steps=240",
+    "learning.episodes=6",
+    "learning.width=8",
+    "max_moves=4",
+    "evaluate_every=40",
+]
 TEACHER_SETTINGS += ["evaluation_episodes=4"]
-STUDENT_SETTINGS = ["learning.rounds=6", "learning.episodes=5", "learning.width=8", "learning.updates=4", "max_moves=4"]
+STUDENT_SETTINGS = [
+    "learning.rounds=6",
+    "learning.episodes=5",
+    "learning.width=8",
+    "learning.updates=4",
+    "max_moves=4",
+]
 STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
 
 
 @pytest.mark.parametrize("script", ["train_explorer", "clone_explorer"])
-def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Path, tmp_path: Path) -> None:
-    settings = [f"scenes={file}", *(TEACHER_SETTINGS if script == "train_explorer" else STUDENT_SETTINGS)]
+def test_a_script_is_killed_and_ends_with_the_same_weights(
+    script: str, file: Path, tmp_path: Path
+) -> None:
+    settings = [
+        f"scenes={file}",
+        *(TEACHER_SETTINGS if script == "train_explorer" else STUDENT_SETTINGS),
+    ]
     if script == "clone_explorer":
         numbers = ClutterExploration(file).numbers
         torch.manual_seed(3)
@@ -277,7 +345,13 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Pa
         )
         settings += [f"teacher={tmp_path / 't.safetensors'}"]
     options = [argument for setting in settings for argument in ("--set", setting)]
-    command = [sys.executable, str(ROOT / "training" / f"{script}.py"), "--out", str(tmp_path / "killed"), *options]
+    command = [
+        sys.executable,
+        str(ROOT / "training" / f"{script}.py"),
+        "--out",
+        str(tmp_path / "killed"),
+        *options,
+    ]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (tmp_path / "killed" / "state.safetensors").exists():
         assert killed.poll() is None
@@ -288,9 +362,13 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(script: str, file: Pa
     train = training_script(script)
     train.main(tmp_path / "whole", settings=settings)
     train.main(tmp_path / "killed", settings=settings)
-    whole, again = (load_checkpoint(tmp_path / name / "explorer.safetensors") for name in ("whole", "killed"))
+    whole, again = (
+        load_checkpoint(tmp_path / name / "explorer.safetensors") for name in ("whole", "killed")
+    )
     assert all(torch.equal(whole.weights[name], again.weights[name]) for name in whole.weights)
-    histories = [json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")]
+    histories = [
+        json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")
+    ]
     assert [row["score"] for row in histories[0]] == [row["score"] for row in histories[1]]
     # What was written plays.
     environment = ClutterExploration(file, max_moves=4)
@@ -310,13 +388,24 @@ def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Pa
     torch.manual_seed(3)
     cloned = ExplorerNetwork(len(numbers), 8)
     save_checkpoint(begun, cloned, {"kind": STUDENT, "network": about_explorer(numbers, 8)})
-    settings = [f"scenes={file}", f"warm_start={begun}", *TEACHER_SETTINGS, "learning.steps=10", "learning.learning_rate=1.0e-30"]
+    settings = [
+        f"scenes={file}",
+        f"warm_start={begun}",
+        *TEACHER_SETTINGS,
+        "learning.steps=10",
+        "learning.learning_rate=1.0e-30",
+    ]
     train = training_script("train_explorer")
     train.main(tmp_path / "tuned", settings=[*settings, "privileged=false"])
     tuned = load_checkpoint(tmp_path / "tuned" / "explorer.safetensors")
     assert tuned.about["kind"] == STUDENT
-    assert all(torch.equal(value, tuned.weights[name]) for name, value in cloned.state_dict().items())
-    with pytest.raises(InputError, match=r"s\.safetensors: is a checkpoint of a student; allowed is one of a teacher"):
+    assert all(
+        torch.equal(value, tuned.weights[name]) for name, value in cloned.state_dict().items()
+    )
+    with pytest.raises(
+        InputError,
+        match=r"s\.safetensors: is a checkpoint of a student; allowed is one of a teacher",
+    ):
         train.main(tmp_path / "teacher", settings=settings)
     with pytest.raises(InputError, match=r"warm_start: .* another width"):
         train.main(tmp_path / "wide", settings=[*settings, "privileged=false", "learning.width=16"])
@@ -330,13 +419,22 @@ def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
     about = {"kind": STUDENT, "network": about_explorer(numbers, 8)}
     save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"kind": "generator"})
     with pytest.raises(
-        InputError, match=r"s\.safetensors: is a checkpoint of a generator; allowed is one of a teacher or student"
+        InputError,
+        match=r"s\.safetensors: is a checkpoint of a generator; allowed is one of a teacher or student",
     ):
         make_explorers(str(path), ClutterConfig())
-    save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"network": {**about_explorer(numbers, 8), "features": []}})
+    save_checkpoint(
+        path,
+        ExplorerNetwork(len(numbers), 8),
+        about | {"network": {**about_explorer(numbers, 8), "features": []}},
+    )
     with pytest.raises(InputError, match="was trained on other features"):
         make_explorers(str(path), ClutterConfig())
-    save_checkpoint(path, ExplorerNetwork(2, 8), {"kind": STUDENT, "network": about_explorer({TRAY: 1, "sugar_box": 2}, 8)})
+    save_checkpoint(
+        path,
+        ExplorerNetwork(2, 8),
+        {"kind": STUDENT, "network": about_explorer({TRAY: 1, "sugar_box": 2}, 8)},
+    )
     environment = ClutterExploration(file)
     environment.reset(options={"scene": 0})
     agent = make_explorers(str(path), ClutterConfig())(environment.backend)
@@ -385,7 +483,12 @@ def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig
 
 def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) -> None:
     camera = "cameras.overhead.pose={translation: [0.0, 0.3, 1.5], rpy_deg: [170, 0, 0]}"
-    save_scene_set(tmp_path / "tilted.json", {"objects": "ycb7"}, [entry(22)], cell_with(camera, "support.size=[0.75, 0.75]"))
+    save_scene_set(
+        tmp_path / "tilted.json",
+        {"objects": "ycb7"},
+        [entry(22)],
+        cell_with(camera, "support.size=[0.75, 0.75]"),
+    )
     environment = ClutterExploration(tmp_path / "tilted.json")
     environment.reset(options={"scene": 0})
     observation = environment.backend.look.observation

@@ -32,7 +32,9 @@ def arm(folder: Path, kind: str, axis: str, length: float) -> RobotSpec:
     links = [("foot", 0.1), ("boom", length), ("end", 0.1)]
     made = "".join(_LINK.format(name=name, length=size, x=size / 2 - 0.05) for name, size in links)
     made += _JOINT.format(name="first", kind=kind, parent="foot", child="boom", x=0, axis=axis)
-    made += _JOINT.format(name="second", kind="revolute", parent="boom", child="end", x=length, axis="0 0 1")
+    made += _JOINT.format(
+        name="second", kind="revolute", parent="boom", child="end", x=length, axis="0 0 1"
+    )
     path = folder / f"{kind}.urdf"
     path.write_text(f'<robot name="arm">{made}</robot>')
     spec = {
@@ -56,7 +58,9 @@ def among_posts(spec: RobotSpec, p_TF: tuple[float, float, float]) -> WorkCell:
 @pytest.mark.parametrize("name", CELLS)
 def test_the_first_link_of_an_articulated_arm_stays_in_place(name: str) -> None:
     links = robot(name).links
-    assert set(links_in_place(robot(name))) == {link for link, moved_by in links.items() if moved_by <= 1}
+    assert set(links_in_place(robot(name))) == {
+        link for link, moved_by in links.items() if moved_by <= 1
+    }
 
 
 @pytest.mark.parametrize(
@@ -85,7 +89,10 @@ def test_an_object_may_have_the_name_of_a_link() -> None:
     """Of how near it is, and how that changes with the joints, its name changes nothing."""
     found = {}
     for name in ("cup", "other"):
-        held, near = resting("gelatin_box", floor=0.2, name="held"), resting("sugar_box", xy=(0.1, 0.0), name=name)
+        held, near = (
+            resting("gelatin_box", floor=0.2, name="held"),
+            resting("sugar_box", xy=(0.1, 0.0), name=name),
+        )
         scene = ClearanceScene(DEFAULT_CELL, [(o.name, o.object_class) for o in (held, near)])
         scene.put([held, near])
         q = np.array([-2.9, -1.5, 2.0, -2.0, -1.6, 0.0])

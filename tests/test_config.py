@@ -24,7 +24,9 @@ def test_defaults() -> None:
 
 
 def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
-    config = load_config(config_file(tmp_path, "settle: {max_time: 3}\nexploration: {collapse_penalty: -2.5}\n"))
+    config = load_config(
+        config_file(tmp_path, "settle: {max_time: 3}\nexploration: {collapse_penalty: -2.5}\n")
+    )
     expected = ClutterConfig()
     expected = replace(
         expected,
@@ -39,13 +41,19 @@ def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
     config = load_config(config_file(tmp_path, text))
     camera = Camera.over(2.0, width=320, visibility_threshold=0.2)
     cell = DEFAULT_CELL.model_copy(update={"support": tray(0.5), "cameras": {"overhead": camera}})
-    assert config == replace(ClutterConfig(), layout=replace(ClutterConfig().layout, stack_gap=0.02), cell=cell)
+    assert config == replace(
+        ClutterConfig(), layout=replace(ClutterConfig().layout, stack_gap=0.02), cell=cell
+    )
 
 
-def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(tmp_path: Path) -> None:
+def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
+    tmp_path: Path,
+) -> None:
     """Whatever its cameras are called."""
     text = "{pose: {translation: [0, 0, 2], rpy_deg: [180, 0, 0]}, width: 320}"
-    config = load_config(config_file(tmp_path, f"cell: {{cameras: {{camera: {text}, arm: {text}}}}}"))
+    config = load_config(
+        config_file(tmp_path, f"cell: {{cameras: {{camera: {text}, arm: {text}}}}}")
+    )
     assert list(config.cell.cameras) == ["camera", "arm"]
     both = "camera: {width: 320, height: 100}\ncell: {cameras: {overhead: {height: 200}}}\n"
     camera = load_config(config_file(tmp_path, both)).cell.camera
@@ -54,7 +62,12 @@ def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
 
 @pytest.mark.parametrize(
     "text",
-    ["camera: {}\ncell: 3", "arm: {}\nworld: 3", "arm: {}\nworld: {cell: [1]}", "layout: {tray_side: 1}\ncell: {support: 1}"],
+    [
+        "camera: {}\ncell: 3",
+        "arm: {}\nworld: 3",
+        "arm: {}\nworld: {cell: [1]}",
+        "layout: {tray_side: 1}\ncell: {support: 1}",
+    ],
 )
 def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"world\.yaml: .*allowed"):
@@ -62,7 +75,9 @@ def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> Non
 
 
 def test_two_cameras_are_read_back(tmp_path: Path) -> None:
-    config = world_with("cell.cameras={side: {pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}}, top: {pose: {}}}")
+    config = world_with(
+        "cell.cameras={side: {pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}}, top: {pose: {}}}"
+    )
     assert list(config.cell.cameras) == ["side", "top"]
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
     one = load_config(settings=["cell.cameras.top.width=320"], path=tmp_path / "world.yaml")
@@ -82,8 +97,14 @@ def test_two_cameras_are_read_back(tmp_path: Path) -> None:
         ),
         ("fixtures=[{name: overhead, box: [1, 1, 1]}]", "gripper, overhead"),
         ("fixtures=[{name: a}]", "fixtures[0]: {'name': 'a'}; allowed is either a box or a model"),
-        ("fixtures=[{name: a, box: [1, 1, 1], model: a.sdf}]", "allowed is either a box or a model"),
-        ("fixtures=[{name: a, box: [1, 1]}]", "fixtures[0].box: [1, 1]; allowed is a list of 3 numbers"),
+        (
+            "fixtures=[{name: a, box: [1, 1, 1], model: a.sdf}]",
+            "allowed is either a box or a model",
+        ),
+        (
+            "fixtures=[{name: a, box: [1, 1]}]",
+            "fixtures[0].box: [1, 1]; allowed is a list of 3 numbers",
+        ),
         (
             "fixtures=[{name: a, box: [1, 1, 1], color: [2, 0, 0, 1]}]",
             "fixtures[0].color[0]: 2; allowed is a finite number from 0",
@@ -91,8 +112,14 @@ def test_two_cameras_are_read_back(tmp_path: Path) -> None:
         ("cameras={}", "cameras: {}; allowed is a mapping of at least one entry"),
         ("robot.home=[]", "robot.home: []; allowed is a list of at least one entry"),
         ("robot.home=[0, 0, 0]", "allowed are 3, as robot.home has"),
-        ("robot.limits.jerk=[1, 2]", "robot.limits.jerk: 2 values; allowed are 6, as robot.home has"),
-        ("robot.limits.position=[[1, 2, 3]]", "robot.limits.position[0]: [1, 2, 3]; allowed is a list of 2 numbers"),
+        (
+            "robot.limits.jerk=[1, 2]",
+            "robot.limits.jerk: 2 values; allowed are 6, as robot.home has",
+        ),
+        (
+            "robot.limits.position=[[1, 2, 3]]",
+            "robot.limits.position[0]: [1, 2, 3]; allowed is a list of 2 numbers",
+        ),
     ],
 )
 def test_a_cell_that_cannot_be(setting: str, message: str) -> None:
@@ -102,7 +129,9 @@ def test_a_cell_that_cannot_be(setting: str, message: str) -> None:
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    config = world_with(f"cell.support.size={[0.1 + 0.2, 0.5]}", "settle.calm_samples=7", "cell.robot.base.yaw=10")
+    config = world_with(
+        f"cell.support.size={[0.1 + 0.2, 0.5]}", "settle.calm_samples=7", "cell.robot.base.yaw=10"
+    )
     assert config.cell.support.size == (0.1 + 0.2, 0.5)
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
 
@@ -110,7 +139,9 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 def test_the_focal_length_is_that_of_the_field_of_view() -> None:
     """At 45 degrees half the height of the image lies one focal length times tan(22.5 deg) from its middle."""
     assert Camera.over(1.6, height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
-    assert Camera.over(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(240.0 * (1 + 2**0.5))
+    assert Camera.over(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(
+        240.0 * (1 + 2**0.5)
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,7 +187,9 @@ def test_a_setting_names_an_entry_of_a_list() -> None:
     """The other fields of the entry stay, and so do the other entries."""
     cell = cell_with("fixtures.0.pose.z=-0.05", "robot.limits.acceleration.1=2")
     (table,), (before,) = cell.fixtures, DEFAULT_CELL.fixtures
-    assert table == before.model_copy(update={"pose": before.pose.model_copy(update={"translation": (0.0, 0.0, -0.05)})})
+    assert table == before.model_copy(
+        update={"pose": before.pose.model_copy(update={"translation": (0.0, 0.0, -0.05)})}
+    )
     assert cell.robot.limits.acceleration == (4.0, 2.0, 6.0, 10.0, 10.0, 10.0)
 
 

@@ -56,7 +56,10 @@ class Block:
 
 def blocks(page: Path, *languages: str) -> list[Block]:
     text = page.read_text(encoding="utf-8")
-    found = [Block(match[2], match[3], text[: match.start(3)].count("\n") + 1, not match[1]) for match in BLOCK.finditer(text)]
+    found = [
+        Block(match[2], match[3], text[: match.start(3)].count("\n") + 1, not match[1])
+        for match in BLOCK.finditer(text)
+    ]
     return [block for block in found if block.language in languages]
 
 
@@ -143,7 +146,9 @@ def fault(line: str, *, complete: bool) -> str:
     try:
         while hasattr(command, "commands"):
             command = command.commands[words.pop(0)]
-        context = command.make_context(line, list(words) if complete else [], resilient_parsing=not complete)
+        context = command.make_context(
+            line, list(words) if complete else [], resilient_parsing=not complete
+        )
         if not complete:
             command.make_parser(context).parse_args(list(words))
     except Exception as error:  # typer has a click of its own, whose errors it does not export
@@ -181,7 +186,9 @@ def test_training_scripts_parse(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_files_of_commands_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    named = re.findall(r"(?<!--out )\b((?:benchmarks|examples|models|training)/[\w./-]+\.\w+)", text)
+    named = re.findall(
+        r"(?<!--out )\b((?:benchmarks|examples|models|training)/[\w./-]+\.\w+)", text
+    )
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
@@ -204,6 +211,8 @@ def test_files_that_are_named_exist(page: Path) -> None:
     for name in FILE.findall(prose(page)):
         if "/" not in name:
             missing += [name] if name.endswith(".py") and name not in file_names() else []
-        elif not name.startswith(MADE) and not any((ROOT / at / name).exists() for at in ("", "drake_clutter")):
+        elif not name.startswith(MADE) and not any(
+            (ROOT / at / name).exists() for at in ("", "drake_clutter")
+        ):
             missing.append(name)
     assert missing == []

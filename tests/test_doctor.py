@@ -26,22 +26,30 @@ def test_this_machine_is_fit() -> None:
 
 def test_a_broken_library_is_a_finding(torch_is: Path) -> None:
     torch_is.write_text("raise ImportError('broken')")
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "ImportError: broken", "mend it")
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+        "torch", False, "ImportError: broken", "mend it"
+    )
 
 
 def test_a_crash_is_a_finding(torch_is: Path) -> None:
     torch_is.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "died of SIGSEGV", "mend it")
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+        "torch", False, "died of SIGSEGV", "mend it"
+    )
 
 
 def test_a_hang_is_a_finding(torch_is: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch_is.write_text("import time\ntime.sleep(60)")
     monkeypatch.setattr(doctor, "_PROBE_TIMEOUT", 1.0)
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check("torch", False, "no answer in 1 s", "mend it")
+    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+        "torch", False, "no answer in 1 s", "mend it"
+    )
 
 
 def test_missing_models_are_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
     monkeypatch.setattr("drake_clutter.catalogue.load_catalogue", lambda: catalogue)
-    with pytest.raises(doctor.MissingError, match="1 of 1 object classes have no model, the first is crate"):
+    with pytest.raises(
+        doctor.MissingError, match="1 of 1 object classes have no model, the first is crate"
+    ):
         doctor.probe_assets()

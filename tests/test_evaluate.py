@@ -20,7 +20,11 @@ CONFIG = ClutterConfig()
 
 
 def rows_of(
-    scenes: Sequence[PlayableScene], *agents: str, config: ClutterConfig = CONFIG, out: Path | None = None, most: int = 100
+    scenes: Sequence[PlayableScene],
+    *agents: str,
+    config: ClutterConfig = CONFIG,
+    out: Path | None = None,
+    most: int = 100,
 ) -> list[dict[str, Any]]:
     """The rows; `most`: episodes that are to be played."""
 
@@ -37,7 +41,9 @@ def test_an_agent_that_is_named_twice_plays_once() -> None:
 
 
 def test_a_set_that_there_is_not() -> None:
-    with pytest.raises(InputError, match=r"--scenes sg_star_9: is not there; allowed are .*sg_star_25"):
+    with pytest.raises(
+        InputError, match=r"--scenes sg_star_9: is not there; allowed are .*sg_star_25"
+    ):
         playable("sg_star_9", None)
 
 
@@ -63,7 +69,9 @@ def test_what_hides_nothing_from_the_config_s_camera_is_left_out() -> None:
 def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) -> None:
     """A camera that calls nothing hidden but what it sees nothing of."""
     scene = random_scene(22)
-    cells = [cell_with(f"cameras.overhead.visibility_threshold={least}") for least in (0.3, 0.000001)]
+    cells = [
+        cell_with(f"cameras.overhead.visibility_threshold={least}") for least in (0.3, 0.000001)
+    ]
     for number, cell in enumerate(cells):
         folder = tmp_path / str(number)
         folder.mkdir()
@@ -71,11 +79,25 @@ def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) 
         save_scene(folder / f"{number}.yaml", scene, cell, verdict)
         assert cell_of(playable(str(folder), None)) == cell
         out = folder / "out.json"
-        command = ["evaluate", str(folder), "--agents", "random", "--fidelity", "fast", "--max-moves", "1", "--out", str(out)]
+        command = [
+            "evaluate",
+            str(folder),
+            "--agents",
+            "random",
+            "--fidelity",
+            "fast",
+            "--max-moves",
+            "1",
+            "--out",
+            str(out),
+        ]
         told = CliRunner().invoke(app, command)
         assert told.exit_code == 0, told.output
         camera = json.loads(out.read_text())["config"]["cell"]["cameras"]["overhead"]
         assert camera["visibility_threshold"] == cell.camera.visibility_threshold
     mixed = [playable(str(tmp_path / str(number)), None)[0] for number in (0, 1)]
-    with pytest.raises(InputError, match=r"1\.yaml was made in another cell than 0\.yaml; allowed are scenes of one cell"):
+    with pytest.raises(
+        InputError,
+        match=r"1\.yaml was made in another cell than 0\.yaml; allowed are scenes of one cell",
+    ):
         cell_of(mixed)

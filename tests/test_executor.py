@@ -29,7 +29,9 @@ def executor(config: ClutterConfig) -> SettleExecutor:
     return SettleExecutor(config)
 
 
-def carried_out(executor: SettleExecutor, detector: LabelDetector, scene: Scene, move: Move, seed: int = 0) -> Outcome:
+def carried_out(
+    executor: SettleExecutor, detector: LabelDetector, scene: Scene, move: Move, seed: int = 0
+) -> Outcome:
     return executed(executor, scene, detector.look(scene).observation, move, rng(seed))
 
 
@@ -46,7 +48,11 @@ def test_the_top_object_goes_to_the_tray(executor: SettleExecutor, detector: Lab
     assert how_far(STACKS, after, "above") > 0.15
     assert deepest_penetration(after.objects)[0] < 0.0005
     assert how_far(STACKS, after, "below") < 0.001
-    for name in ("can", "on the can", "marker"):  # what the move does not touch is not even simulated
+    for name in (
+        "can",
+        "on the can",
+        "marker",
+    ):  # what the move does not touch is not even simulated
         assert after[name].X_TO == STACKS[name].X_TO
 
 
@@ -72,11 +78,16 @@ def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecut
 
 def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
     """What is let go too high beside something close falls onto what is below all the same."""
-    picked, neighbour = resting("gelatin_box", floor=0.101, name="picked"), resting("cracker_box", Orientation.UPRIGHT_0)
+    picked, neighbour = (
+        resting("gelatin_box", floor=0.101, name="picked"),
+        resting("cracker_box", Orientation.UPRIGHT_0),
+    )
     gap = TOUCHING_MARGIN - 0.001
     beside = neighbour.bounds_T[1][0] + gap - picked.bounds_T[0][0]
     scene = scene_of(
-        neighbour, resting("tomato_soup_can", xy=(beside, 0.0)), replace(picked, X_TO=picked.X_TO.moved((beside, 0.0, 0.0)))
+        neighbour,
+        resting("tomato_soup_can", xy=(beside, 0.0)),
+        replace(picked, X_TO=picked.X_TO.moved((beside, 0.0, 0.0))),
     )
     start = scene["picked"].X_TO
     raised = start.moved((0.0, 0.0, 0.005))
@@ -87,10 +98,14 @@ def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
 
 
 @pytest.mark.parametrize(("pick", "falls"), [("below", "above"), ("can", "on the can")])
-def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_what_loses_its_support_falls(
+    pick: str, falls: str, executor: SettleExecutor, detector: LabelDetector
+) -> None:
     observation = detector.look(STACKS).observation
     scene = STACKS
-    if pick not in {d.name for d in observation.detections}:  # the can is all but covered: seen here by an open-minded detector
+    if pick not in {
+        d.name for d in observation.detections
+    }:  # the can is all but covered: seen here by an open-minded detector
         config = world_with("camera.visibility_threshold=0")
         observation = LabelDetector(config.cell.camera).look(STACKS).observation
     outcome = executed(executor, scene, observation, Move(pick), rng())
@@ -102,14 +117,22 @@ def test_what_loses_its_support_falls(pick: str, falls: str, executor: SettleExe
     assert outcome.scene.names == STACKS.names
 
 
-def test_a_move_without_a_free_spot_changes_nothing(executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_a_move_without_a_free_spot_changes_nothing(
+    executor: SettleExecutor, detector: LabelDetector
+) -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(executor, detector, scene, Move("box"))
-    assert (outcome.result, outcome.instability, outcome.motion) == (MoveResult.NO_FREE_SPOT, None, ())
+    assert (outcome.result, outcome.instability, outcome.motion) == (
+        MoveResult.NO_FREE_SPOT,
+        None,
+        (),
+    )
     assert outcome.scene is scene
 
 
-def test_a_pile_that_does_not_hold_collapses(executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_a_pile_that_does_not_hold_collapses(
+    executor: SettleExecutor, detector: LabelDetector
+) -> None:
     """A box let go on a single lying marker rolls off: the picked object, too, has to stay where it was let go."""
     outcome = carried_out(executor, detector, STACKS, Move("on the can", "marker"))
     assert outcome.result is MoveResult.COLLAPSED
@@ -117,14 +140,18 @@ def test_a_pile_that_does_not_hold_collapses(executor: SettleExecutor, detector:
     assert outcome.instability.object in ("on the can", "marker")
 
 
-def test_the_same_rng_gives_the_same_outcome(executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_the_same_rng_gives_the_same_outcome(
+    executor: SettleExecutor, detector: LabelDetector
+) -> None:
     one, other = (carried_out(executor, detector, STACKS, Move("marker"), seed=7) for _ in range(2))
     assert one == other
     assert carried_out(executor, detector, STACKS, Move("marker"), seed=8).scene != one.scene
 
 
 @pytest.mark.parametrize("move", [Move("above"), Move("below")], ids=str)
-def test_the_motion_shows_the_whole_scene(move: Move, executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_the_motion_shows_the_whole_scene(
+    move: Move, executor: SettleExecutor, detector: LabelDetector
+) -> None:
     outcome = carried_out(executor, detector, STACKS, move)
     times = [frame.time for frame in outcome.motion]
     assert times[0] == 0.0
@@ -135,7 +162,9 @@ def test_the_motion_shows_the_whole_scene(move: Move, executor: SettleExecutor, 
 
 
 @pytest.mark.parametrize("move", [Move("ghost"), Move("marker", "ghost")], ids=str)
-def test_what_is_not_in_view_cannot_be_moved(move: Move, executor: SettleExecutor, detector: LabelDetector) -> None:
+def test_what_is_not_in_view_cannot_be_moved(
+    move: Move, executor: SettleExecutor, detector: LabelDetector
+) -> None:
     with pytest.raises(KeyError, match="'ghost' is not in view"):
         carried_out(executor, detector, STACKS, move)
     assert move.place in (TRAY, "ghost")

@@ -16,7 +16,9 @@ ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top)
 BESIDE = resting("gelatin_box", xy=(0.2, 0.1))
 
 
-def found(there: list[SceneObject], said: list[SceneObject], scores: list[float] | None = None) -> list[int]:
+def found(
+    there: list[SceneObject], said: list[SceneObject], scores: list[float] | None = None
+) -> list[int]:
     depth = LabelDetector(CAMERA).look(scene_of(*there)).observation.depth
     explained = [explanation(o.object_class, o.X_TO, depth, CAMERA) for o in said]
     return sorted(chosen(explained, scores or [0.8] * len(said), depth.shape, 0.2))

@@ -62,7 +62,11 @@ class Scripted:
             return Outcome(result, scene)
         pick = command.move.pick
         moved = scene.at({pick: resting("cracker_box", xy=ASIDE[pick]).X_TO})
-        fallen = Instability(InstabilityReason.SLID, "g1", 0.02, 0.0) if result is MoveResult.COLLAPSED else None
+        fallen = (
+            Instability(InstabilityReason.SLID, "g1", 0.02, 0.0)
+            if result is MoveResult.COLLAPSED
+            else None
+        )
         return Outcome(result, moved, fallen)
 
 
@@ -112,7 +116,9 @@ def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
     assert task.end is EpisodeEnd.ALL_FOUND
     assert task.found == task.hidden_at_start
     assert task.steps == [first, second, third]
-    assert sum(step.reward for step in task.steps) == REWARDS.detection_reward * len(task.hidden_at_start)
+    assert sum(step.reward for step in task.steps) == REWARDS.detection_reward * len(
+        task.hidden_at_start
+    )
     assert task.start is HIDING
     assert task.scene is third.outcome.scene
 
@@ -293,7 +299,9 @@ def imagined(*detections: tuple[str, str, int]) -> Observation:
     for index, (name, class_name, pixels) in enumerate(detections):
         mask = np.zeros((camera.height, camera.width), bool)
         mask.ravel()[1000 * index : 1000 * index + pixels] = True
-        found.append(Detection(name, CLASSES[class_name], Pose((0.1 * index - 0.3, 0.0, 0.1)), mask))
+        found.append(
+            Detection(name, CLASSES[class_name], Pose((0.1 * index - 0.3, 0.0, 0.1)), mask)
+        )
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     return Observation(depth, tuple(found), camera, DEFAULT_CELL.support)
 
@@ -317,18 +325,31 @@ def test_largest_first_goes_by_volume_and_repeats_only_after_a_sweep() -> None:
         ("a", "sugar_box", 5),
         ("k", "master_chef_can", 1),
     )
-    order = ["c", "k", "a", "b", "m"]  # 2.2, 1.1, 0.59, 0.59 and 0.03 litres; of two alike the first by name
+    order = [
+        "c",
+        "k",
+        "a",
+        "b",
+        "m",
+    ]  # 2.2, 1.1, 0.59, 0.59 and 0.03 litres; of two alike the first by name
     assert sweep(largest_first, observation, 12) == [*order, *order, "c", "k"]
 
 
 def test_what_comes_into_view_is_picked_before_a_repeat() -> None:
-    observation = imagined(("c", "cracker_box", 20), ("k", "master_chef_can", 1), ("m", "large_marker", 900))
+    observation = imagined(
+        ("c", "cracker_box", 20), ("k", "master_chef_can", 1), ("m", "large_marker", 900)
+    )
     tried = (Move("c"), Move("k", "c"), Move("gone"))
     assert largest_first(Belief(history=tried), observation, rng()).move == Move("m")
 
 
 def test_largest_clear_goes_by_pixels() -> None:
-    observation = imagined(("m", "large_marker", 900), ("b", "sugar_box", 10), ("a", "gelatin_box", 10), ("c", "cracker_box", 20))
+    observation = imagined(
+        ("m", "large_marker", 900),
+        ("b", "sugar_box", 10),
+        ("a", "gelatin_box", 10),
+        ("c", "cracker_box", 20),
+    )
     order = ["m", "c", "a", "b"]
     assert sweep(largest_clear, observation, 6) == [*order, "m", "c"]
 
@@ -359,7 +380,9 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
     moves = legal_moves(observation)
     assert set(drawn) == set(moves)
     expected = 1800 / len(moves)
-    assert sum((count - expected) ** 2 / expected for count in drawn.values()) < 26.1  # chi-squared, 8 degrees of freedom, 0.1 %
+    assert (
+        sum((count - expected) ** 2 / expected for count in drawn.values()) < 26.1
+    )  # chi-squared, 8 degrees of freedom, 0.1 %
 
 
 @pytest.mark.parametrize("name", sorted(BASELINES))

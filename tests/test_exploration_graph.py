@@ -7,7 +7,12 @@ import pytest
 import torch
 from conftest import CLASSES, random_scene, resting, rng, scene_of
 
-from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
+from drake_clutter.agents.explorer_network import (
+    ExplorerNetwork,
+    decide,
+    log_probability,
+    stacked_graphs,
+)
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Move
@@ -33,7 +38,9 @@ SCENE = scene_of(
 )
 
 
-def graph_of(scene: Scene, tried: Sequence[Move] = (), failed: Sequence[Move] = (), nodes: int = 0) -> GraphObservation:
+def graph_of(
+    scene: Scene, tried: Sequence[Move] = (), failed: Sequence[Move] = (), nodes: int = 0
+) -> GraphObservation:
     return exploration_graph(scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, failed, nodes)
 
 
@@ -56,16 +63,31 @@ def test_how_objects_lie_to_each_other() -> None:
     assert found["large_marker", "tomato_soup_can"] == "is_below"
     assert {found[pair] for pair in found if set(pair) == {"cracker_box", "close"}} == {"is_beside"}
     assert {found[pair] for pair in found if set(pair) == {"close", "far"}} == {"is_apart_from"}
-    assert {upper for (lower, upper), kind in found.items() if kind == "tray_carries"} == {"large_marker", "close", "far"}
-    assert {upper for (lower, upper), kind in found.items() if kind == "tray_is_below"} == {"cracker_box", "tomato_soup_can"}
+    assert {upper for (lower, upper), kind in found.items() if kind == "tray_carries"} == {
+        "large_marker",
+        "close",
+        "far",
+    }
+    assert {upper for (lower, upper), kind in found.items() if kind == "tray_is_below"} == {
+        "cracker_box",
+        "tomato_soup_can",
+    }
 
 
 def test_what_is_known_of_each_object() -> None:
     graph = graph_of(SCENE, (Move("far"), Move("far"), Move("close")), nodes=9)
-    assert graph["node_kind"].tolist() == [NUMBERS[TRAY], *(NUMBERS[o.object_class.name] for o in SCENE.objects), 0, 0, 0]
+    assert graph["node_kind"].tolist() == [
+        NUMBERS[TRAY],
+        *(NUMBERS[o.object_class.name] for o in SCENE.objects),
+        0,
+        0,
+        0,
+    ]
     assert [feature(graph, k, "in_view") for k in range(1, 6)] == [0, 1, 1, 1, 1]
     assert [feature(graph, k, "covered") for k in range(1, 6)] == [1, 1, 0, 0, 0]
-    assert [feature(graph, k, "times_picked") for k in range(1, 6)] == pytest.approx([0, 0, 0, 1 / 3, 2 / 3])
+    assert [feature(graph, k, "times_picked") for k in range(1, 6)] == pytest.approx(
+        [0, 0, 0, 1 / 3, 2 / 3]
+    )
     assert [feature(graph, k, "unexplained_height") for k in range(1, 6)] == [0.0] * 5
     assert feature(graph, 2, "extent_x") == pytest.approx(0.230 / 0.35)
     assert feature(graph, 4, "seen_share") == pytest.approx(1, abs=0.05)
@@ -136,7 +158,10 @@ def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
     assert torch.allclose(one.pick[:, nodes], other.pick)
     picked = int(one.pick.argmax())
     there = int((nodes == picked).nonzero())
-    places = network.places(one, torch.tensor([picked])), network.places(other, torch.tensor([there]))
+    places = (
+        network.places(one, torch.tensor([picked])),
+        network.places(other, torch.tensor([there])),
+    )
     assert torch.allclose(places[0][:, nodes], places[1])
 
 
@@ -166,7 +191,9 @@ def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
     drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
     assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
     found = network(stacked_graphs([graph] * 50))
-    again = log_probability(found, network.places(found, torch.from_numpy(moves[:50, 0])), torch.from_numpy(moves[:50]))
+    again = log_probability(
+        found, network.places(found, torch.from_numpy(moves[:50, 0])), torch.from_numpy(moves[:50])
+    )
     assert again.detach().numpy() == pytest.approx(chance[:50], abs=1e-5)
     (likeliest,) = decide(network, stacked_graphs([graph]), None)[0].tolist()
     assert likeliest[0] == picks[0].argmax()

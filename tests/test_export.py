@@ -36,7 +36,9 @@ MAIN_FILES = {
     ExportFormat.MJCF: "scene.xml",
     ExportFormat.GLB: "scene.glb",
 }
-REFERENCE = re.compile(r'<uri>(.*?)</uri>|file="(.*?)"|^mtllib (.*)$|^map_Kd (.*)$|^ *file: (.*)$', re.MULTILINE)
+REFERENCE = re.compile(
+    r'<uri>(.*?)</uri>|file="(.*?)"|^mtllib (.*)$|^map_Kd (.*)$|^ *file: (.*)$', re.MULTILINE
+)
 BULLET = 1e-5
 
 
@@ -56,7 +58,9 @@ def scene(mug: ObjectClass) -> Scene:
     """A box that lies on a can (its pitch is a right angle), a can of the same class, a lying marker, a turned mug."""
     can = resting("tomato_soup_can", Orientation.UPRIGHT_0, (0.1, 0.1))
     box = resting("sugar_box", xy=(0.1, 0.1), floor=can.top)
-    tilted = Pose.of(Rotation.from_euler("zyx", [0.4, np.pi / 2, 0.0]).as_matrix(), (-0.1, -0.1, 0.009))
+    tilted = Pose.of(
+        Rotation.from_euler("zyx", [0.4, np.pi / 2, 0.0]).as_matrix(), (-0.1, -0.1, 0.009)
+    )
     turned = Pose.of(Rotation.from_euler("z", 2.0).as_matrix(), (0.2, -0.15, mug.size[2] / 2))
     return scene_of(
         can,
@@ -69,7 +73,9 @@ def scene(mug: ObjectClass) -> Scene:
 
 
 @pytest.fixture(scope="module", params=ExportFormat, ids=lambda format: format.value)
-def exported(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[ExportFormat, Path]:
+def exported(
+    request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[ExportFormat, Path]:
     """The format and the main file of an export that was moved after it was written."""
     format: ExportFormat = request.param
     out = tmp_path_factory.mktemp("export") / "before"
@@ -86,7 +92,9 @@ def matrix_of(pose: Pose) -> NDArray[np.float64]:
     return np.asarray(rigid_transform(pose).GetAsMatrix4())
 
 
-def check(scene: Scene, name: str, mass: float | None, X_TO: NDArray[np.float64], tolerance: float = 1e-6) -> None:
+def check(
+    scene: Scene, name: str, mass: float | None, X_TO: NDArray[np.float64], tolerance: float = 1e-6
+) -> None:
     """Mass (kg) and pose (4, 4) that a program read are the scene's; m and rad."""
     assert pytest.approx(matrix_of(scene[name].X_TO), abs=tolerance) == X_TO, name
     assert mass is None or mass == pytest.approx(scene[name].object_class.mass, abs=1e-6), name
@@ -108,9 +116,13 @@ def check_in_drake(scene: Scene, main_file: Path, package_xml: Path | None) -> N
         check(scene, name, body.default_mass(), body.EvalPoseInWorld(context).GetAsMatrix4())
         inspector = scene_graph.model_inspector()
         for geometry in plant.GetCollisionGeometriesForBody(body):
-            friction = inspector.GetProximityProperties(geometry).GetProperty("material", "coulomb_friction")
+            friction = inspector.GetProximityProperties(geometry).GetProperty(
+                "material", "coulomb_friction"
+            )
             assert friction.static_friction() == friction.dynamic_friction() == FRICTION
-            assert inspector.GetProximityProperties(geometry).HasProperty("hydroelastic", "hydroelastic_modulus")
+            assert inspector.GetProximityProperties(geometry).HasProperty(
+                "hydroelastic", "hydroelastic_modulus"
+            )
 
 
 @pytest.fixture
@@ -128,23 +140,30 @@ def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
     for body, name in list(zip(bodies, names, strict=True))[1:]:
         dynamics = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
         X_OI, X_TI = np.eye(4), np.eye(4)
-        for X, (p, q) in ((X_OI, dynamics[3:5]), (X_TI, pybullet.getBasePositionAndOrientation(body, physicsClientId=client))):
+        for X, (p, q) in (
+            (X_OI, dynamics[3:5]),
+            (X_TI, pybullet.getBasePositionAndOrientation(body, physicsClientId=client)),
+        ):
             X[:3, :3], X[:3, 3] = Rotation.from_quat(q).as_matrix(), p
         check(scene, name, dynamics[0], X_TI @ np.linalg.inv(X_OI), BULLET)
-        (visual,) = pybullet.getVisualShapeData(body, pybullet.VISUAL_SHAPE_DATA_TEXTURE_UNIQUE_IDS, physicsClientId=client)
+        (visual,) = pybullet.getVisualShapeData(
+            body, pybullet.VISUAL_SHAPE_DATA_TEXTURE_UNIQUE_IDS, physicsClientId=client
+        )
         assert visual[8] >= 0, f"{name} has no texture"
         low, high = pybullet.getAABB(body, -1, physicsClientId=client)
         extents = scene[name].bounds_T
         assert np.all(np.array(low) < extents[0] + BULLET)
         assert np.all(np.array(high) > extents[1] - BULLET)
-        assert np.all(np.subtract(high, low) < extents[1] - extents[0] + 0.08)  # Bullet's boxes around boxes are wide
+        assert np.all(
+            np.subtract(high, low) < extents[1] - extents[0] + 0.08
+        )  # Bullet's boxes around boxes are wide
     for _ in range(24):
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
         pybullet.stepSimulation(physicsClientId=client)
     for body, name in list(zip(bodies, names, strict=True))[1:]:
-        assert pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0][2] == pytest.approx(
-            scene[name].X_TO.p[2], abs=0.015
-        )
+        assert pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0][
+            2
+        ] == pytest.approx(scene[name].X_TO.p[2], abs=0.015)
 
 
 def check_in_mujoco(scene: Scene, main_file: Path) -> None:
@@ -159,7 +178,9 @@ def check_in_mujoco(scene: Scene, main_file: Path) -> None:
         X_TO = np.eye(4)
         X_TO[:3, :3], X_TO[:3, 3] = data.body(name).xmat.reshape(3, 3), data.body(name).xpos
         check(scene, name, float(body.mass[0]), X_TO)
-        geoms = [model.geom(index) for index in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])]
+        geoms = [
+            model.geom(index) for index in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
+        ]
         visuals = [geom for geom in geoms if geom.group[0] == 2]
         contacts = [geom for geom in geoms if geom.group[0] == 3]
         assert [int(geom.contype[0]) for geom in visuals] == [0]
@@ -172,7 +193,9 @@ def check_in_mujoco(scene: Scene, main_file: Path) -> None:
         assert model.body(name).ipos == pytest.approx(inertial.com, abs=1e-9)
         R_OI = Rotation.from_quat(model.body(name).iquat, scalar_first=True).as_matrix()
         inertia = R_OI @ np.diag(model.body(name).inertia) @ R_OI.T
-        assert inertia == pytest.approx(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), rel=1e-6, abs=1e-12)
+        assert inertia == pytest.approx(
+            np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), rel=1e-6, abs=1e-12
+        )
     assert -0.02 < model.body("mug").ipos[0] < -0.005  # away from the handle
     before = data.xpos.copy()
     mujoco.mj_step(model, data, 200)
@@ -219,7 +242,9 @@ def test_refers_to_nothing_outside(exported: tuple[ExportFormat, Path], scene: S
         text = file.read_text(encoding="utf-8", errors="ignore")
         for groups in REFERENCE.findall(text):
             (reference,) = (group.strip() for group in groups if group)
-            root = folder if reference.startswith("package://") or file == main_file else file.parent
+            root = (
+                folder if reference.startswith("package://") or file == main_file else file.parent
+            )
             target = root / reference.removeprefix("package://drake_clutter_scene/")
             assert target.is_file(), f"{file}: {reference}"
             assert target.resolve().is_relative_to(folder.resolve()), f"{file}: {reference}"
@@ -239,7 +264,9 @@ def test_textures_are_the_labels(exported: tuple[ExportFormat, Path], scene: Sce
                 assert np.array_equal(np.asarray(picture), np.asarray(label))
 
 
-@pytest.mark.parametrize("name", ["tray", "world", "tray_frame", "__can__", "a/b", "../can", "a::b", "can ", "<can>"])
+@pytest.mark.parametrize(
+    "name", ["tray", "world", "tray_frame", "__can__", "a/b", "../can", "a::b", "can ", "<can>"]
+)
 def test_refuses_names(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=re.escape(repr(name))):
         export_scene(scene_of(resting("sugar_box", name=name)), ExportFormat.MJCF, tmp_path)
@@ -259,5 +286,7 @@ def test_failure_leaves_an_empty_folder(format: ExportFormat, tmp_path: Path) ->
     (unbuilt.folder / "visual.gltf").unlink()
     if format is not ExportFormat.DMD:  # which only copies
         with pytest.raises(Exception, match=r"visual\.gltf"):
-            export_scene(scene_of(sugar, replace(sugar, name="second", object_class=unbuilt)), format, out)
+            export_scene(
+                scene_of(sugar, replace(sugar, name="second", object_class=unbuilt)), format, out
+            )
         assert not list(out.iterdir())

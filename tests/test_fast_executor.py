@@ -40,7 +40,9 @@ def seen(scene: Scene) -> Observation:
     return JUDGE.rays.observe(scene)[0]
 
 
-def carried_out(scene: Scene, move: Move, seed: int = 0, executor: MoveExecutor = EXECUTOR) -> Outcome:
+def carried_out(
+    scene: Scene, move: Move, seed: int = 0, executor: MoveExecutor = EXECUTOR
+) -> Outcome:
     return executed(executor, scene, seen(scene), move, rng(seed))
 
 
@@ -67,7 +69,12 @@ def lowest(o: SceneObject) -> float:
 def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None:
     """At rest, not at the height where it is let go; within the random offset of its place; nothing else moves."""
     outcome = carried_out(STACKS, move)
-    assert (outcome.result, outcome.instability, outcome.cannot_judge, outcome.motion) == (MoveResult.PLACED, None, None, ())
+    assert (outcome.result, outcome.instability, outcome.cannot_judge, outcome.motion) == (
+        MoveResult.PLACED,
+        None,
+        None,
+        (),
+    )
     after = outcome.scene
     assert lowest(after[move.pick]) == pytest.approx(floor, abs=1e-9)
     command = resolve_placement(move, seen(STACKS), CONFIG.exploration, rng())
@@ -77,7 +84,11 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
     assert np.hypot(*(after[move.pick].X_TO.p - place.p)[:2]) <= CONFIG.settle.jitter
     assert after.names == STACKS.names
     assert all(after[name] == STACKS[name] for name in STACKS.names if name != move.pick)
-    assert (after.support, after.graph, after.derivation) == (STACKS.support, STACKS.graph, STACKS.derivation)
+    assert (after.support, after.graph, after.derivation) == (
+        STACKS.support,
+        STACKS.graph,
+        STACKS.derivation,
+    )
     assert JUDGE.stability(after) is None
 
 
@@ -92,14 +103,25 @@ def test_the_same_rng_gives_the_same_outcome() -> None:
 
 # --- Collapsed ---
 
-OVERHANG = [resting("cracker_box", name="below"), resting("sugar_box", xy=(0.100, 0.0), floor=0.060, name="over")]
+OVERHANG = [
+    resting("cracker_box", name="below"),
+    resting("sugar_box", xy=(0.100, 0.0), floor=0.060, name="over"),
+]
 HEAVY = resting("granola_box", Orientation.FLAT_0, (-0.2, 0.25), name="heavy")
 WEIGHED_DOWN = scene_of(
-    *(resting("cracker_box", name="below"), resting("sugar_box", xy=(0.132, 0.0), floor=0.060, name="over")),
-    *(resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight"), resting("gelatin_box", xy=(-0.2, 0.25), name="beside")),
+    *(
+        resting("cracker_box", name="below"),
+        resting("sugar_box", xy=(0.132, 0.0), floor=0.060, name="over"),
+    ),
+    *(
+        resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight"),
+        resting("gelatin_box", xy=(-0.2, 0.25), name="beside"),
+    ),
 )
 # What is free of the overhang's top is beyond the can, and beyond the edge.
-OUTSIDE_ONLY = scene_of(*OVERHANG, resting("tomato_soup_can", xy=(0.055, 0.0), floor=0.098, name="can"), HEAVY)
+OUTSIDE_ONLY = scene_of(
+    *OVERHANG, resting("tomato_soup_can", xy=(0.055, 0.0), floor=0.098, name="can"), HEAVY
+)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +161,9 @@ def test_where_nothing_balances() -> None:
     assert outcome.instability.reason is InstabilityReason.UNBALANCED
     assert outcome.scene["heavy"].X_TO.p[0] > 0.115
     # Without the can the middle of the top is free, which is 15 mm inside the edge.
-    assert carried_out(scene_of(*OVERHANG, HEAVY), Move("heavy", "over")).result is MoveResult.PLACED
+    assert (
+        carried_out(scene_of(*OVERHANG, HEAVY), Move("heavy", "over")).result is MoveResult.PLACED
+    )
 
 
 # --- Not carried out ---
@@ -148,7 +172,11 @@ def test_where_nothing_balances() -> None:
 def test_no_free_spot_changes_nothing() -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(scene, Move("box"))
-    assert (outcome.result, outcome.instability, outcome.cannot_judge) == (MoveResult.NO_FREE_SPOT, None, None)
+    assert (outcome.result, outcome.instability, outcome.cannot_judge) == (
+        MoveResult.NO_FREE_SPOT,
+        None,
+        None,
+    )
     assert outcome.scene is scene
 
 
@@ -161,7 +189,10 @@ def leaning(o: SceneObject) -> SceneObject:
 LEANS = scene_of(*STACKS.objects, leaning(resting("gelatin_box", xy=(0.2, -0.2), name="leaning")))
 # As settling may leave it: its middle 1 mm inside the edge, where the judge wants 2 mm.
 JUST_RESTS = scene_of(
-    *(resting("cracker_box", name="below"), resting("sugar_box", xy=(0.114, 0.0), floor=0.060, name="over")),
+    *(
+        resting("cracker_box", name="below"),
+        resting("sugar_box", xy=(0.114, 0.0), floor=0.060, name="over"),
+    ),
     *(
         resting("gelatin_box", xy=(0.114, 0.0), floor=0.098, name="on it"),
         resting("large_marker", xy=(-0.2, -0.2), name="marker"),
@@ -177,17 +208,29 @@ LEANING = CannotJudge(CannotJudgeReason.LEANING, "leaning")
         (LEANS, Move("leaning", "above"), LEANING),
         (LEANS, Move("marker", "leaning"), LEANING),
         (JUST_RESTS, Move("on it"), CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, "over")),
-        (JUST_RESTS, Move("marker", "on it"), CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, "over")),
+        (
+            JUST_RESTS,
+            Move("marker", "on it"),
+            CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, "over"),
+        ),
     ],
 )
 def test_what_it_cannot_judge_is_a_result(scene: Scene, move: Move, answer: CannotJudge) -> None:
     """Also that something rests, before the move, which it would let fall."""
     outcome = carried_out(scene, move)
-    assert (outcome.result, outcome.cannot_judge, outcome.instability) == (MoveResult.CANNOT_JUDGE, answer, None)
+    assert (outcome.result, outcome.cannot_judge, outcome.instability) == (
+        MoveResult.CANNOT_JUDGE,
+        answer,
+        None,
+    )
     assert outcome.scene is scene
 
 
-@pytest.mark.parametrize("move", [Move("above"), Move("marker", "above"), Move("below"), Move("on the can", "marker")], ids=str)
+@pytest.mark.parametrize(
+    "move",
+    [Move("above"), Move("marker", "above"), Move("below"), Move("on the can", "marker")],
+    ids=str,
+)
 def test_what_a_move_does_not_touch_need_not_be_judged(move: Move) -> None:
     """The same as without the box that leans, wherever the picked one goes."""
     outcome, without = carried_out(LEANS, move), carried_out(STACKS, move)
@@ -197,7 +240,11 @@ def test_what_a_move_does_not_touch_need_not_be_judged(move: Move) -> None:
 
 
 @pytest.mark.parametrize("executor", [EXECUTOR, FastOrDrakeExecutor(CONFIG)])
-@pytest.mark.parametrize("move", [Move("ghost"), Move("marker", "ghost"), Move("can", "marker"), Move("marker", "can")], ids=str)
+@pytest.mark.parametrize(
+    "move",
+    [Move("ghost"), Move("marker", "ghost"), Move("can", "marker"), Move("marker", "can")],
+    ids=str,
+)
 def test_only_what_is_in_view_can_be_moved(move: Move, executor: MoveExecutor) -> None:
     """The can is hidden."""
     name = move.pick if move.pick != "marker" else move.place
@@ -217,7 +264,9 @@ def test_only_what_is_in_view_can_be_moved(move: Move, executor: MoveExecutor) -
     ],
     ids=str,
 )
-def test_drake_lets_it_go_at_the_same_place(move: Move, result: MoveResult, detector: LabelDetector) -> None:
+def test_drake_lets_it_go_at_the_same_place(
+    move: Move, result: MoveResult, detector: LabelDetector
+) -> None:
     """From the ray caster's observation as from the rendered one. A box then creeps by less than 0.1 mm; a fall goes on in Drake,
     whose motion begins where the object was let go, 1 mm higher."""
     rendered, cast = detector.look(STACKS).observation, seen(STACKS)
@@ -231,7 +280,9 @@ def test_drake_lets_it_go_at_the_same_place(move: Move, result: MoveResult, dete
     down = np.array([0.0, 0.0, CONFIG.exploration.release_height])
     assert mine.scene[move.pick].X_TO.p == pytest.approx(let_go.p - down, abs=1e-12)
     if result is MoveResult.PLACED:
-        assert drakes.scene[move.pick].X_TO.p == pytest.approx(mine.scene[move.pick].X_TO.p, abs=1e-4)
+        assert drakes.scene[move.pick].X_TO.p == pytest.approx(
+            mine.scene[move.pick].X_TO.p, abs=1e-4
+        )
         assert JUDGE.stability(drakes.scene) is None
     else:
         assert mine.instability is not None
@@ -250,7 +301,9 @@ def test_drake_is_asked_about_what_cannot_be_judged() -> None:
     assert generator.random() == other.random()
 
 
-@pytest.mark.parametrize("move", [Move("above"), Move("below"), Move("on the can", "marker")], ids=str)
+@pytest.mark.parametrize(
+    "move", [Move("above"), Move("below"), Move("on the can", "marker")], ids=str
+)
 def test_drake_is_not_asked_about_the_rest(move: Move) -> None:
     """Not even about a collapse, of which it would show the motion."""
     generator, other = rng(5), rng(5)

@@ -10,7 +10,13 @@ from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
-from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
+from drake_clutter.scenes.interfaces import (
+    CannotJudge,
+    CannotJudgeReason,
+    Instability,
+    InstabilityReason,
+    Verdict,
+)
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
 from drake_clutter.simulation.judge import DrakeJudge
@@ -33,7 +39,9 @@ def stands(*objects: SceneObject) -> bool:
     return found is None
 
 
-def reason_of(found: Instability | CannotJudge | None) -> InstabilityReason | CannotJudgeReason | None:
+def reason_of(
+    found: Instability | CannotJudge | None,
+) -> InstabilityReason | CannotJudgeReason | None:
     """What is wrong. Which of two twins that fall alike is named is not asked."""
     return None if found is None else found.reason
 
@@ -41,7 +49,9 @@ def reason_of(found: Instability | CannotJudge | None) -> InstabilityReason | Ca
 # --- Known statics ---
 
 
-@pytest.mark.parametrize("class_name", ["sugar_box", "gelatin_box", "tomato_soup_can", "master_chef_can"])
+@pytest.mark.parametrize(
+    "class_name", ["sugar_box", "gelatin_box", "tomato_soup_can", "master_chef_can"]
+)
 @pytest.mark.parametrize(("axis", "half"), [(0, 0.115), (1, 0.080)], ids=["along", "across"])
 def test_the_tipping_point(class_name: str, axis: int, half: float) -> None:
     """What is uniform tips when its middle is beyond the edge; the judge wants the margin more. To 1 mm, and then to 0.1 mm."""
@@ -50,7 +60,9 @@ def test_the_tipping_point(class_name: str, axis: int, half: float) -> None:
         for sign in (-1, 1):
             xy = [0.0, 0.0]
             xy[axis] = sign * offset
-            assert stands(BELOW, resting(class_name, xy=xy, floor=0.060, name="above")) == (offset <= half - MARGIN)
+            assert stands(BELOW, resting(class_name, xy=xy, floor=0.060, name="above")) == (
+                offset <= half - MARGIN
+            )
 
 
 def test_the_margin_grows_with_the_offsets() -> None:
@@ -59,16 +71,26 @@ def test_the_margin_grows_with_the_offsets() -> None:
     wide = world_with("settle.jitter=0.003")
     assert FAST.stability(scene) is None
     fallen = Instability(InstabilityReason.UNBALANCED, "above")
-    assert FastJudge(wide).stability(scene) == FastJudge(ClutterConfig(), margin=0.0041).stability(scene) == fallen
+    assert (
+        FastJudge(wide).stability(scene)
+        == FastJudge(ClutterConfig(), margin=0.0041).stability(scene)
+        == fallen
+    )
     assert FastJudge(wide, margin=0.0039).stability(scene) is None
 
 
 # A box of 514 g that reaches 17 mm too far out, and what may hold it.
 TOO_FAR = resting("sugar_box", xy=(0.132, 0.0), floor=0.060, name="over")
-LYING_PAIR = [resting("sugar_box", xy=(0.0, y), name=name) for name, y in (("left", -0.0455), ("right", 0.0455))]
+LYING_PAIR = [
+    resting("sugar_box", xy=(0.0, y), name=name)
+    for name, y in (("left", -0.0455), ("right", 0.0455))
+]
 TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
     "a can on a box": ([BELOW, resting("tomato_soup_can", floor=0.060)], None),
-    "a can over the edge": ([BELOW, resting("tomato_soup_can", xy=(0.114, 0.0), floor=0.060)], InstabilityReason.UNBALANCED),
+    "a can over the edge": (
+        [BELOW, resting("tomato_soup_can", xy=(0.114, 0.0), floor=0.060)],
+        InstabilityReason.UNBALANCED,
+    ),
     "a bridge over a standing pair": ([*STANDING_PAIR, resting("cracker_box", floor=0.175)], None),
     "a bridge that only one of the pair carries": (
         [STANDING_PAIR[0], resting("cracker_box", floor=0.175)],
@@ -76,20 +98,30 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
     ),
     "a bridge on four feet": (
         [
-            *(resting("tomato_soup_can", xy=(x, y), name=f"{x} {y}") for x in (-0.07, 0.07) for y in (-0.04, 0.04)),
+            *(
+                resting("tomato_soup_can", xy=(x, y), name=f"{x} {y}")
+                for x in (-0.07, 0.07)
+                for y in (-0.04, 0.04)
+            ),
             resting("cracker_box", floor=0.101),
         ],
         None,
     ),
     "a table on three legs of four, its middle on the diagonal": (
         [
-            *(resting("tomato_soup_can", xy=xy, name=str(xy)) for xy in ((-0.07, -0.04), (0.07, 0.04))),
+            *(
+                resting("tomato_soup_can", xy=xy, name=str(xy))
+                for xy in ((-0.07, -0.04), (0.07, 0.04))
+            ),
             resting("cracker_box", floor=0.101),
         ],
         None,
     ),
     "an overhang without its counterweight": ([BELOW, TOO_FAR], InstabilityReason.UNBALANCED),
-    "an overhang with its counterweight": ([BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098)], None),
+    "an overhang with its counterweight": (
+        [BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098)],
+        None,
+    ),
     "a counterweight on the wrong side": (
         [BELOW, TOO_FAR, resting("granola_box", xy=(0.16, 0.0), floor=0.098)],
         InstabilityReason.UNBALANCED,
@@ -99,16 +131,26 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
         InstabilityReason.UNBALANCED,
     ),
     "a marker across a marker": (
-        [resting("large_marker", name="below"), resting("large_marker", Orientation.FLAT_90, floor=0.018)],
+        [
+            resting("large_marker", name="below"),
+            resting("large_marker", Orientation.FLAT_90, floor=0.018),
+        ],
         InstabilityReason.ROLLS,
     ),
     "a marker along a marker": (
         [resting("large_marker", name="below"), resting("large_marker", floor=0.018, name="above")],
         InstabilityReason.ROLLS,
     ),
-    "a box on a marker": ([resting("large_marker"), resting("gelatin_box", floor=0.018)], InstabilityReason.ROLLS),
+    "a box on a marker": (
+        [resting("large_marker"), resting("gelatin_box", floor=0.018)],
+        InstabilityReason.ROLLS,
+    ),
     "a box on a marker on a box": (
-        [BELOW, resting("large_marker", Orientation.FLAT_30, floor=0.060), resting("gelatin_box", floor=0.078)],
+        [
+            BELOW,
+            resting("large_marker", Orientation.FLAT_30, floor=0.060),
+            resting("gelatin_box", floor=0.078),
+        ],
         InstabilityReason.ROLLS,
     ),
     "a box beside the line on which a marker would carry it": (
@@ -116,13 +158,22 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
         InstabilityReason.UNBALANCED,
     ),
     "a box on a pair of markers": ([*MARKER_PAIR, resting("gelatin_box", floor=0.018)], None),
-    "a marker across a pair of markers": ([*MARKER_PAIR, resting("large_marker", Orientation.FLAT_90, floor=0.018)], None),
+    "a marker across a pair of markers": (
+        [*MARKER_PAIR, resting("large_marker", Orientation.FLAT_90, floor=0.018)],
+        None,
+    ),
     "a box on a pair of markers, beyond one": (
         [*MARKER_PAIR, resting("gelatin_box", xy=(0.0, 0.012), floor=0.018)],
         InstabilityReason.UNBALANCED,
     ),
-    "a marker over the gap of a lying pair": ([*LYING_PAIR, resting("large_marker", floor=0.038)], None),
-    "a marker across the gap of a lying pair": ([*LYING_PAIR, resting("large_marker", Orientation.FLAT_90, floor=0.038)], None),
+    "a marker over the gap of a lying pair": (
+        [*LYING_PAIR, resting("large_marker", floor=0.038)],
+        None,
+    ),
+    "a marker across the gap of a lying pair": (
+        [*LYING_PAIR, resting("large_marker", Orientation.FLAT_90, floor=0.038)],
+        None,
+    ),
     "a marker in the gap of a standing pair": (
         [*STANDING_PAIR, resting("large_marker", floor=0.175)],
         InstabilityReason.UNSUPPORTED,
@@ -140,27 +191,49 @@ def test_known_statics(objects: list[SceneObject], reason: InstabilityReason | N
 
 
 @pytest.mark.parametrize(("objects", "reason"), TABLE.values(), ids=list(TABLE))
-def test_numerical_noise_is_no_matter(objects: list[SceneObject], reason: InstabilityReason | None) -> None:
+def test_numerical_noise_is_no_matter(
+    objects: list[SceneObject], reason: InstabilityReason | None
+) -> None:
     """As settling leaves it: 1 nm and 1 nrad."""
     generator = rng(1)
     noisy = []
     for o in objects:
         turn = Rotation.from_rotvec(1e-9 * generator.standard_normal(3)).as_matrix()
-        noisy.append(replace(o, X_TO=Pose.of(turn @ o.X_TO.rotation, o.X_TO.p + 1e-9 * generator.standard_normal(3))))
+        noisy.append(
+            replace(
+                o,
+                X_TO=Pose.of(
+                    turn @ o.X_TO.rotation, o.X_TO.p + 1e-9 * generator.standard_normal(3)
+                ),
+            )
+        )
     assert reason_of(FAST.stability(scene_of(*noisy))) is reason
 
 
 def test_the_verdict_names_what_falls_in_the_first_stack_that_does() -> None:
     falling = [BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="first")]
-    other = [resting("cracker_box", xy=(0.0, 0.2), name="foot"), resting("gelatin_box", xy=(0.0, 0.29), floor=0.060, name="b")]
-    assert FAST.stability(scene_of(*falling, *other)) == Instability(InstabilityReason.UNBALANCED, "first")
-    assert FAST.stability(scene_of(*other, *falling)) == Instability(InstabilityReason.UNBALANCED, "b")
+    other = [
+        resting("cracker_box", xy=(0.0, 0.2), name="foot"),
+        resting("gelatin_box", xy=(0.0, 0.29), floor=0.060, name="b"),
+    ]
+    assert FAST.stability(scene_of(*falling, *other)) == Instability(
+        InstabilityReason.UNBALANCED, "first"
+    )
+    assert FAST.stability(scene_of(*other, *falling)) == Instability(
+        InstabilityReason.UNBALANCED, "b"
+    )
 
 
 ARCH = scene_of(
     # Tall boxes whose middles are 3 mm beyond their feet, kept apart by a box on both their inner edges.
-    *(resting("cracker_box", Orientation.FLAT_90, (s * 0.213, 0.0), name=f"foot {s}") for s in (-1, 1)),
-    *(resting("cracker_box", Orientation.UPRIGHT_90, (s * 0.130, 0.0), 0.060, f"leg {s}") for s in (-1, 1)),
+    *(
+        resting("cracker_box", Orientation.FLAT_90, (s * 0.213, 0.0), name=f"foot {s}")
+        for s in (-1, 1)
+    ),
+    *(
+        resting("cracker_box", Orientation.UPRIGHT_90, (s * 0.130, 0.0), 0.060, f"leg {s}")
+        for s in (-1, 1)
+    ),
     resting("cracker_box", floor=0.290, name="bridge"),
 )
 
@@ -171,7 +244,10 @@ def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -
     assert FastJudge(config).stability(ARCH) is None
     assert judge.judge(ARCH, rng()).stable
     for friction in (0.0, 0.1):  # 0.05 Nm do not suffice either
-        assert reason_of(FastJudge(config, friction=friction).stability(ARCH)) is InstabilityReason.UNBALANCED
+        assert (
+            reason_of(FastJudge(config, friction=friction).stability(ARCH))
+            is InstabilityReason.UNBALANCED
+        )
     margins = FAST.margins(ARCH)  # under vertical forces
     assert not isinstance(margins, CannotJudge)
     assert max(margins.values()) < 0
@@ -189,10 +265,22 @@ def leaning(o: SceneObject, degrees: float) -> SceneObject:
 
 CANNOT: dict[str, tuple[list[SceneObject], CannotJudgeReason]] = {
     "leans": ([leaning(resting("sugar_box", UPRIGHT, name="it"), 3.0)], CannotJudgeReason.LEANING),
-    "a can that leans": ([leaning(resting("tomato_soup_can", name="it"), 3.0)], CannotJudgeReason.LEANING),
-    "a marker that leans": ([leaning(resting("large_marker", name="it"), 3.0)], CannotJudgeReason.LEANING),
-    "over the rim": ([resting("cracker_box", xy=(0.240, 0.0), name="it")], CannotJudgeReason.OUTSIDE_TRAY),
-    "beside the tray": ([resting("large_marker", xy=(0.0, -0.5), name="it")], CannotJudgeReason.OUTSIDE_TRAY),
+    "a can that leans": (
+        [leaning(resting("tomato_soup_can", name="it"), 3.0)],
+        CannotJudgeReason.LEANING,
+    ),
+    "a marker that leans": (
+        [leaning(resting("large_marker", name="it"), 3.0)],
+        CannotJudgeReason.LEANING,
+    ),
+    "over the rim": (
+        [resting("cracker_box", xy=(0.240, 0.0), name="it")],
+        CannotJudgeReason.OUTSIDE_TRAY,
+    ),
+    "beside the tray": (
+        [resting("large_marker", xy=(0.0, -0.5), name="it")],
+        CannotJudgeReason.OUTSIDE_TRAY,
+    ),
     "in another": (
         [resting("gelatin_box", xy=(0.1, 0.0), floor=0.040, name="it"), BELOW],
         CannotJudgeReason.INTERPENETRATING,
@@ -201,34 +289,59 @@ CANNOT: dict[str, tuple[list[SceneObject], CannotJudgeReason]] = {
         [resting("gelatin_box", xy=(0.0, 0.071), name="it"), resting("gelatin_box", name="other")],
         CannotJudgeReason.INTERPENETRATING,
     ),
-    "in the tray": ([resting("cracker_box", floor=-0.003, name="it")], CannotJudgeReason.INTERPENETRATING),
+    "in the tray": (
+        [resting("cracker_box", floor=-0.003, name="it")],
+        CannotJudgeReason.INTERPENETRATING,
+    ),
     "floats": ([resting("cracker_box", floor=0.05, name="it")], CannotJudgeReason.FLOATING),
-    "floats 3 mm above a box": ([BELOW, resting("gelatin_box", floor=0.063, name="it")], CannotJudgeReason.FLOATING),
-    "floats far beside": ([BELOW, resting("gelatin_box", xy=(0.0, 0.25), floor=0.060, name="it")], CannotJudgeReason.FLOATING),
+    "floats 3 mm above a box": (
+        [BELOW, resting("gelatin_box", floor=0.063, name="it")],
+        CannotJudgeReason.FLOATING,
+    ),
+    "floats far beside": (
+        [BELOW, resting("gelatin_box", xy=(0.0, 0.25), floor=0.060, name="it")],
+        CannotJudgeReason.FLOATING,
+    ),
     "on the side of a marker": (
-        [resting("large_marker", name="other"), resting("gelatin_box", xy=(0.0, 0.044), floor=0.018, name="it")],
+        [
+            resting("large_marker", name="other"),
+            resting("gelatin_box", xy=(0.0, 0.044), floor=0.018, name="it"),
+        ],
         CannotJudgeReason.EDGE_CONTACT,
     ),
-    "in the groove of a pair": ([*MARKER_PAIR, resting("large_marker", floor=0.0175, name="it")], CannotJudgeReason.EDGE_CONTACT),
-    "misses": ([BELOW, resting("gelatin_box", xy=(0.0, 0.13), floor=0.060, name="it")], CannotJudgeReason.UNSUPPORTED),
+    "in the groove of a pair": (
+        [*MARKER_PAIR, resting("large_marker", floor=0.0175, name="it")],
+        CannotJudgeReason.EDGE_CONTACT,
+    ),
+    "misses": (
+        [BELOW, resting("gelatin_box", xy=(0.0, 0.13), floor=0.060, name="it")],
+        CannotJudgeReason.UNSUPPORTED,
+    ),
 }
 
 
 @pytest.mark.parametrize(("objects", "reason"), CANNOT.values(), ids=list(CANNOT))
-def test_what_it_cannot_judge(objects: list[SceneObject], reason: CannotJudgeReason, config: ClutterConfig) -> None:
+def test_what_it_cannot_judge(
+    objects: list[SceneObject], reason: CannotJudgeReason, config: ClutterConfig
+) -> None:
     """Whatever is asked. What misses what should carry it falls; the rest may fall or not."""
     scene = scene_of(*objects)
     answer = CannotJudge(reason, "it")
     assert FAST.supports(scene) == FAST.margins(scene) == FAST.never_movable(scene) == answer
     losing = FAST.losing_support(scene, "it")
     if reason is CannotJudgeReason.UNSUPPORTED:
-        assert losing in (answer, CannotJudge(CannotJudgeReason.FLOATING, "it"))  # of its group alone, to which the other is not
+        assert losing in (
+            answer,
+            CannotJudge(CannotJudgeReason.FLOATING, "it"),
+        )  # of its group alone, to which the other is not
         assert FAST.stability(scene) == Instability(InstabilityReason.UNSUPPORTED, "it")
         return
     assert losing == answer
     generator, untouched = rng(), rng()
     assert FAST.stability(scene) == FAST.judge(scene, generator) == answer
-    assert generator.random() == untouched.random()  # so that Drake draws the same offsets when it is asked instead
+    assert (
+        generator.random() == untouched.random()
+    )  # so that Drake draws the same offsets when it is asked instead
     assert str(answer) == f"it {reason.value}"
 
 
@@ -259,7 +372,9 @@ PARTLY = scene_of(
     [HIDING, PARTLY, *(scene_of(*objects) for objects in STABLE.values())],
     ids=["hiding", "partly", *STABLE],
 )
-def test_stable_scenes_look_as_drake_says(scene: Scene, config: ClutterConfig, fast: FastJudge, judge: DrakeJudge) -> None:
+def test_stable_scenes_look_as_drake_says(
+    scene: Scene, config: ClutterConfig, fast: FastJudge, judge: DrakeJudge
+) -> None:
     """The same offsets are drawn; then a marker, and what lies on markers, rolls by what still counts as rest. What Drake has
     settled, the fast judge takes for settled."""
     mine, drakes = fast.judge(scene, rng(3)), judge.judge(scene, rng(3))
@@ -270,13 +385,17 @@ def test_stable_scenes_look_as_drake_says(scene: Scene, config: ClutterConfig, f
     assert list(mine.visible_share) == list(scene.names)
     assert mine.visible_share == pytest.approx(drakes.visible_share, abs=0.01)
     for name in scene.names:
-        assert np.linalg.norm(mine.settled[name].p - drakes.settled[name].p) < config.settle.rest_drift
+        assert (
+            np.linalg.norm(mine.settled[name].p - drakes.settled[name].p) < config.settle.rest_drift
+        )
         assert np.hypot(*(mine.settled[name].p - scene[name].X_TO.p)[:2]) <= 0.001
     assert fast.stability(scene.at(drakes.settled)) is None
 
 
 @pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
-def test_what_falls_in_drake(objects: list[SceneObject], reason: InstabilityReason, name: str, fast: FastJudge) -> None:
+def test_what_falls_in_drake(
+    objects: list[SceneObject], reason: InstabilityReason, name: str, fast: FastJudge
+) -> None:
     verdict = fast.judge(scene_of(*objects), rng())
     if isinstance(verdict, CannotJudge):
         assert verdict.reason in (CannotJudgeReason.FLOATING, CannotJudgeReason.OUTSIDE_TRAY)
@@ -309,10 +428,14 @@ def test_the_threshold_of_hidden_is_the_configs(config: ClutterConfig) -> None:
 
 
 @pytest.mark.parametrize("name", ["a box on its shelf above nothing", "a stack beside the tray"])
-def test_what_the_fast_judge_cannot_judge_drake_does(name: str, config: ClutterConfig, judge: DrakeJudge) -> None:
+def test_what_the_fast_judge_cannot_judge_drake_does(
+    name: str, config: ClutterConfig, judge: DrakeJudge
+) -> None:
     scene = scene_of(*FALLING[name][0])
     assert FastOrDrakeJudge(config).judge(scene, rng(2)) == judge.judge(scene, rng(2))
 
 
-def test_what_the_fast_judge_can_judge_drake_is_not_asked(config: ClutterConfig, fast: FastJudge) -> None:
+def test_what_the_fast_judge_can_judge_drake_is_not_asked(
+    config: ClutterConfig, fast: FastJudge
+) -> None:
     assert FastOrDrakeJudge(config).judge(HIDING, rng(2)) == fast.judge(HIDING, rng(2))

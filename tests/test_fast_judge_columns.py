@@ -17,7 +17,12 @@ from test_settle import BELOW
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
-from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, InstabilityReason, Verdict
+from drake_clutter.scenes.interfaces import (
+    CannotJudge,
+    CannotJudgeReason,
+    InstabilityReason,
+    Verdict,
+)
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
@@ -28,7 +33,11 @@ BOXES = ["cracker_box", "sugar_box", "pudding_box", "gelatin_box", "granola_box"
 MILLIMETRE = 0.001013
 """m. Sizes are round, so that no outline begins just where another one ends."""
 OFFSETS = st.integers(-60, 60).map(lambda k: k * MILLIMETRE)
-LAYERS = st.lists(st.tuples(st.sampled_from(BOXES), st.sampled_from(list(Orientation)), OFFSETS, OFFSETS), min_size=2, max_size=4)
+LAYERS = st.lists(
+    st.tuples(st.sampled_from(BOXES), st.sampled_from(list(Orientation)), OFFSETS, OFFSETS),
+    min_size=2,
+    max_size=4,
+)
 Layers = list[tuple[str, Orientation, float, float]]
 
 
@@ -38,7 +47,9 @@ def column(layers: Layers) -> list[SceneObject]:
     x = y = floor = 0.0
     for class_name, orientation, dx, dy in layers:
         x, y = (x + dx, y + dy) if objects else (0.0, 0.0)
-        objects.append(resting(class_name, orientation, (x, y), floor, f"{class_name} {len(objects)}"))
+        objects.append(
+            resting(class_name, orientation, (x, y), floor, f"{class_name} {len(objects)}")
+        )
         floor = objects[-1].top
     return objects
 
@@ -48,7 +59,9 @@ def how_far_inside(box: SceneObject, p_T: NDArray[np.float64]) -> float:
     R_TO = box.X_TO.rotation
     level = [axis for axis in range(3) if abs(R_TO[2, axis]) < 0.5]
     sizes = box.object_class.size
-    return min(sizes[axis] / 2 - abs(float(R_TO[:2, axis] @ (p_T - box.X_TO.p)[:2])) for axis in level)
+    return min(
+        sizes[axis] / 2 - abs(float(R_TO[:2, axis] @ (p_T - box.X_TO.p)[:2])) for axis in level
+    )
 
 
 def column_margins(objects: Sequence[SceneObject]) -> list[float]:
@@ -58,13 +71,19 @@ def column_margins(objects: Sequence[SceneObject]) -> list[float]:
     found = []
     for k, o in enumerate(objects):
         p_TC = masses[k:] @ middles[k:] / masses[k:].sum()
-        found.append(min(how_far_inside(met, p_TC) for met in ([o] if k == 0 else [objects[k - 1], o])))
+        found.append(
+            min(how_far_inside(met, p_TC) for met in ([o] if k == 0 else [objects[k - 1], o]))
+        )
     return found
 
 
 @given(LAYERS)
-@example([("cracker_box", Orientation.FLAT_0, 0.0, 0.0), ("sugar_box", Orientation.FLAT_0, 0.110, 0.0)])
-@example([("cracker_box", Orientation.FLAT_0, 0.0, 0.0), ("sugar_box", Orientation.FLAT_0, 0.1125, 0.0)])
+@example(
+    [("cracker_box", Orientation.FLAT_0, 0.0, 0.0), ("sugar_box", Orientation.FLAT_0, 0.110, 0.0)]
+)
+@example(
+    [("cracker_box", Orientation.FLAT_0, 0.0, 0.0), ("sugar_box", Orientation.FLAT_0, 0.1125, 0.0)]
+)
 @settings(max_examples=100)
 def test_a_column_stands_while_every_centre_of_mass_is_inside(layers: Layers) -> None:
     """And the margins are how far inside it is, in steps of 0.1 mm; where another contact fails, nothing helps."""
@@ -100,7 +119,16 @@ def test_losing_support_is_what_the_rest_cannot_do_without(layers: Layers, which
         assert (losing == ()) == stands(*rest)
 
 
-FEET = [(-0.12, -0.12), (-0.12, 0.0), (-0.12, 0.12), (0.0, -0.12), (0.0, 0.12), (0.12, -0.12), (0.12, 0.0), (0.12, 0.12)]
+FEET = [
+    (-0.12, -0.12),
+    (-0.12, 0.0),
+    (-0.12, 0.12),
+    (0.0, -0.12),
+    (0.0, 0.12),
+    (0.12, -0.12),
+    (0.12, 0.0),
+    (0.12, 0.12),
+]
 
 
 def on_feet(feet: Sequence[tuple[float, float]], top: SceneObject, margin: float) -> bool:
@@ -109,7 +137,10 @@ def on_feet(feet: Sequence[tuple[float, float]], top: SceneObject, margin: float
     corners = []
     for foot in feet:
         half = np.array([0.089, 0.038]) / 2 - margin
-        lower, upper = np.maximum(low, np.array(foot) - half), np.minimum(high, np.array(foot) + half)
+        lower, upper = (
+            np.maximum(low, np.array(foot) - half),
+            np.minimum(high, np.array(foot) + half),
+        )
         if (lower < upper).all():
             corners += [(x, y, 1.0) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
     if not corners:
@@ -131,7 +162,9 @@ def test_a_box_on_feet_stands_while_its_middle_is_between_them(
     top = resting("cereal_box_large", orientation, xy, 0.175, "top")
     expected = on_feet(feet, top, MARGIN)
     assume(on_feet(feet, top, MARGIN - 1e-5) == expected == on_feet(feet, top, MARGIN + 1e-5))
-    found = FAST.stability(scene_of(*(resting("sugar_box", UPRIGHT, foot, name=f"{foot}") for foot in feet), top))
+    found = FAST.stability(
+        scene_of(*(resting("sugar_box", UPRIGHT, foot, name=f"{foot}") for foot in feet), top)
+    )
     assume(reason_of(found) is not CannotJudgeReason.FLOATING)
     assert not isinstance(found, CannotJudge)
     assert (found is None) == expected
@@ -140,7 +173,12 @@ def test_a_box_on_feet_stands_while_its_middle_is_between_them(
 # --- What must not matter ---
 
 ANYTHING = st.lists(
-    st.tuples(st.sampled_from([*BOXES, "tomato_soup_can", "large_marker"]), st.sampled_from(list(Orientation)), OFFSETS, OFFSETS),
+    st.tuples(
+        st.sampled_from([*BOXES, "tomato_soup_can", "large_marker"]),
+        st.sampled_from(list(Orientation)),
+        OFFSETS,
+        OFFSETS,
+    ),
     min_size=2,
     max_size=5,
 )
@@ -152,14 +190,18 @@ def shifted(scene: Scene, x: float, y: float) -> Scene:
 
 def turned(scene: Scene, quarters: int) -> Scene:
     turn = np.rint(Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix())
-    return scene.at({o.name: Pose.of(turn @ o.X_TO.rotation, turn @ o.X_TO.p) for o in scene.objects})
+    return scene.at(
+        {o.name: Pose.of(turn @ o.X_TO.rotation, turn @ o.X_TO.p) for o in scene.objects}
+    )
 
 
 @given(ANYTHING, st.integers(-99, 99), st.integers(-99, 99))
 @settings(max_examples=60)
 def test_the_place_on_the_tray_is_no_matter(layers: Layers, x: int, y: int) -> None:
     scene = scene_of(*column(layers), side=2.0)
-    assert reason_of(FAST.stability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))) is reason_of(FAST.stability(scene))
+    assert reason_of(FAST.stability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))) is reason_of(
+        FAST.stability(scene)
+    )
 
 
 @given(ANYTHING, st.integers(1, 3))
@@ -193,7 +235,10 @@ def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) 
 @settings(max_examples=60)
 def test_a_stack_far_away_is_no_matter(layers: Layers) -> None:
     scene = scene_of(*column(layers), side=2.0)
-    far = [resting("cracker_box", xy=(0.8, 0.8), name="foot"), resting("sugar_box", xy=(0.8, 0.8), floor=0.060, name="far")]
+    far = [
+        resting("cracker_box", xy=(0.8, 0.8), name="foot"),
+        resting("sugar_box", xy=(0.8, 0.8), floor=0.060, name="far"),
+    ]
     for objects in ((*scene.objects, *far), (*far, *scene.objects)):
         assert FAST.stability(replace(scene, objects=objects)) == FAST.stability(scene)
 
@@ -207,7 +252,10 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
     for step in range(24):
         scene = scenes[generator.integers(len(scenes))]
         if step % 3 == 1:
-            scene = replace(scene, objects=tuple(scene.objects[k] for k in generator.permutation(len(scene.objects))))
+            scene = replace(
+                scene,
+                objects=tuple(scene.objects[k] for k in generator.permutation(len(scene.objects))),
+            )
         if step % 3 == 2:
             o = scene.objects[generator.integers(len(scene.objects))]
             scene = scene.at({o.name: o.X_TO.moved((*generator.uniform(-0.02, 0.02, 2), 0.0))})
@@ -217,15 +265,25 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
     assert kinds >= {True, False}
 
 
-def test_which_of_two_twins_falls_does_not_depend_on_what_was_judged_before(config: ClutterConfig) -> None:
+def test_which_of_two_twins_falls_does_not_depend_on_what_was_judged_before(
+    config: ClutterConfig,
+) -> None:
     used = FastJudge(config)
-    scene = scene_of(BELOW, *(resting("sugar_box", xy=(0.0, s * 0.1), floor=0.060, name=f"{s}") for s in (-1, 1)))
+    scene = scene_of(
+        BELOW, *(resting("sugar_box", xy=(0.0, s * 0.1), floor=0.060, name=f"{s}") for s in (-1, 1))
+    )
     for x, y in ((0.0, 0.0), (0.1, 0.05), (-0.1, -0.1)):
-        assert FastJudge(config).stability(shifted(scene, x, y)) == used.stability(shifted(scene, x, y))
+        assert FastJudge(config).stability(shifted(scene, x, y)) == used.stability(
+            shifted(scene, x, y)
+        )
 
 
 def test_a_force_that_ends_at_zero_ends_no_search() -> None:
-    layers = [("pudding_box", 0.0, 0.0), ("pudding_box", 0.051663, -0.045585), ("sugar_box", 0.004052, 0.001013)]
+    layers = [
+        ("pudding_box", 0.0, 0.0),
+        ("pudding_box", 0.051663, -0.045585),
+        ("sugar_box", 0.004052, 0.001013),
+    ]
     layers.append(("sugar_box", 0.001013, 0.001013))
     scene = scene_of(*column([(name, Orientation.FLAT_0, x, y) for name, x, y in layers]))
     assert reason_of(FAST.stability(scene)) is InstabilityReason.UNBALANCED
@@ -237,7 +295,10 @@ def test_any_number_of_orientations(config: ClutterConfig) -> None:
     for degrees in range(150):
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         o = resting("sugar_box", name="box")
-        assert used.stability(scene_of(replace(o, X_TO=Pose.of(turn @ o.X_TO.rotation, o.X_TO.p)))) is None
+        assert (
+            used.stability(scene_of(replace(o, X_TO=Pose.of(turn @ o.X_TO.rotation, o.X_TO.p))))
+            is None
+        )
 
 
 def test_an_empty_tray_is_stable(config: ClutterConfig, judge: DrakeJudge) -> None:

@@ -42,7 +42,9 @@ SCENE = scene_of(
 
 
 def study(cell: WorkCell | None = None) -> FeasibilityStudy:
-    return FeasibilityStudy("it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimise=False), 0)
+    return FeasibilityStudy(
+        "it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimise=False), 0
+    )
 
 
 def test_manipulability_in_closed_form() -> None:
@@ -65,7 +67,9 @@ def test_every_legal_move_has_a_row() -> None:
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
         assert row.below == (1 if row.pick == "gelatin_box" else 0)
     again = study().moves("scene", 0, SCENE)
-    assert [str(replace(row, planning_s=0.0)) for row in rows] == [str(replace(row, planning_s=0.0)) for row in again]
+    assert [str(replace(row, planning_s=0.0)) for row in rows] == [
+        str(replace(row, planning_s=0.0)) for row in again
+    ]
 
 
 def test_what_points_up_and_what_lies_below() -> None:
@@ -81,15 +85,21 @@ def test_what_no_arm_can_do_is_a_reason() -> None:
     place = Pose((0.1, 0.1, SCENE["tomato_soup_can"].X_TO.p[2] + 0.001))
 
     def reason(cell: WorkCell) -> NoPlan:
-        found = PickPlacePlanner(cell, PlannerConfig()).plan(SCENE.objects, "tomato_soup_can", place)
+        found = PickPlacePlanner(cell, PlannerConfig()).plan(
+            SCENE.objects, "tomato_soup_can", place
+        )
         assert isinstance(found, NoPlan)
         return found
 
     in_tray = reason(cell_with("robot.base.x=-0.1"))
     assert (in_tray.reason, in_tray.about) == (PlanFailure.IN_COLLISION, "pedestal and tray")
-    hanging = cell_with("robot.base.x=-0.1", "robot.base.z=1.2", "robot.base.roll=180", "robot.pedestal_side=0.0")
+    hanging = cell_with(
+        "robot.base.x=-0.1", "robot.base.z=1.2", "robot.base.roll=180", "robot.pedestal_side=0.0"
+    )
     planner = PickPlacePlanner(hanging, PlannerConfig())
-    assert isinstance(planner.plan(SCENE.objects, "tomato_soup_can", place), Plan), "it has no pedestal"
+    assert isinstance(planner.plan(SCENE.objects, "tomato_soup_can", place), Plan), (
+        "it has no pedestal"
+    )
     assert reason(cell_with("robot.base.x=-5.0")).reason is PlanFailure.UNREACHABLE
     assert reason(cell_with("robot.payload=1")).reason is PlanFailure.TOO_HEAVY
 
@@ -100,7 +110,10 @@ def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
     found = it.noise("scene", 0, SCENE, rows)
     planned = sum(row.result == PLANNED for row in rows)
     assert len(found) == 5 * min(6, planned)
-    holds = [sum(row.result == "holds" for row in found if row.error == error) for error in (0.002, 0.040)]
+    holds = [
+        sum(row.result == "holds" for row in found if row.error == error)
+        for error in (0.002, 0.040)
+    ]
     assert holds[0] > holds[1]
     assert {row.result for row in found} - {"holds", "no plan"}, "some fail, and it is said how"
 
@@ -114,7 +127,11 @@ def test_the_map_agrees_with_the_poses() -> None:
     middle = reachability.poses(downwards(0.0, np.array([0.0, 0.0, 0.1]))[None])
     assert middle.branches[0] > 0
     assert middle.manipulability[0] == pytest.approx(float(manipulability(middle.q[0])))
-    away = reachability.poses(np.array([downwards(0.0, np.array([3.0, 0.0, 0.1])), downwards(0.0, np.array([0.0, 0.0, -0.3]))]))
+    away = reachability.poses(
+        np.array(
+            [downwards(0.0, np.array([3.0, 0.0, 0.1])), downwards(0.0, np.array([0.0, 0.0, -0.3]))]
+        )
+    )
     assert away.branches.tolist() == [0, 0]
     assert away.in_the_way[0] == ""
     assert "table" in away.in_the_way[1] or "floor" in away.in_the_way[1], "through the floor"
@@ -160,8 +177,15 @@ def test_cells_of_one_name_are_refused(scenes: Path, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    save_scene(folder / "pile.yaml", SCENE, DEFAULT_CELL, Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()))
-    leaning = scene_of(resting("gelatin_box"), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0), 0.028))
+    save_scene(
+        folder / "pile.yaml",
+        SCENE,
+        DEFAULT_CELL,
+        Verdict(None, SCENE.poses, dict.fromkeys(SCENE.names, 1.0), ()),
+    )
+    leaning = scene_of(
+        resting("gelatin_box"), resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0), 0.028)
+    )
     save_scene(folder / "falls.yaml", leaning, DEFAULT_CELL)
     return folder
 
@@ -179,7 +203,9 @@ def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.open()))
 
 
-def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_from_the_command_line(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     quick(monkeypatch)
     small = tmp_path / "small_cup.yaml"
     small.write_text("{suction: {cup_diameter: 0.015}}")
@@ -211,7 +237,9 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
             assert found["groups"][group] == {
                 value: {
                     "moves": sum(row[group] == value for row in rows),
-                    "planned": sum(row[group] == value and row["result"] == PLANNED for row in rows),
+                    "planned": sum(
+                        row[group] == value and row["result"] == PLANNED for row in rows
+                    ),
                 }
                 for value in {row[group] for row in rows}
             }
@@ -219,7 +247,9 @@ def test_a_study_from_the_command_line(scenes: Path, tmp_path: Path, monkeypatch
             assert sum(part["moves"] for part in parts.values()) == len(rows)
     assert {row["scene"] for row in moves} == {"pile"}
     assert len(table(out / "bases.csv")) == 4
-    assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {(name, "up") for name in summary["setups"]}
+    assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {
+        (name, "up") for name in summary["setups"]
+    }
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64") >= 10
     assert "http:" not in page
@@ -260,7 +290,9 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for name in names:
         of_setup = [row for row in reach if row["setup"] == name]
         assert max(float(row["share"]) for row in of_setup) == 1.0
-        assert {float(row["x"]) for row in of_setup} == {-0.2, 0.2}, "over the scene's tray, whatever the cell's"
+        assert {float(row["x"]) for row in of_setup} == {-0.2, 0.2}, (
+            "over the scene's tray, whatever the cell's"
+        )
     assert (out / "report.html").stat().st_size > 1e5
 
 
@@ -283,7 +315,10 @@ def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
             "allowed is w, x, y, z that are not all zero",
         ),
         ("{name: a}", "{'name': 'a'}; allowed is a list"),
-        ("[{translation: [0, 0, 0]}]", r"\[0\]\.name: is missing; needed are name, translation, quaternion"),
+        (
+            "[{translation: [0, 0, 0]}]",
+            r"\[0\]\.name: is missing; needed are name, translation, quaternion",
+        ),
     ],
 )
 def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
@@ -296,9 +331,15 @@ def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{suction: {cup_diameter: 1.0}}", "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1"),
+        (
+            "{suction: {cup_diameter: 1.0}}",
+            "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1",
+        ),
         ("{base: [0, 0]}", "base: is unknown"),
-        ("{base: [0, 0, 0, north]}", "robot.base.rpy_deg\\[2\\]: 'north'; allowed is a finite number"),
+        (
+            "{base: [0, 0, 0, north]}",
+            "robot.base.rpy_deg\\[2\\]: 'north'; allowed is a finite number",
+        ),
         ("{reach: 3}", "reach: is unknown"),
     ],
 )
@@ -313,4 +354,13 @@ def test_an_arm_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
     found: dict[str, Any] = command.setups([], [], [path], DEFAULT_CELL)
-    assert found == {"long": cell_with(*["robot.base.x=-0.7", "robot.base.y=0.1", "robot.base.yaw=10", "gripper.extension=0.15"])}
+    assert found == {
+        "long": cell_with(
+            *[
+                "robot.base.x=-0.7",
+                "robot.base.y=0.1",
+                "robot.base.yaw=10",
+                "gripper.extension=0.15",
+            ]
+        )
+    }

@@ -70,7 +70,10 @@ def test_output_directory_makes_what_is_missing(tmp_path: Path) -> None:
 def test_output_directory_may_hold_what_an_earlier_run_left(tmp_path: Path) -> None:
     (tmp_path / "scenes").mkdir()
     (tmp_path / "summary.json").touch()
-    assert output_directory(tmp_path, may_hold=frozenset({"scenes", "summary.json", "more"})) == tmp_path
+    assert (
+        output_directory(tmp_path, may_hold=frozenset({"scenes", "summary.json", "more"}))
+        == tmp_path
+    )
     with pytest.raises(InputError, match=r"is not empty \(holds summary\.json\)"):
         output_directory(tmp_path, may_hold=frozenset({"scenes"}))
     with pytest.raises(InputError, match="give a folder that is new or empty"):

@@ -25,7 +25,9 @@ FLOORS = {
     9: {"cli", "commands", "doctor", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
-MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts)
+MODULES = sorted(
+    path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "_shipped" not in path.parts
+)
 
 
 def room_of(module: Path) -> str:
@@ -63,7 +65,11 @@ def late():
 def test_imports_go_down(module: Path) -> None:
     room = room_of(module)
     assert room == "" or room in FLOOR_OF, f"{module} is on no floor; give {room!r} one in FLOORS"
-    floor = FLOOR_OF.get(room, -1)  # the package's own file imports nothing, so that every module stays quick to import
+    floor = FLOOR_OF.get(
+        room, -1
+    )  # the package's own file imports nothing, so that every module stays quick to import
     for line, imported in imported_rooms((PACKAGE / module).read_text()):
         assert imported in FLOOR_OF, f"{module}:{line} imports {imported!r}, which is on no floor"
-        assert FLOOR_OF[imported] <= floor, f"{module}:{line}: floor {floor} imports {imported!r} of floor {FLOOR_OF[imported]}"
+        assert FLOOR_OF[imported] <= floor, (
+            f"{module}:{line}: floor {floor} imports {imported!r} of floor {FLOOR_OF[imported]}"
+        )

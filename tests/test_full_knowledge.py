@@ -43,7 +43,13 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
     "under a box, beside others": ([*covered(), IN_VIEW], 1, {"cover"}),
     "under two boxes": ([*covered(), ON_TOP], 2, {"cover", "on top"}),
     "under a box that carries two": (
-        [*covered(), *(resting("tomato_soup_can", xy=(x, 0.0), floor=0.088, name=f"can {x}") for x in (-0.06, 0.06))],
+        [
+            *covered(),
+            *(
+                resting("tomato_soup_can", xy=(x, 0.0), floor=0.088, name=f"can {x}")
+                for x in (-0.06, 0.06)
+            ),
+        ],
         3,
         {"cover", "can -0.06", "can 0.06"},
     ),
@@ -61,7 +67,11 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
         3,
         {"cover", "cover 2", "cover 3"},
     ),
-    "one deep, one not": ([*covered(), ON_TOP, *covered(0.2, 0.25, " 2")], 3, {"cover", "on top", "cover 2"}),
+    "one deep, one not": (
+        [*covered(), ON_TOP, *covered(0.2, 0.25, " 2")],
+        3,
+        {"cover", "on top", "cover 2"},
+    ),
     "hidden under hidden": (
         # Of the middle box a corner shows once the upper is gone, of the small one nothing before the middle one is.
         [*covered(), resting("cereal_box_large", floor=0.088, name="on top"), IN_VIEW],
@@ -71,7 +81,10 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
     "behind a bridge's two feet": (
         [
             resting("gelatin_box", Orientation.FLAT_90, name="small"),
-            *(resting("sugar_box", Orientation.UPRIGHT_90, (x, 0.0), name=f"foot {x}") for x in (-0.09, 0.09)),
+            *(
+                resting("sugar_box", Orientation.UPRIGHT_90, (x, 0.0), name=f"foot {x}")
+                for x in (-0.09, 0.09)
+            ),
             resting("cereal_box_large", floor=0.175, name="bridge"),
         ],
         1,
@@ -86,7 +99,12 @@ def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[
     assert JUDGE.stability(scene) is None
     solution = SEARCH.solve(scene)
     assert solution.answer is Solvability.SOLVABLE
-    assert (len(solution.plan), solution.at_least, solution.fewest, solution.never_found) == (moves, moves, True, ())
+    assert (len(solution.plan), solution.at_least, solution.fewest, solution.never_found) == (
+        moves,
+        moves,
+        True,
+        (),
+    )
     assert {move.pick for move in solution.plan} == picked
     assert solution.moves_tried >= moves
     assert replayed(scene, solution, 0) == set(scene.names)
@@ -138,7 +156,11 @@ def test_what_is_hidden_elsewhere_is_not_named() -> None:
 def test_no_room_for_any_move() -> None:
     """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
     solution = SEARCH.solve(scene_of(*covered(), side=0.26))
-    assert (solution.answer, solution.plan, solution.never_found) == (Solvability.UNSOLVABLE, (), ())
+    assert (solution.answer, solution.plan, solution.never_found) == (
+        Solvability.UNSOLVABLE,
+        (),
+        (),
+    )
     assert not solution.fewest
     assert solution.moves_tried > 0
 
@@ -146,8 +168,13 @@ def test_no_room_for_any_move() -> None:
 def test_a_stack_that_collapses_whatever_is_picked() -> None:
     """A pair that overhangs its foot under a box: whoever takes one of the four makes others fall, and nothing else is there to
     put down on them first. Proved by trying nothing."""
-    pair = [resting("sugar_box", xy=(0.0, y), floor=0.038, name=name) for name, y in (("left", -0.0455), ("right", 0.0455))]
-    scene = scene_of(resting("sugar_box", name="foot"), *pair, resting("cracker_box", floor=0.076, name="load"))
+    pair = [
+        resting("sugar_box", xy=(0.0, y), floor=0.038, name=name)
+        for name, y in (("left", -0.0455), ("right", 0.0455))
+    ]
+    scene = scene_of(
+        resting("sugar_box", name="foot"), *pair, resting("cracker_box", floor=0.076, name="load")
+    )
     assert JUDGE.stability(scene) is None
     assert all(JUDGE.losing_support(scene, name) for name in scene.names)
     solution = SEARCH.solve(scene)
@@ -185,7 +212,10 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     scene = scene_of(*covered(), leaning)
     observation = JUDGE.rays.observe(scene)[0]
     outcome = executed(SettleExecutor(CONFIG), scene, observation, Move("cover"), rng())
-    if outcome.result is not MoveResult.PLACED or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3:
+    if (
+        outcome.result is not MoveResult.PLACED
+        or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3
+    ):
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
     if (solution.answer, solution.moves_tried) != (Solvability.UNDECIDED, 0):
@@ -207,7 +237,10 @@ def test_no_plan_begins_with_what_has_failed() -> None:
 
 
 def test_more_objects_than_the_search_takes() -> None:
-    markers = [resting("large_marker", xy=(0.01 * (k % 8), 0.1 * (k // 8)), name=f"m{k}") for k in range(65)]
+    markers = [
+        resting("large_marker", xy=(0.01 * (k % 8), 0.1 * (k // 8)), name=f"m{k}")
+        for k in range(65)
+    ]
     with pytest.raises(InputError, match="objects: 65; allowed are 64 at most"):
         SEARCH.solve(scene_of(*markers))
 
@@ -254,7 +287,11 @@ def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
         assert len(solution.plan) > 2 or solution.answer is not Solvability.SOLVABLE
         return
     assert fewest == (1 if seed == 2 else 2)
-    assert (solution.answer, solution.at_least, len(solution.plan)) == (Solvability.SOLVABLE, fewest, fewest)
+    assert (solution.answer, solution.at_least, len(solution.plan)) == (
+        Solvability.SOLVABLE,
+        fewest,
+        fewest,
+    )
     assert solution.fewest
     assert replayed(scene, solution, 2) == set(scene.names)
 

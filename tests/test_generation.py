@@ -37,7 +37,10 @@ def job(nodes: int = 10, seed: int = 5) -> GenerationJob:
 def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
     """The scenes with their verdicts, as scene files."""
     made = map_ordered(partial(SceneGenerator, which), range(count), workers=workers)
-    return [yaml.dump(scene_fields(generated.scene, DEFAULT_CELL, generated.verdict)) for generated in made]
+    return [
+        yaml.dump(scene_fields(generated.scene, DEFAULT_CELL, generated.verdict))
+        for generated in made
+    ]
 
 
 def test_the_scenes_do_not_depend_on_the_number_of_workers() -> None:
@@ -76,7 +79,9 @@ def test_the_random_generator_is_uniform_over_feasible_rules() -> None:
     """After the tray's only rule, three are feasible with nodes to spare."""
     grammar = GRAMMARS["ycb7"]
     generator = rng(0)
-    second = Counter(RandomGenerator().derive(grammar, NodeBudget(8), generator).rules[1] for _ in range(600))
+    second = Counter(
+        RandomGenerator().derive(grammar, NodeBudget(8), generator).rules[1] for _ in range(600)
+    )
     assert set(second) == {"drop_object", "stack_object", "end"}
     assert min(second.values()) > 200 - 4 * 11.5  # four standard deviations
 
@@ -92,7 +97,9 @@ def test_a_generated_scene_says_whether_it_is_solvable() -> None:
 
 def test_the_hill_climber_hides_more_than_chance() -> None:
     grammar, config = GRAMMARS["ycb7"], ClutterConfig()
-    environment = ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=12), config)
+    environment = ClutterGeneration(
+        list(grammar.classes.values()), GenerationTask(nodes=12), config
+    )
 
     def worth(agent: GenerationAgent, seed: int) -> float:
         environment.reset(seed=0)
@@ -125,18 +132,31 @@ def test_an_unknown_agent_is_refused() -> None:
 
 
 def laid_out(*rules: str) -> Scene:
-    scene = lay_out(Derivation(GRAMMARS["ycb7"].replay(rules), rules), CLASSES, ClutterConfig(), rng())
+    scene = lay_out(
+        Derivation(GRAMMARS["ycb7"].replay(rules), rules), CLASSES, ClutterConfig(), rng()
+    )
     assert isinstance(scene, Scene)
     return scene
 
 
 def test_summary_of_a_batch_by_hand() -> None:
-    can, box = (("drop_object", "end", f"insert_{name}") for name in ("tomato_soup_can", "sugar_box"))
+    can, box = (
+        ("drop_object", "end", f"insert_{name}") for name in ("tomato_soup_can", "sugar_box")
+    )
     scenes = [
         laid_out(*can, "orient_flat_0", *box, "orient_side_0"),  # two stacks, two objects
-        laid_out(*box, "orient_side_0", *can, "orient_upright_90"),  # the same: a can is symmetric, order says nothing
+        laid_out(
+            *box, "orient_side_0", *can, "orient_upright_90"
+        ),  # the same: a can is symmetric, order says nothing
         laid_out("drop_object", "end", "insert_meta_sugar_box_1"),  # one stack of two objects
-        laid_out("drop_object", "stack_object", "end", "insert_meta_sugar_box_2", "insert_cracker_box", "orient_flat_0"),
+        laid_out(
+            "drop_object",
+            "stack_object",
+            "end",
+            "insert_meta_sugar_box_2",
+            "insert_cracker_box",
+            "orient_flat_0",
+        ),
     ]
     slid = Instability(InstabilityReason.SLID, "sugar_box_3", 0.02, 0.0)
     verdicts = [
@@ -149,10 +169,14 @@ def test_summary_of_a_batch_by_hand() -> None:
     summary = summarise(job(), list(zip(scenes, verdicts, strict=True)), answers)
     assert summary.pop("solvable_ci95") == pytest.approx(wilson_interval(2, 3))
     assert summary.pop("largest_stack_share") == pytest.approx((0.5 + 0.5 + 1 + 1) / 4)
-    assert summary.pop("class_entropy") == pytest.approx(-sum(n / 9 * np.log2(n / 9) for n in (6, 2, 1)))
+    assert summary.pop("class_entropy") == pytest.approx(
+        -sum(n / 9 * np.log2(n / 9) for n in (6, 2, 1))
+    )
     low, high = summary.pop("stability_ci95")
     assert (low, high) == pytest.approx((0.3006, 0.9544), abs=5e-5)
-    assert summary.pop("hidden_ci95") == pytest.approx((1 - 1.959964 / 3**0.5, 1 + 1.959964 / 3**0.5))
+    assert summary.pop("hidden_ci95") == pytest.approx(
+        (1 - 1.959964 / 3**0.5, 1 + 1.959964 / 3**0.5)
+    )
     assert summary == {
         "nodes": 10,
         "count": 4,
@@ -176,5 +200,9 @@ def test_a_batch_without_a_stable_scene_has_no_mean() -> None:
     scene = laid_out("drop_object", "end", "insert_sugar_box", "orient_flat_0")
     toppled = Verdict(Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.0, 1.0), {}, {}, ())
     summary = summarise(job(), [(scene, toppled)])
-    assert (summary["stability_rate"], summary["hidden_mean"], summary["hidden_ci95"]) == (0.0, None, None)
+    assert (summary["stability_rate"], summary["hidden_mean"], summary["hidden_ci95"]) == (
+        0.0,
+        None,
+        None,
+    )
     assert (summary["solvable_share"], summary["solvable_ci95"]) == (None, None)

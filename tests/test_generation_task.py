@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from conftest import CLASSES, GRAMMARS, rng
 from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
 
 from drake_clutter.grammar import ClutterGraph, NodeBudget, canonical_form
 from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, PRIMITIVE
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphObservation, StackFault, most_edges
+from drake_clutter.tasks.generation import (
+    ClutterGeneration,
+    GenerationTask,
+    GraphObservation,
+    StackFault,
+    most_edges,
+)
 
 
 def random_action(mask: np.ndarray, draw: np.random.Generator) -> int:
@@ -22,7 +29,9 @@ def graph_of(observation: GraphObservation, environment: ClutterGeneration) -> C
     nodes = {k: kinds[kind - 1] for k, kind in enumerate(observation["node_kind"].tolist()) if kind}
     edges = {
         (parent, child): edge_kinds[kind - 1]
-        for (parent, child), kind in zip(observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True)
+        for (parent, child), kind in zip(
+            observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True
+        )
         if kind
     }
     return ClutterGraph.from_parts(nodes, edges)
@@ -33,8 +42,12 @@ def finished_stacks(graph: ClutterGraph) -> set[int]:
     found = set()
     for bottom in graph.stacks():
         members = set(bottom).union(*(nx.descendants(graph.nx, node) for node in bottom))
-        edges = [e for e in graph.nx.edges(data="kind") if e[1] in members and graph.kind(e[1]) != END]
-        if all(graph.kind(node) not in NON_TERMINAL_KINDS for node in members) and all(kind != PRIMITIVE for *_, kind in edges):
+        edges = [
+            e for e in graph.nx.edges(data="kind") if e[1] in members and graph.kind(e[1]) != END
+        ]
+        if all(graph.kind(node) not in NON_TERMINAL_KINDS for node in members) and all(
+            kind != PRIMITIVE for *_, kind in edges
+        ):
             found |= {node for node in members if graph.kind(node) not in (END, DUMMY)}
     return found
 
@@ -49,7 +62,10 @@ def test_gymnasium_approves() -> None:
 def test_what_is_observed_is_the_graph(objects: str) -> None:
     """With its finished stacks and where their objects stand."""
     grammar = GRAMMARS[objects]
-    environment, draw = ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=14)), rng(1)
+    environment, draw = (
+        ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=14)),
+        rng(1),
+    )
     stacks_seen = 0
     for episode in range(25):
         observation, info = environment.reset(seed=episode)
@@ -71,7 +87,9 @@ def test_what_is_observed_is_the_graph(objects: str) -> None:
                     assert observation["position"][node, 2] > 0
                 else:
                     assert (observation["position"][node] == 0).all()
-            observation, _, over, truncated, info = environment.step(random_action(info["action_mask"], draw))
+            observation, _, over, truncated, info = environment.step(
+                random_action(info["action_mask"], draw)
+            )
             assert not truncated
     assert stacks_seen > 50
 
@@ -86,7 +104,11 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
             action = random_action(info["action_mask"], draw)
             rule, before = grammar.rules[action], environment.partial.graph.copy()
             marked = (
-                np.flatnonzero(observation["node_flags"][:, 1 + ["top", "slot", "child"].index(rule.left.rewritten)])
+                np.flatnonzero(
+                    observation["node_flags"][
+                        :, 1 + ["top", "slot", "child"].index(rule.left.rewritten)
+                    ]
+                )
                 if (rule.left.rewritten != "tray")
                 else np.array([0])
             )
@@ -96,7 +118,10 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
             changed |= {
                 child
                 for _, child in set(before.nx.edges) & set(after.nx.edges)
-                if any(before.edge_kind(p, child) != after.edge_kind(p, child) for p in before.nx.predecessors(child))
+                if any(
+                    before.edge_kind(p, child) != after.edge_kind(p, child)
+                    for p in before.nx.predecessors(child)
+                )
                 and rule.left.rewritten == "child"
             }
             if changed:
@@ -121,7 +146,9 @@ def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
             assert info["verdict"].stable
             sizes = [len(stack) for stack in info["scene"].graph.stack_objects()]
             balanced.add(max(sizes) <= 0.6 * sum(sizes))
-            assert total == pytest.approx(0.5 * len(info["verdict"].hidden) + (0.25 if max(sizes) <= 0.6 * sum(sizes) else 0))
+            assert total == pytest.approx(
+                0.5 * len(info["verdict"].hidden) + (0.25 if max(sizes) <= 0.6 * sum(sizes) else 0)
+            )
             assert info["scene"].graph.is_terminal
             assert len(info["scene"].graph) == 14
             derived = environment.grammar.replay(info["scene"].derivation)
@@ -145,7 +172,9 @@ def test_an_infeasible_rule_changes_nothing() -> None:
     assert (later["action_mask"] == info["action_mask"]).all()
 
 
-def derived(environment: ClutterGeneration, rules: list[str]) -> tuple[float, bool, dict[str, object]]:
+def derived(
+    environment: ClutterGeneration, rules: list[str]
+) -> tuple[float, bool, dict[str, object]]:
     """Return, whether it is over, and the last info, of a derivation given by names."""
     environment.reset(seed=0)
     total, over = 0.0, False
@@ -160,7 +189,15 @@ def derived(environment: ClutterGeneration, rules: list[str]) -> tuple[float, bo
 def test_a_tower_that_falls_ends_the_episode() -> None:
     """A cracker box flat on a marker that lies."""
     environment = ClutterGeneration(task=GenerationTask(nodes=10))
-    rules = ["drop_object", "stack_object", "end", "insert_large_marker", "insert_cracker_box", "orient_flat_0", "orient_flat_0"]
+    rules = [
+        "drop_object",
+        "stack_object",
+        "end",
+        "insert_large_marker",
+        "insert_cracker_box",
+        "orient_flat_0",
+        "orient_flat_0",
+    ]
     total, over, info = derived(environment, rules)
     assert over
     assert total == -1.0
@@ -170,7 +207,14 @@ def test_a_tower_that_falls_ends_the_episode() -> None:
 def test_a_tower_that_is_too_high_ends_the_episode() -> None:
     """Three cracker boxes on end are 0.69 m."""
     environment = ClutterGeneration(task=GenerationTask(nodes=10))
-    rules = ["drop_object", "stack_object", "stack_object", "end", *["insert_cracker_box"] * 3, *["orient_upright_0"] * 3]
+    rules = [
+        "drop_object",
+        "stack_object",
+        "stack_object",
+        "end",
+        *["insert_cracker_box"] * 3,
+        *["orient_upright_0"] * 3,
+    ]
     total, over, info = derived(environment, rules)
     assert (total, over, info["fault"]) == (-1.0, True, StackFault.TOO_HIGH)
 
@@ -178,7 +222,15 @@ def test_a_tower_that_is_too_high_ends_the_episode() -> None:
 def test_a_hidden_object_pays_at_once() -> None:
     """A gelatin box under a cracker box, both flat; then another stack."""
     environment = ClutterGeneration(task=GenerationTask(nodes=7))
-    rules = ["drop_object", "stack_object", "end", "insert_gelatin_box", "insert_cracker_box", "orient_flat_0", "orient_flat_0"]
+    rules = [
+        "drop_object",
+        "stack_object",
+        "end",
+        "insert_gelatin_box",
+        "insert_cracker_box",
+        "orient_flat_0",
+        "orient_flat_0",
+    ]
     total, over, _ = derived(environment, rules)
     assert (total, over) == (0.5, False)
 
@@ -186,7 +238,12 @@ def test_a_hidden_object_pays_at_once() -> None:
 def test_a_graph_of_hundreds_of_nodes_is_observed() -> None:
     environment, draw = ClutterGeneration(task=GenerationTask(nodes=300)), rng(0)
     observation, info = environment.reset(seed=0)
-    structure = np.array([rule.left.rewritten in ("tray", "top") and rule.name != "end" for rule in environment.grammar.rules])
+    structure = np.array(
+        [
+            rule.left.rewritten in ("tray", "top") and rule.name != "end"
+            for rule in environment.grammar.rules
+        ]
+    )
     while (mask := info["action_mask"].astype(bool) & structure).any():
         observation, *_, info = environment.step(random_action(mask, draw))
     graph = graph_of(observation, environment)
@@ -199,10 +256,17 @@ def test_edges_fit() -> None:
     for nodes in range(3, 30):
         grammar, draw, most = GRAMMARS["ycb7"], rng(nodes), 0
         pairs = [k for k, rule in enumerate(grammar.rules) if rule.name.startswith("insert_meta")]
+
+        def choose(
+            _: object,
+            mask: NDArray[np.bool_],
+            draw: np.random.Generator = draw,
+            pairs: list[int] = pairs,
+        ) -> int:
+            chosen = np.array(pairs)[mask[pairs]] if mask[pairs].any() else np.flatnonzero(mask)
+            return int(draw.choice(chosen))
+
         for _ in range(10):
-            graph = grammar.derive(
-                NodeBudget(nodes),
-                lambda _, mask: int(draw.choice(np.flatnonzero(mask) if not mask[pairs].any() else np.array(pairs)[mask[pairs]])),  # noqa: B023
-            ).graph
+            graph = grammar.derive(NodeBudget(nodes), choose).graph
             most = max(most, graph.nx.number_of_edges())
         assert most <= most_edges(nodes)

@@ -17,7 +17,13 @@ from drake_clutter.simulation.plant import add_scene_plant
 CRACKER, SUGAR = np.array([0.060, 0.160, 0.230]), np.array([0.038, 0.089, 0.175])
 
 
-def turned(class_name: str, axis: str, degrees: float, translation: tuple[float, float, float], name: str = "b") -> SceneObject:
+def turned(
+    class_name: str,
+    axis: str,
+    degrees: float,
+    translation: tuple[float, float, float],
+    name: str = "b",
+) -> SceneObject:
     """An object turned about one axis of the tray."""
     rotation = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return SceneObject(name, CLASSES[class_name], Pose.of(rotation, translation))
@@ -50,9 +56,13 @@ def test_a_box_inside_another_is_as_deep_as_its_way_out() -> None:
 def test_edge_on_edge(depth: float) -> None:
     """Two boxes on their edges, crossed: the lower one's edge along x, the upper one's along y, the middles over each other."""
     half = math.sqrt(0.5) / 2
-    lower = turned("cracker_box", "x", 45, (0, 0, 0))  # its highest edge is where y = half * (160 - 230 mm)
+    lower = turned(
+        "cracker_box", "x", 45, (0, 0, 0)
+    )  # its highest edge is where y = half * (160 - 230 mm)
     height = half * (0.160 + 0.230) + half * (0.038 + 0.175)
-    upper = turned("sugar_box", "y", 45, (half * (0.175 - 0.038), half * (0.160 - 0.230), height - depth))
+    upper = turned(
+        "sugar_box", "y", 45, (half * (0.175 - 0.038), half * (0.160 - 0.230), height - depth)
+    )
     assert both_ways(lower, upper) == pytest.approx(depth, abs=1e-9)
 
 
@@ -60,7 +70,10 @@ def test_edge_on_edge(depth: float) -> None:
 def test_a_gap_that_the_axis_aligned_boxes_do_not_see(gap: float) -> None:
     """Two boxes turned by 45 degrees, face to face: their axis-aligned boxes overlap far, they are 1 mm apart."""
     away = (0.060 + gap) * math.sqrt(0.5)
-    first, second = turned("cracker_box", "z", 45, (0, 0, 0)), turned("cracker_box", "z", 45, (away, away, 0))
+    first, second = (
+        turned("cracker_box", "z", 45, (0, 0, 0)),
+        turned("cracker_box", "z", 45, (away, away, 0)),
+    )
     assert (second.bounds_T[0] < first.bounds_T[1]).all()
     assert both_ways(first, second) == pytest.approx(-gap, abs=1e-12)
 
@@ -84,44 +97,65 @@ def test_a_can_beside_a_box(depth: float) -> None:
 
 def test_a_turned_can_reads_at_most_half_a_percent_of_its_radius_too_small() -> None:
     box = turned("cracker_box", "z", 0, (0.051 + 0.030 - 0.003, 0, 0.0))
-    depths = [both_ways(turned("master_chef_can", "z", angle, (0, 0, 0), "can"), box) for angle in np.linspace(0, 12, 25)]
+    depths = [
+        both_ways(turned("master_chef_can", "z", angle, (0, 0, 0), "can"), box)
+        for angle in np.linspace(0, 12, 25)
+    ]
     assert max(depths) == pytest.approx(0.003)
     assert 0.003 - 0.005 * 0.051 < min(depths) < 0.003 - 0.004 * 0.051
 
 
 def test_a_can_on_a_can() -> None:
     lower = resting("tomato_soup_can", name="lower")
-    assert both_ways(lower, resting("tomato_soup_can", floor=0.101, name="upper")) == pytest.approx(0, abs=1e-12)
-    assert both_ways(lower, resting("tomato_soup_can", floor=0.099, name="upper")) == pytest.approx(0.002)
+    assert both_ways(lower, resting("tomato_soup_can", floor=0.101, name="upper")) == pytest.approx(
+        0, abs=1e-12
+    )
+    assert both_ways(lower, resting("tomato_soup_can", floor=0.099, name="upper")) == pytest.approx(
+        0.002
+    )
 
 
-def random_pairs(names: tuple[str, str], count: int, reach: float) -> list[tuple[SceneObject, SceneObject]]:
+def random_pairs(
+    names: tuple[str, str], count: int, reach: float
+) -> list[tuple[SceneObject, SceneObject]]:
     """Two objects near each other, turned any way."""
     generator = rng(1)
 
     def anyhow(name: str, class_name: str) -> SceneObject:
         rotation = Rotation.random(rng=generator).as_matrix()
-        return SceneObject(name, CLASSES[class_name], Pose.of(rotation, generator.uniform(0, reach, 3)))
+        return SceneObject(
+            name, CLASSES[class_name], Pose.of(rotation, generator.uniform(0, reach, 3))
+        )
 
     return [(anyhow("a", names[0]), anyhow("b", names[1])) for _ in range(count)]
 
 
-@pytest.mark.parametrize("names", [("cracker_box", "sugar_box"), ("sugar_box", "pasta_box"), ("gelatin_box", "gelatin_box")])
+@pytest.mark.parametrize(
+    "names",
+    [("cracker_box", "sugar_box"), ("sugar_box", "pasta_box"), ("gelatin_box", "gelatin_box")],
+)
 def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
     builder = DiagramBuilder()
-    scene_plant = add_scene_plant(builder, [("a", CLASSES[names[0]]), ("b", CLASSES[names[1]])], TRAY, 0.01, visuals=False)
+    scene_plant = add_scene_plant(
+        builder, [("a", CLASSES[names[0]]), ("b", CLASSES[names[1]])], TRAY, 0.01, visuals=False
+    )
     scene_plant.plant.Finalize()
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
     context = scene_plant.plant.GetMyContextFromRoot(root)
     geometries = {
-        int(scene_plant.plant.GetCollisionGeometriesForBody(body)[0].get_value()) for body in scene_plant.bodies.values()
+        int(scene_plant.plant.GetCollisionGeometriesForBody(body)[0].get_value())
+        for body in scene_plant.bodies.values()
     }
     overlapping = apart = 0
     for a, b in random_pairs(names, 200, 0.15):
-        lifted = [SceneObject(o.name, o.object_class, o.X_TO.moved((0, 0, 1.0))) for o in (a, b)]  # off the tray
+        lifted = [
+            SceneObject(o.name, o.object_class, o.X_TO.moved((0, 0, 1.0))) for o in (a, b)
+        ]  # off the tray
         scene_plant.set_poses(context, lifted)
-        query = scene_plant.scene_graph.get_query_output_port().Eval(scene_plant.scene_graph.GetMyContextFromRoot(root))
+        query = scene_plant.scene_graph.get_query_output_port().Eval(
+            scene_plant.scene_graph.GetMyContextFromRoot(root)
+        )
         reported = [
             pair.depth
             for pair in query.ComputePointPairPenetration()
@@ -138,7 +172,9 @@ def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
     assert min(overlapping, apart) > 20
 
 
-@pytest.mark.parametrize("names", [("tomato_soup_can", "cracker_box"), ("large_marker", "large_marker")])
+@pytest.mark.parametrize(
+    "names", [("tomato_soup_can", "cracker_box"), ("large_marker", "large_marker")]
+)
 def test_moving_a_cylinder_out_by_the_depth_parts_it(names: tuple[str, str]) -> None:
     """By a bit less, in no direction. And points that lie in both prove an overlap."""
     generator = rng(2)
@@ -160,14 +196,22 @@ def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
     height, angle = 1 - (2 * index + 1) / 150, index * math.pi * (3 - math.sqrt(5))
     ring = np.sqrt(1 - height**2)
     directions = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
-    return any(penetration(a, SceneObject("b", b.object_class, b.X_TO.moved(distance * d))) < 0 for d in directions)
+    return any(
+        penetration(a, SceneObject("b", b.object_class, b.X_TO.moved(distance * d))) < 0
+        for d in directions
+    )
 
 
 def points_inside(o: SceneObject, generator: np.random.Generator) -> NDArray[np.float64]:
     """(N, 3) m in O, within the cylinder, a bit inside the prism that stands for it."""
     radius, half = 0.99 * o.object_class.size[0] / 2, o.object_class.size[2] / 2
-    angle, distance = generator.uniform(0, 2 * math.pi, 2000), radius * np.sqrt(generator.uniform(size=2000))
-    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), generator.uniform(-half, half, 2000)])
+    angle, distance = (
+        generator.uniform(0, 2 * math.pi, 2000),
+        radius * np.sqrt(generator.uniform(size=2000)),
+    )
+    return np.column_stack(
+        [distance * np.cos(angle), distance * np.sin(angle), generator.uniform(-half, half, 2000)]
+    )
 
 
 def inside(o: SceneObject, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -176,11 +220,16 @@ def inside(o: SceneObject, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
     half = np.asarray(o.object_class.size) / 2
     if o.object_class.shape.value == "box":
         return np.asarray((np.abs(p_O) < half).all(axis=1))
-    return np.asarray((np.hypot(p_O[:, 0], p_O[:, 1]) < 0.99 * half[0]) & (np.abs(p_O[:, 2]) < half[2]))
+    return np.asarray(
+        (np.hypot(p_O[:, 0], p_O[:, 1]) < 0.99 * half[0]) & (np.abs(p_O[:, 2]) < half[2])
+    )
 
 
 def test_deepest_penetration_names_the_two() -> None:
-    a, b, c = (resting("sugar_box", xy=(x, 0), name=name) for name, x in (("a", 0.0), ("b", 0.172), ("c", 0.340)))
+    a, b, c = (
+        resting("sugar_box", xy=(x, 0), name=name)
+        for name, x in (("a", 0.0), ("b", 0.172), ("c", 0.340))
+    )
     depth, *names = deepest_penetration([a, b, c])
     assert depth == pytest.approx(0.007)
     assert names == ["b", "c"]
@@ -195,13 +244,20 @@ def names_of(groups: list[list[SceneObject]]) -> list[list[str]]:
 def test_touching_groups() -> None:
     """A chain through neighbours within the margin is one group; order is the scene's."""
     chain = [
-        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=name) for name, x in (("a", 0.0), ("c", 0.1825), ("b", 0.091))
+        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=name)
+        for name, x in (("a", 0.0), ("c", 0.1825), ("b", 0.091))
     ]
     high = resting("gelatin_box", xy=(0.0, 0.0), floor=0.0405, name="above a")
     far = resting("gelatin_box", xy=(0.0, 0.3), name="far")
     groups = touching_groups([*chain, far, high], 0.003)
     assert names_of(groups) == [["a", "c", "b", "above a"], ["far"]]
-    assert names_of(touching_groups([*chain, far, high], 0.0005)) == [["a"], ["c"], ["b"], ["far"], ["above a"]]
+    assert names_of(touching_groups([*chain, far, high], 0.0005)) == [
+        ["a"],
+        ["c"],
+        ["b"],
+        ["far"],
+        ["above a"],
+    ]
     assert touching_groups([], 0.003) == []
 
 

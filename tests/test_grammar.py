@@ -32,8 +32,23 @@ STRUCTURE = ("drop_object", "stack_object", "end")
 ORIENT = tuple(f"orient_{orientation.name.lower()}" for orientation in Orientation)
 # A stack of two, and a stack of a pair with one on top: the paper's example in the terms of its rule sheet.
 EXAMPLE = (
-    *("drop_object", "stack_object", "end", "insert_tomato_soup_can", "insert_sugar_box", "orient_flat_0", "orient_flat_30"),
-    *("drop_object", "stack_object", "end", "insert_meta_pudding_box_1", "insert_cracker_box", "orient_upright_90"),
+    *(
+        "drop_object",
+        "stack_object",
+        "end",
+        "insert_tomato_soup_can",
+        "insert_sugar_box",
+        "orient_flat_0",
+        "orient_flat_30",
+    ),
+    *(
+        "drop_object",
+        "stack_object",
+        "end",
+        "insert_meta_pudding_box_1",
+        "insert_cracker_box",
+        "orient_upright_90",
+    ),
 )
 
 
@@ -62,7 +77,13 @@ def ordered(graph: ClutterGraph) -> tuple[Nodes, Edges]:
             {
                 **{"cracker_box": 2, "sugar_box": 2, "pudding_box": 2, "gelatin_box": 1},
                 **{"master_chef_can": 1, "tomato_soup_can": 1, "large_marker": 1},
-                **{"cereal_box_large": 2, "cereal_box_small": 2, "granola_box": 2, "pasta_box": 2, "lasagna_box": 2},
+                **{
+                    "cereal_box_large": 2,
+                    "cereal_box_small": 2,
+                    "granola_box": 2,
+                    "pasta_box": 2,
+                    "lasagna_box": 2,
+                },
                 **{"chips_box": 1, "pringles_can": 1},
             },
         ),
@@ -71,7 +92,11 @@ def ordered(graph: ClutterGraph) -> tuple[Nodes, Edges]:
 def test_the_rules_are_those_of_the_sheet(objects: str, count: int, metas: dict[str, int]) -> None:
     names = [rule.name for rule in GRAMMARS[objects].rules]
     insertions = [f"insert_{name}" for name in metas]
-    insertions += [f"insert_meta_{name}_{number}" for name, total in metas.items() for number in range(1, total + 1)]
+    insertions += [
+        f"insert_meta_{name}_{number}"
+        for name, total in metas.items()
+        for number in range(1, total + 1)
+    ]
     assert len(names) == count
     assert Counter(names) == Counter([*STRUCTURE, *insertions, *ORIENT])
     assert len(insertions) == count - 13
@@ -80,22 +105,36 @@ def test_the_rules_are_those_of_the_sheet(objects: str, count: int, metas: dict[
 def edges_by_kind(rule: ProductionRule) -> Counter[tuple[str, str, Orientation | str]]:
     """The edges of G_R as (parent's kind, child's kind, edge's kind); a node that keeps its kind is given by its name."""
     kinds = {name: name if kind == KEEP else kind for name, kind in rule.right_nodes.items()}
-    return Counter((kinds[parent], kinds[child], kind) for (parent, child), kind in rule.right_edges.items())
+    return Counter(
+        (kinds[parent], kinds[child], kind) for (parent, child), kind in rule.right_edges.items()
+    )
 
 
 def test_left_and_right_of_every_kind_of_rule() -> None:
     rules = {rule.name: rule for rule in YCB.rules}
     drop, push, end = (rules[name] for name in STRUCTURE)
     assert list(drop.left.nodes.values()) == [{TRAY}]
-    assert edges_by_kind(drop) == {("tray", OBJECT_SLOT, PRIMITIVE): 1, (OBJECT_SLOT, OPEN_SLOT, PRIMITIVE): 1}
+    assert edges_by_kind(drop) == {
+        ("tray", OBJECT_SLOT, PRIMITIVE): 1,
+        (OBJECT_SLOT, OPEN_SLOT, PRIMITIVE): 1,
+    }
     for rule in (push, end):
         assert list(rule.left.nodes.values()) == [{OBJECT_SLOT}, {OPEN_SLOT}]
         assert rule.left.edges == (("slot", "top"),)
-    assert edges_by_kind(push) == {("slot", OBJECT_SLOT, PRIMITIVE): 1, (OBJECT_SLOT, OPEN_SLOT, PRIMITIVE): 1}
+    assert edges_by_kind(push) == {
+        ("slot", OBJECT_SLOT, PRIMITIVE): 1,
+        (OBJECT_SLOT, OPEN_SLOT, PRIMITIVE): 1,
+    }
     assert edges_by_kind(end) == {("slot", END, PRIMITIVE): 1}
 
-    single, lying, standing = (rules[name] for name in ("insert_sugar_box", "insert_meta_sugar_box_1", "insert_meta_sugar_box_2"))
-    assert edges_by_kind(single) == {("parent", "sugar_box", PRIMITIVE): 1, ("sugar_box", "child", PRIMITIVE): 1}
+    single, lying, standing = (
+        rules[name]
+        for name in ("insert_sugar_box", "insert_meta_sugar_box_1", "insert_meta_sugar_box_2")
+    )
+    assert edges_by_kind(single) == {
+        ("parent", "sugar_box", PRIMITIVE): 1,
+        ("sugar_box", "child", PRIMITIVE): 1,
+    }
     for rule, orientation in ((lying, Orientation.FLAT_0), (standing, Orientation.UPRIGHT_0)):
         assert rule.left.nodes["slot"] == {OBJECT_SLOT}
         assert rule.left.nodes["child"] == {OBJECT_SLOT, END}
@@ -110,7 +149,10 @@ def test_left_and_right_of_every_kind_of_rule() -> None:
         assert edges_by_kind(rules[name]) == {("parent", "child", orientation): 1}
     growth = {"drop_object": 2, "stack_object": 1} | {name: 2 for name in rules if "meta" in name}
     assert {name: rule.growth for name, rule in rules.items() if rule.growth} == growth
-    assert {rule.name: rule.open_slots_added for rule in YCB.rules if rule.open_slots_added} == {"drop_object": 1, "end": -1}
+    assert {rule.name: rule.open_slots_added for rule in YCB.rules if rule.open_slots_added} == {
+        "drop_object": 1,
+        "end": -1,
+    }
 
 
 def test_the_papers_example() -> None:
@@ -141,7 +183,13 @@ def test_the_papers_example() -> None:
     )
     assert graph.is_terminal
     assert list(graph.objects()) == [
-        *((1, "tomato_soup_can"), (2, "sugar_box"), (4, "pudding_box"), (5, "cracker_box"), (7, "pudding_box"))
+        *(
+            (1, "tomato_soup_can"),
+            (2, "sugar_box"),
+            (4, "pudding_box"),
+            (5, "cracker_box"),
+            (7, "pudding_box"),
+        )
     ]
 
 
@@ -157,7 +205,11 @@ def test_an_insertion_waits_for_a_closed_top_and_a_terminal_parent() -> None:
 
     def feasible(*rules: str) -> set[str]:
         mask = YCB.feasible(YCB.replay(rules), budget)
-        return {rule.name.split("_")[0] for rule, allowed in zip(YCB.rules, mask, strict=True) if allowed}
+        return {
+            rule.name.split("_")[0]
+            for rule, allowed in zip(YCB.rules, mask, strict=True)
+            if allowed
+        }
 
     assert YCB.feasible(graph, budget).sum() == 1
     assert feasible("drop_object") == {"drop", "stack", "end"}
@@ -165,7 +217,13 @@ def test_an_insertion_waits_for_a_closed_top_and_a_terminal_parent() -> None:
     assert feasible("drop_object", "stack_object") == {"drop", "stack", "end", "insert"}
     two = YCB.replay(["drop_object", "stack_object", "stack_object", "end"])
     inserted = YCB.apply(two, YCB.rules[YCB.index["insert_sugar_box"]])
-    assert [inserted.kind(node) for node in range(5)] == [TRAY, "sugar_box", OBJECT_SLOT, OBJECT_SLOT, END]
+    assert [inserted.kind(node) for node in range(5)] == [
+        TRAY,
+        "sugar_box",
+        OBJECT_SLOT,
+        OBJECT_SLOT,
+        END,
+    ]
 
 
 def test_the_first_match_is_breadth_first_with_siblings_in_order() -> None:
@@ -174,9 +232,15 @@ def test_the_first_match_is_breadth_first_with_siblings_in_order() -> None:
     graph = YCB.replay([*begun, "insert_cracker_box"])
     assert [graph.kind(child) for child in graph.children(0)] == ["sugar_box", "cracker_box"]
     oriented = YCB.replay([*begun, "insert_cracker_box", "orient_side_0", "orient_side_90"])
-    assert [oriented.edge_kind(0, child) for child in oriented.children(0)] == [Orientation.SIDE_0, Orientation.SIDE_90]
+    assert [oriented.edge_kind(0, child) for child in oriented.children(0)] == [
+        Orientation.SIDE_0,
+        Orientation.SIDE_90,
+    ]
     both_open = YCB.replay(["drop_object", "drop_object", "end"])
-    assert [both_open.kind(both_open.children(child)[0]) for child in both_open.children(0)] == [END, OPEN_SLOT]
+    assert [both_open.kind(both_open.children(child)[0]) for child in both_open.children(0)] == [
+        END,
+        OPEN_SLOT,
+    ]
 
 
 def test_apply_leaves_its_argument_alone() -> None:
@@ -215,7 +279,10 @@ def preferring(*prefixes: str) -> Callable[[int], Choose]:
         generator = rng(seed)
 
         def choose(graph: ClutterGraph, mask: NDArray[np.bool_]) -> int:
-            names = {int(index): YCB_AND_PANTRY[len(mask)].rules[index].name for index in np.flatnonzero(mask)}
+            names = {
+                int(index): YCB_AND_PANTRY[len(mask)].rules[index].name
+                for index in np.flatnonzero(mask)
+            }
             for prefix in (*prefixes, ""):
                 if fitting := [index for index, name in names.items() if name.startswith(prefix)]:
                     return int(generator.choice(fitting))
@@ -249,7 +316,9 @@ POLICIES: dict[str, Callable[[int], Choose]] = {
     exact=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_every_derivation_ends_terminal_and_in_budget(policy: str, objects: str, nodes: int, exact: bool, seed: int) -> None:
+def test_every_derivation_ends_terminal_and_in_budget(
+    policy: str, objects: str, nodes: int, exact: bool, seed: int
+) -> None:
     grammar = GRAMMARS[objects]
     derivation = grammar.derive(NodeBudget(nodes, exact), POLICIES[policy](seed))
     graph = derivation.graph
@@ -257,7 +326,9 @@ def test_every_derivation_ends_terminal_and_in_budget(policy: str, objects: str,
     assert len(graph) == nodes if exact else nodes - 1 <= len(graph) <= nodes
     assert len(graph.breadth_first()) == len(graph)
     assert ordered(grammar.replay(derivation.rules)) == ordered(graph)
-    rebuilt = ClutterGraph.from_parts(dict(ordered(graph)[0]), {(a, b): kind for a, b, kind in ordered(graph)[1]})
+    rebuilt = ClutterGraph.from_parts(
+        dict(ordered(graph)[0]), {(a, b): kind for a, b, kind in ordered(graph)[1]}
+    )
     assert ordered(rebuilt) == ordered(graph)
     assert sum(1 for _ in graph.objects()) >= 1
 
@@ -265,7 +336,11 @@ def test_every_derivation_ends_terminal_and_in_budget(policy: str, objects: str,
 def test_both_object_sets_use_every_rule() -> None:
     for grammar in GRAMMARS.values():
         generator = rng(5)
-        used = {name for _ in range(60) for name in grammar.derive(NodeBudget(25), uniform_choice(generator)).rules}
+        used = {
+            name
+            for _ in range(60)
+            for name in grammar.derive(NodeBudget(25), uniform_choice(generator)).rules
+        }
         assert used == set(grammar.index)
 
 
@@ -276,7 +351,10 @@ def matches_by_networkx(graph: ClutterGraph, rule: ProductionRule) -> bool:
         pattern.add_node(name, kinds=kinds)
     pattern.add_edges_from(rule.left.edges)
     matcher = DiGraphMatcher(
-        graph.nx, pattern, lambda host, left: host["kind"] in left["kinds"], lambda host, _: host["kind"] == PRIMITIVE
+        graph.nx,
+        pattern,
+        lambda host, left: host["kind"] in left["kinds"],
+        lambda host, _: host["kind"] == PRIMITIVE,
     )
     return bool(matcher.subgraph_is_monomorphic())
 
@@ -312,7 +390,11 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
     One class with one pair; one orientation stands for the ten, which match alike.
     """
     grammar = SceneGrammar([CLASSES["gelatin_box"]])
-    rules = [rule for rule in grammar.rules if not rule.name.startswith("orient") or rule.name == ORIENT[0]]
+    rules = [
+        rule
+        for rule in grammar.rules
+        if not rule.name.startswith("orient") or rule.name == ORIENT[0]
+    ]
 
     def key(graph: ClutterGraph) -> str:
         return repr(ordered(graph))
@@ -321,29 +403,45 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
     states, successors, queue = {key(start): start}, {}, [start]
     while queue:
         graph = queue.pop()
-        results = {rule.name: grammar.apply(graph, rule) for rule in rules if matches_by_networkx(graph, rule)}
-        successors[key(graph)] = {name: key(result) for name, result in results.items() if len(result) <= nodes}
+        results = {
+            rule.name: grammar.apply(graph, rule)
+            for rule in rules
+            if matches_by_networkx(graph, rule)
+        }
+        successors[key(graph)] = {
+            name: key(result) for name, result in results.items() if len(result) <= nodes
+        }
         for result in results.values():
             if len(result) <= nodes and key(result) not in states:
                 states[key(result)] = result
                 queue.append(result)
 
     # A graph of the right size that is terminal is an end; the tray alone is not one of them.
-    completable = {name for name, graph in states.items() if graph.is_terminal and (len(graph) == nodes or not exact)}
+    completable = {
+        name
+        for name, graph in states.items()
+        if graph.is_terminal and (len(graph) == nodes or not exact)
+    }
     completable -= set() if exact else {key(start)}
     grown = True
     while grown:
-        more = {name for name, following in successors.items() if completable & set(following.values())} - completable
+        more = {
+            name for name, following in successors.items() if completable & set(following.values())
+        } - completable
         completable |= more
         grown = bool(more)
 
     reachable, queue = {key(start)}, [start]
     while queue:
         graph = queue.pop()
-        mask = dict(zip(grammar.index, grammar.feasible(graph, NodeBudget(nodes, exact)), strict=True))
+        mask = dict(
+            zip(grammar.index, grammar.feasible(graph, NodeBudget(nodes, exact)), strict=True)
+        )
         following = successors[key(graph)]
         for rule in rules:
-            assert mask[rule.name] == (rule.name in following and following[rule.name] in completable)
+            assert mask[rule.name] == (
+                rule.name in following and following[rule.name] in completable
+            )
             if mask[rule.name] and following[rule.name] not in reachable:
                 reachable.add(following[rule.name])
                 queue.append(states[following[rule.name]])
@@ -363,10 +461,16 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
         ({0: TRAY, 1: TRAY}, {(0, 1): PRIMITIVE}, "exactly one tray"),
         ({0: TRAY, 1: END}, {}, "leads to every node"),
         ({0: TRAY, 1: END}, {(0, 2): PRIMITIVE}, "0 -> 2 joins a node that is not there"),
-        ({0: TRAY, 1: "sugar_box", 2: END}, {(0, 1): PRIMITIVE, (1, 2): PRIMITIVE, (2, 1): PRIMITIVE}, "acyclic"),
+        (
+            {0: TRAY, 1: "sugar_box", 2: END},
+            {(0, 1): PRIMITIVE, (1, 2): PRIMITIVE, (2, 1): PRIMITIVE},
+            "acyclic",
+        ),
         ({0: TRAY, 1: "sugar_box"}, {(0, 1): PRIMITIVE, (1, 1): PRIMITIVE}, "acyclic"),
     ],
 )
-def test_graphs_that_are_none(nodes: dict[int, str], edges: dict[tuple[int, int], str], message: str) -> None:
+def test_graphs_that_are_none(
+    nodes: dict[int, str], edges: dict[tuple[int, int], str], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         ClutterGraph.from_parts(nodes, edges)

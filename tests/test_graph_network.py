@@ -33,7 +33,9 @@ def observations(count: int, seed: int = 0) -> list[GraphObservation]:
 def network(seed: int = 0) -> RuleValues:
     torch.manual_seed(seed)
     vocabulary = ENVIRONMENT.vocabulary
-    return RuleValues(len(vocabulary.node_kinds), len(vocabulary.edge_kinds), len(ENVIRONMENT.grammar.rules)).double()
+    return RuleValues(
+        len(vocabulary.node_kinds), len(vocabulary.edge_kinds), len(ENVIRONMENT.grammar.rules)
+    ).double()
 
 
 def fc(*weights_and_inputs: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
@@ -46,7 +48,9 @@ def fc(*weights_and_inputs: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
 def edges(observation: GraphObservation) -> Iterator[tuple[int, int, int]]:
     """Sender, receiver, and number of the kind, both ways."""
     kinds = len(ENVIRONMENT.vocabulary.edge_kinds)
-    for (parent, child), kind in zip(observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True):
+    for (parent, child), kind in zip(
+        observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True
+    ):
         if kind > 0:
             yield parent, child, kind - 1
             yield child, parent, kind - 1 + kinds
@@ -62,8 +66,12 @@ def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
     count = int(observation["node_mask"].sum())
     node = []
     for k in range(count):
-        features = torch.tensor([*observation["node_flags"][k], *observation["position"][k]], dtype=torch.float64)
-        node.append(leaky(net.kind.weight[int(observation["node_kind"][k]) - 1] + net.feature(features)))
+        features = torch.tensor(
+            [*observation["node_flags"][k], *observation["position"][k]], dtype=torch.float64
+        )
+        node.append(
+            leaky(net.kind.weight[int(observation["node_kind"][k]) - 1] + net.feature(features))
+        )
     glob = leaky(net.glob(torch.tensor(observation["remaining"], dtype=torch.float64)))
     for layer in map(LayerWeights._make, zip(*net.layers.weights, strict=True)):
         most: list[Tensor | None] = [None] * count
@@ -74,10 +82,13 @@ def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
             most[receiver] = message if so_far is None else torch.maximum(so_far, message)
         heard = [torch.zeros_like(node[0]) if m is None else m for m in most]
         node = [
-            own + fc((layer.node, own), (layer.maximum, m), (layer.glob, glob), bias=layer.node_bias)
+            own
+            + fc((layer.node, own), (layer.maximum, m), (layer.glob, glob), bias=layer.node_bias)
             for own, m in zip(node, heard, strict=True)
         ]
-        weight = torch.cat([layer.attention @ own + layer.attention_bias for own in node]).softmax(dim=0)
+        weight = torch.cat([layer.attention @ own + layer.attention_bias for own in node]).softmax(
+            dim=0
+        )
         pooled = sum((w * own for w, own in zip(weight, node, strict=True)), torch.zeros_like(glob))
         glob = glob + fc((layer.pooled, pooled), (layer.old, glob), bias=layer.pooled_bias)
     marked = []
@@ -98,7 +109,9 @@ def test_a_graph_does_not_feel_its_neighbours_in_the_batch() -> None:
     values, seen = network(1), observations(20, seed=1)
     together = values(stacked(seen))
     for k, observation in enumerate(seen):
-        torch.testing.assert_close(values(stacked([observation]))[0], together[k], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            values(stacked([observation]))[0], together[k], rtol=1e-9, atol=1e-9
+        )
 
 
 def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
@@ -111,7 +124,9 @@ def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
             other[name][:nodes] = observation[name][order]
         other["edge"][:linked] = np.argsort(order)[observation["edge"][:linked]][edge_order]
         other["edge_kind"][:linked] = observation["edge_kind"][:linked][edge_order]
-        torch.testing.assert_close(values(stacked([other])), values(stacked([observation])), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            values(stacked([other])), values(stacked([observation])), rtol=1e-9, atol=1e-9
+        )
 
 
 def test_what_is_known_of_a_graph_matters() -> None:
@@ -137,11 +152,22 @@ def test_what_is_compiled_is_what_is_composed(width: int) -> None:
         return torch.randn(*shape, dtype=torch.float64, generator=draw).requires_grad_()
 
     inputs = drawn(12, width), drawn(4, width), drawn(4, 3)
-    node, glob = torch.randn(12, width, generator=draw).double(), torch.randn(4, width, generator=draw).double()
+    node, glob = (
+        torch.randn(12, width, generator=draw).double(),
+        torch.randn(4, width, generator=draw).double(),
+    )
     found = []
     for layer_of in (message_passing, composed):
         out, out_glob = layer_of(*inputs, links, weights)
-        found.append((out, out_glob, *torch.autograd.grad((node * out).sum() + (glob * out_glob).sum(), (*inputs, *weights))))
+        found.append(
+            (
+                out,
+                out_glob,
+                *torch.autograd.grad(
+                    (node * out).sum() + (glob * out_glob).sum(), (*inputs, *weights)
+                ),
+            )
+        )
     for mine, expected in zip(*found, strict=True):
         torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-12)
 
@@ -149,6 +175,8 @@ def test_what_is_compiled_is_what_is_composed(width: int) -> None:
 def test_a_lone_node_has_no_messages() -> None:
     layers = MessagePassing(4, 3, layers=1)
     none, zero = torch.zeros(0, dtype=torch.long), torch.zeros(1, dtype=torch.long)
-    node, glob = layers(torch.ones(1, 4), torch.ones(1, 4), torch.ones(2, 3), Links(zero, none, none, none))
+    node, glob = layers(
+        torch.ones(1, 4), torch.ones(1, 4), torch.ones(2, 3), Links(zero, none, none, none)
+    )
     assert torch.isfinite(node).all()
     assert torch.isfinite(glob).all()

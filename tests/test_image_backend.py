@@ -22,13 +22,18 @@ from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd
 
-COVERED = scene_of(resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028))
+COVERED = scene_of(
+    resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028)
+)
 
 
 def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
     """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
     observation = LabelDetector(config.cell.camera).look(scene).observation
-    shifted = [replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0))) for k, d in enumerate(observation.detections)]
+    shifted = [
+        replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0)))
+        for k, d in enumerate(observation.detections)
+    ]
     return replace(observation, detections=tuple(shifted))
 
 
@@ -50,7 +55,9 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
     assert step.outcome.released is not None
     off = task.scene["cracker_box"].X_TO.p - step.outcome.released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
-    assert recognised(known, COVERED.objects) == ("cracker_box",), "it has looked again, and was shown the same"
+    assert recognised(known, COVERED.objects) == ("cracker_box",), (
+        "it has looked again, and was shown the same"
+    )
 
 
 def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
@@ -62,7 +69,16 @@ def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
 
 def test_rows_of_the_results() -> None:
     script = training_script("closed_loop_results")
-    episode = {"hidden": 2, "found": 2, "moves": 4, "robot": 60.0, "wall": 9.0, "not_planned": {}, "results": {}, "arm_can": True}
+    episode = {
+        "hidden": 2,
+        "found": 2,
+        "moves": 4,
+        "robot": 60.0,
+        "wall": 9.0,
+        "not_planned": {},
+        "results": {},
+        "arm_can": True,
+    }
     episode |= {"objects": 5, "known": 6, "recognised": 4, "commit": "abc"}
     episodes = [
         episode | {"ended": "all found"},
@@ -82,7 +98,12 @@ def test_rows_of_the_results() -> None:
     assert row["commits"] == ["abc", "def"]
     assert json.dumps(row)
     nothing = script.row_of(script.ROWS[0], episodes[-1:])
-    assert (nothing["success"], nothing["found"], nothing["robot_minutes"], nothing["failed_of"]) == (
+    assert (
+        nothing["success"],
+        nothing["found"],
+        nothing["robot_minutes"],
+        nothing["failed_of"],
+    ) == (
         0,
         None,
         None,
@@ -103,8 +124,14 @@ def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(script, "map_ordered", lambda _, items, **options: map(play, items))
     row = script.ROWS[0]
     assert [e["number"] for e in script.episodes_of(row, 2, 1, path)] == [row.first, row.first + 1]
-    assert [e["number"] for e in script.episodes_of(row, 3, 1, path)] == made == [row.first + k for k in range(3)]
-    with pytest.raises(InputError, match=r"row\.jsonl: holds records of something else \(row, scenario, weights\)"):
+    assert (
+        [e["number"] for e in script.episodes_of(row, 3, 1, path)]
+        == made
+        == [row.first + k for k in range(3)]
+    )
+    with pytest.raises(
+        InputError, match=r"row\.jsonl: holds records of something else \(row, scenario, weights\)"
+    ):
         script.episodes_of(replace(row, agent="student-dagger"), 3, 1, path)
 
 
@@ -113,5 +140,10 @@ def test_what_the_arm_can() -> None:
     ceiling = ArmCeiling(ClutterConfig())
     on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
     assert ceiling.never_found(COVERED) == ()
-    above = replace(on_top, X_TO=on_top.X_TO.moved((0.0, 0.0, COVERED["cracker_box"].top - on_top.bounds_T[0][2])))
-    assert ceiling.never_found(replace(COVERED, objects=(*COVERED.objects, above))) == ("gelatin_box",)
+    above = replace(
+        on_top,
+        X_TO=on_top.X_TO.moved((0.0, 0.0, COVERED["cracker_box"].top - on_top.bounds_T[0][2])),
+    )
+    assert ceiling.never_found(replace(COVERED, objects=(*COVERED.objects, above))) == (
+        "gelatin_box",
+    )

@@ -48,7 +48,9 @@ def test_noise_grows_with_the_square_of_the_distance(distance: float, expected: 
     assert held.mean() == pytest.approx(distance, abs=0.0003)
     assert held.std() == pytest.approx(expected, rel=0.08)
     beside = (measured[:, 1:] > 0) & (measured[:, :-1] > 0)
-    assert np.corrcoef(measured[:, 1:][beside], measured[:, :-1][beside])[0, 1] > 0.4, "of neighbours"
+    assert np.corrcoef(measured[:, 1:][beside], measured[:, :-1][beside])[0, 1] > 0.4, (
+        "of neighbours"
+    )
 
 
 def test_disparity_comes_in_steps() -> None:
@@ -97,13 +99,16 @@ def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[Labelled
 
 
 def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabelledImage]) -> None:
-    assert dict(zip(SCENE.names, images[0].visible_share, strict=True)) == camera.visible_shares(SCENE)
+    assert dict(zip(SCENE.names, images[0].visible_share, strict=True)) == camera.visible_shares(
+        SCENE
+    )
 
 
 def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabelledImage]) -> None:
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     gt, info, eye, coco = (
-        json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info", "camera", "gt_coco")
+        json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text())
+        for name in ("gt", "gt_info", "camera", "gt_coco")
     )
     names = {category["id"]: category["name"] for category in coco["categories"]}
     K = np.reshape(eye["0"]["cam_K"], (3, 3))
@@ -116,11 +121,15 @@ def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[Labell
             x, y, width, height = info["0"][number]["bbox_visib"]
             lower, upper = pixels.min(axis=0), pixels.max(axis=0)
             assert [x, y, x + width - 1, y + height - 1] == pytest.approx([*lower, *upper], abs=1.0)
-    assert info["0"][0] == {"px_count_all": info["1"][0]["px_count_all"], "px_count_visib": 0, "visib_fract": 0.0} | {
-        "bbox_visib": [-1, -1, -1, -1]
-    }
+    assert info["0"][0] == {
+        "px_count_all": info["1"][0]["px_count_all"],
+        "px_count_visib": 0,
+        "visib_fract": 0.0,
+    } | {"bbox_visib": [-1, -1, -1, -1]}
     annotated = [a for a in coco["annotations"] if a["image_id"] == 0]
-    assert [names[a["category_id"]] for a in annotated] == list(images[0].classes[1:]), "the hidden one has no mask"
+    assert [names[a["category_id"]] for a in annotated] == list(images[0].classes[1:]), (
+        "the hidden one has no mask"
+    )
     for instance, annotation in enumerate(annotated, start=1):
         mask = decoded(annotation["segmentation"]["counts"], annotation["segmentation"]["size"])
         assert np.array_equal(mask, images[0].label == instance)
@@ -139,7 +148,10 @@ def test_a_heap() -> None:
     start = above_tray(classes, TRAY, rng(2))
     for k, one in enumerate(start.objects):
         assert all(
-            (np.minimum(one.bounds_T[1], o.bounds_T[1]) < np.maximum(one.bounds_T[0], o.bounds_T[0])).any()
+            (
+                np.minimum(one.bounds_T[1], o.bounds_T[1])
+                < np.maximum(one.bounds_T[0], o.bounds_T[0])
+            ).any()
             for o in start.objects[:k]
         ), "nothing begins within another"
     early, late = dropped(start, 0.002, (0.1, 0.5))
@@ -158,9 +170,13 @@ def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.Mo
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
     assert len(files) == 1 + 4 + 6
     for file in files:
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes(), file
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes(), (
+            file
+        )
     before = (tmp_path / "one" / "000000").stat().st_mtime_ns
     script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=3, objects="ycb7")
-    assert (tmp_path / "one" / "000000").stat().st_mtime_ns == before, "what is there is not made again"
+    assert (tmp_path / "one" / "000000").stat().st_mtime_ns == before, (
+        "what is there is not made again"
+    )
     with pytest.raises(InputError, match="of another job"):
         script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=4, objects="ycb7")

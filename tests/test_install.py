@@ -17,8 +17,14 @@ WHERE = "from drake_clutter.resources import shipped_path as s; print(s('sdf_ass
 
 def run(*command: str | Path, cwd: Path) -> str:
     """Runs a command as a user would, with nothing of this test's environment on Python's path; returns what it prints."""
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    result = subprocess.run(command, cwd=cwd, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "VIRTUAL_ENV")
+    }
+    result = subprocess.run(
+        command, cwd=cwd, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
     assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
     return result.stdout
 
@@ -39,26 +45,46 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     python = folder / "bin" / "python"
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder)
     pip = [sys.executable, "-m", "pip", "--python", str(python), "--quiet"]
-    run(*pip, "install", "--no-compile", "--constraint", ROOT / "requirements.lock", wheel, cwd=folder)
+    run(
+        *pip,
+        "install",
+        "--no-compile",
+        "--constraint",
+        ROOT / "requirements.lock",
+        wheel,
+        cwd=folder,
+    )
     run(*pip, "check", cwd=folder)
     return folder
 
 
 def test_the_wheel_holds_one_package(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.partition("/")[0] for name in names} == {"drake_clutter", "drake_clutter-0.1.0.dist-info"}
+    assert {name.partition("/")[0] for name in names} == {
+        "drake_clutter",
+        "drake_clutter-0.1.0.dist-info",
+    }
     for folder in ("models", "sdf_assets"):
         paths = (path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file())
         here = {path.as_posix() for path in paths if "generators" not in path.parts}
         assert here
-        assert here == {name.split("_shipped/")[1] for name in names if name.startswith(f"drake_clutter/_shipped/{folder}/")}
+        assert here == {
+            name.split("_shipped/")[1]
+            for name in names
+            if name.startswith(f"drake_clutter/_shipped/{folder}/")
+        }
     assert "drake_clutter/py.typed" in names
 
 
 def test_the_lock_satisfies_the_wheel(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        metadata = Parser().parsestr(archive.read("drake_clutter-0.1.0.dist-info/METADATA").decode())
-    locked = {line.partition("==")[0].lower() for line in (ROOT / "requirements.lock").read_text().splitlines()}
+        metadata = Parser().parsestr(
+            archive.read("drake_clutter-0.1.0.dist-info/METADATA").decode()
+        )
+    locked = {
+        line.partition("==")[0].lower()
+        for line in (ROOT / "requirements.lock").read_text().splitlines()
+    }
     required = {Requirement(value).name.lower() for value in metadata.get_all("Requires-Dist", [])}
     assert required <= locked
     assert not any(name.startswith("nvidia") for name in locked)
@@ -71,10 +97,18 @@ def test_the_installed_package_works_from_anywhere(installed: Path, tmp_path: Pa
     assert "doctor" in run(installed / "bin" / "drake-clutter", "--help", cwd=tmp_path)
 
 
-def test_the_installed_package_renders_and_finds_its_assets(installed: Path, tmp_path: Path) -> None:
+def test_the_installed_package_renders_and_finds_its_assets(
+    installed: Path, tmp_path: Path
+) -> None:
     """Without the extras: PyTorch is the one thing that the doctor misses."""
     command = installed / "bin" / "drake-clutter"
-    result = subprocess.run([command, "doctor", "--json"], cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    result = subprocess.run(
+        [command, "doctor", "--json"],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+    )
     checks = json.loads(result.stdout)
     assert [check["name"] for check in checks if not check["ok"]] == ["torch"], result.stderr
     (assets,) = (check for check in checks if check["name"] == "assets")

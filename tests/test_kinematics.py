@@ -5,7 +5,13 @@ import pytest
 from conftest import rng
 from numpy.typing import NDArray
 
-from drake_clutter.robots.ur_kinematics import forward_kinematics, inverse_kinematics, jacobian, link_poses, manipulability
+from drake_clutter.robots.ur_kinematics import (
+    forward_kinematics,
+    inverse_kinematics,
+    jacobian,
+    link_poses,
+    manipulability,
+)
 
 
 def apart(q: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -32,7 +38,9 @@ def test_all_branches_reach_the_pose() -> None:
         X_B6 = forward_kinematics(q)
         found = inverse_kinematics(X_B6)
         counts.append(len(found))
-        np.testing.assert_allclose(forward_kinematics(found), np.broadcast_to(X_B6, (len(found), 4, 4)), atol=1e-9)
+        np.testing.assert_allclose(
+            forward_kinematics(found), np.broadcast_to(X_B6, (len(found), 4, 4)), atol=1e-9
+        )
         assert (np.abs(found) <= np.pi).all()
         assert np.abs(apart(found, q)).max(axis=1).min() < 1e-6, "the branch that it was made from"
     assert max(counts) == 8
@@ -69,7 +77,9 @@ def test_the_jacobian_is_the_derivative() -> None:
         q = draw.uniform(-np.pi, np.pi, 6)
         found = jacobian(q)
         for joint in range(6):
-            ahead, behind = (forward_kinematics(q + sign * step * np.eye(6)[joint]) for sign in (1, -1))
+            ahead, behind = (
+                forward_kinematics(q + sign * step * np.eye(6)[joint]) for sign in (1, -1)
+            )
             v = (ahead[:3, 3] - behind[:3, 3]) / (2 * step)
             W = (ahead[:3, :3] - behind[:3, :3]) / (2 * step) @ forward_kinematics(q)[:3, :3].T
             w = np.array([W[2, 1], W[0, 2], W[1, 0]])
@@ -78,6 +88,8 @@ def test_the_jacobian_is_the_derivative() -> None:
 
 def test_manipulability_by_hand() -> None:
     """Of the elbow it is proportional to |sin(q3)|: nothing is left when the arm is stretched."""
-    bent, half = (manipulability(np.array([0.1, -1.0, q3, -0.5, -1.5, 0.0])) for q3 in (np.pi / 2, np.pi / 6))
+    bent, half = (
+        manipulability(np.array([0.1, -1.0, q3, -0.5, -1.5, 0.0])) for q3 in (np.pi / 2, np.pi / 6)
+    )
     stretched = manipulability(np.array([0.1, -1.0, 0.0, -0.5, -1.5, 0.0]))
     assert bent > half > stretched == pytest.approx(0.0, abs=1e-12)

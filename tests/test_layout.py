@@ -37,7 +37,9 @@ def random_layout(index: int) -> Scene | LayoutFailure:
     """The layout of a random graph of 3 to 25 nodes, of either object set, under a seed of its own."""
     generator = item_rng(2022, index)
     grammar = GRAMMARS["ycb7" if index % 2 else "pantry14"]
-    derivation = grammar.derive(NodeBudget(int(generator.integers(3, 26))), uniform_choice(generator))
+    derivation = grammar.derive(
+        NodeBudget(int(generator.integers(3, 26))), uniform_choice(generator)
+    )
     return lay_out(derivation, grammar.classes, ClutterConfig(), generator)
 
 
@@ -73,12 +75,17 @@ def check_scene(scene: Scene, config: LayoutConfig) -> None:
         below = [objects[node] for node in carriers(scene.graph, o.node)]
         lower, upper = o.bounds_T
         assert abs(lower[2] - max((b.top for b in below), default=0.0)) < ROUNDING
-        assert np.abs(o.bounds_T).max(axis=0)[:2].max() <= scene.support.size[0] / 2 - config.stack_gap + ROUNDING
+        assert (
+            np.abs(o.bounds_T).max(axis=0)[:2].max()
+            <= scene.support.size[0] / 2 - config.stack_gap + ROUNDING
+        )
         assert upper[2] <= config.max_stack_height
         if below:
             own = [objects[node] for pair in paired if o.node in pair for node in pair] or [o]
             middle = np.mean([b.X_TO.p[:2] for b in own], axis=0)
-            assert middle == pytest.approx(np.mean([b.X_TO.p[:2] for b in below], axis=0), abs=ROUNDING)
+            assert middle == pytest.approx(
+                np.mean([b.X_TO.p[:2] for b in below], axis=0), abs=ROUNDING
+            )
     for one, other in paired:
         a, b = sorted((objects[one], objects[other]), key=lambda o: o.X_TO.p[1])
         lying = scene.graph.edge_kind(one, scene.graph.children(one)[0]) is Orientation.FLAT_0
@@ -104,7 +111,11 @@ def footprints(scene: Scene) -> list[tuple[Footprint, Footprint]]:
         assert o.node is not None
         stacks.setdefault(stack_of[o.node], []).append(o)
     boxes = [
-        (np.min([o.bounds_T[0][:2] for o in s], axis=0), np.max([o.bounds_T[1][:2] for o in s], axis=0)) for s in stacks.values()
+        (
+            np.min([o.bounds_T[0][:2] for o in s], axis=0),
+            np.max([o.bounds_T[1][:2] for o in s], axis=0),
+        )
+        for s in stacks.values()
     ]
     return [(a, b) for index, a in enumerate(boxes) for b in boxes[:index]]
 
@@ -138,7 +149,11 @@ def test_a_stack_by_hand() -> None:
         assert o.X_TO.p[:2] == pytest.approx(can.X_TO.p[:2])
     assert box.bounds_T[1] - box.bounds_T[0] == pytest.approx([0.230, 0.160, 0.060])
     assert marker.bounds_T[1] - marker.bounds_T[0] == pytest.approx([0.018, 0.121, 0.018], abs=1e-4)
-    assert [o.name for o in scene.objects] == ["tomato_soup_can_1", "cracker_box_2", "large_marker_3"]
+    assert [o.name for o in scene.objects] == [
+        "tomato_soup_can_1",
+        "cracker_box_2",
+        "large_marker_3",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -152,7 +167,10 @@ def test_a_stack_by_hand() -> None:
 )
 def test_a_pair_by_hand(rule: str, gap: float, thickness: float) -> None:
     config = world_with("layout.lying_gap=0.002", "layout.standing_gap=0.040")
-    scene = laid_out(derived("drop_object", "stack_object", "end", rule, "insert_gelatin_box", "orient_flat_0"), config)
+    scene = laid_out(
+        derived("drop_object", "stack_object", "end", rule, "insert_gelatin_box", "orient_flat_0"),
+        config,
+    )
     one, other = (o for o in scene.objects if o.object_class.name != "gelatin_box")
     carried = scene.objects[-1]
     assert abs(one.X_TO.p - other.X_TO.p) == pytest.approx([0.0, thickness + gap, 0.0], abs=1e-4)
@@ -215,7 +233,9 @@ def test_the_same_seed_gives_the_same_layout() -> None:
 def test_stacks_are_spread_over_the_whole_tray(axis: int) -> None:
     """Uniform over the places that are allowed: the mean and the spread of 400 draws."""
     derivation = derived("drop_object", "end", "insert_tomato_soup_can", "orient_flat_0")
-    drawn = np.array([laid_out(derivation, seed=seed).objects[0].X_TO.p[axis] for seed in range(400)])
+    drawn = np.array(
+        [laid_out(derivation, seed=seed).objects[0].X_TO.p[axis] for seed in range(400)]
+    )
     reach = 0.35 - 0.010 - 0.033
     assert abs(drawn).max() <= reach + ROUNDING
     assert abs(drawn).max() > 0.98 * reach

@@ -17,21 +17,33 @@ from drake_clutter.systems.scenario import DETECTORS
 @pytest.fixture(scope="module", params=DETECTORS)
 def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
     network = SegmentationNetwork.load(shipped_path(DETECTORS[request.param]))
-    return LearnedDetector(network, CATALOGUE.object_set("ycb7"), config.cell.camera, config.cell.support)
+    return LearnedDetector(
+        network, CATALOGUE.object_set("ycb7"), config.cell.camera, config.cell.support
+    )
 
 
 def heap() -> Scene:
     """Two small boxes side by side, whose tops together look like a larger one's, and other things about them."""
-    boxes = [resting("gelatin_box", Orientation.FLAT_0, (0.0, y), name=f"gelatin_box_{y}") for y in (-0.0375, 0.0375)]
-    others = [resting("sugar_box", Orientation.FLAT_90, (-0.2, 0.1)), resting("tomato_soup_can", xy=(0.2, 0.15))]
+    boxes = [
+        resting("gelatin_box", Orientation.FLAT_0, (0.0, y), name=f"gelatin_box_{y}")
+        for y in (-0.0375, 0.0375)
+    ]
+    others = [
+        resting("sugar_box", Orientation.FLAT_90, (-0.2, 0.1)),
+        resting("tomato_soup_can", xy=(0.2, 0.15)),
+    ]
     return scene_of(*boxes, *others, resting("cracker_box", Orientation.FLAT_0, (0.2, -0.2)))
 
 
-def test_it_sees_what_is_there_and_is_sure_of_it(detector: LearnedDetector, config: ClutterConfig) -> None:
+def test_it_sees_what_is_there_and_is_sure_of_it(
+    detector: LearnedDetector, config: ClutterConfig
+) -> None:
     scene = heap()
     images = OverheadCamera(config.cell.camera).render(scene)
     seen = detector.detect(images.depth, images.color)
-    assert sorted(d.object_class.name for d in seen.detections) == sorted(o.object_class.name for o in scene.objects)
+    assert sorted(d.object_class.name for d in seen.detections) == sorted(
+        o.object_class.name for o in scene.objects
+    )
     for o in scene.objects:
         nearest = min(seen.detections, key=lambda d: float(np.linalg.norm(d.X_TO.p - o.X_TO.p)))
         assert nearest.object_class.name == o.object_class.name

@@ -33,7 +33,12 @@ def checkpoint(tmp_path: Path) -> Path:
     network = RuleValues(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
     config = {"task": asdict(GenerationTask()), "learning": asdict(SoftQConfig())}
     path = tmp_path / "untrained.safetensors"
-    about = {"kind": "generator", "network": about_values(grammar, WIDTH), "temperature": 0.3, "config": config}
+    about = {
+        "kind": "generator",
+        "network": about_values(grammar, WIDTH),
+        "temperature": 0.3,
+        "config": config,
+    }
     save_checkpoint(path, network, about)
     return path
 
@@ -42,13 +47,17 @@ def checkpoint(tmp_path: Path) -> Path:
 def test_it_derives_terminal_graphs_of_any_size(checkpoint: Path, nodes: int) -> None:
     agent, grammar = LearnedGenerator(checkpoint, ClutterConfig()), GRAMMARS["ycb7"]
     derived = [agent.derive(grammar, NodeBudget(nodes), rng(seed)) for seed in (0, 0, 1)]
-    assert all(derivation.graph.is_terminal and len(derivation.graph) == nodes for derivation in derived)
+    assert all(
+        derivation.graph.is_terminal and len(derivation.graph) == nodes for derivation in derived
+    )
     assert derived[0].rules == derived[1].rules != derived[2].rules
 
 
 def test_a_low_temperature_leaves_nothing_to_chance(checkpoint: Path) -> None:
     grammar = GRAMMARS["ycb7"]
-    cold, hot = (LearnedGenerator(checkpoint, ClutterConfig(), temperature) for temperature in (1e-6, 10.0))
+    cold, hot = (
+        LearnedGenerator(checkpoint, ClutterConfig(), temperature) for temperature in (1e-6, 10.0)
+    )
     assert len({cold.derive(grammar, NodeBudget(8), rng(seed)).rules for seed in range(5)}) == 1
     assert len({hot.derive(grammar, NodeBudget(8), rng(seed)).rules for seed in range(5)}) == 5
 
@@ -63,7 +72,9 @@ def test_the_generate_command_takes_a_checkpoint(checkpoint: Path) -> None:
 
 def test_what_it_was_not_trained_with_is_named(checkpoint: Path) -> None:
     with pytest.raises(InputError, match="was not trained with"):
-        LearnedGenerator(checkpoint, ClutterConfig()).derive(GRAMMARS["pantry14"], NodeBudget(6), rng())
+        LearnedGenerator(checkpoint, ClutterConfig()).derive(
+            GRAMMARS["pantry14"], NodeBudget(6), rng()
+        )
 
 
 def test_what_is_no_generator_is_refused(checkpoint: Path) -> None:
@@ -81,7 +92,10 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
     small, large = GRAMMARS["ycb7"], GRAMMARS["pantry14"]
     loaded = load_checkpoint(checkpoint)
     old, new = (load_values(loaded, grammar) for grammar in (small, large))
-    environments = [ClutterGeneration(list(g.classes.values()), GenerationTask(nodes=12)) for g in (small, large)]
+    environments = [
+        ClutterGeneration(list(g.classes.values()), GenerationTask(nodes=12))
+        for g in (small, large)
+    ]
     both = [large.index[rule.name] for rule in small.rules]
     draw = rng(3)
     for episode in range(5):
@@ -94,10 +108,18 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
             other, *_ = environments[1].step(both[action])
 
 
-@pytest.mark.parametrize(("name", "objects", "hidden"), [("sg-star", "ycb7", 8.0), ("sg-14", "pantry14", 7.0)])
-def test_shipped_agents_hide_objects_in_stable_stacks(name: str, objects: str, hidden: float, fast: FastJudge) -> None:
+@pytest.mark.parametrize(
+    ("name", "objects", "hidden"), [("sg-star", "ycb7", 8.0), ("sg-14", "pantry14", 7.0)]
+)
+def test_shipped_agents_hide_objects_in_stable_stacks(
+    name: str, objects: str, hidden: float, fast: FastJudge
+) -> None:
     """As the fast judge sees it; docs/generation.md has what Drake says of many more."""
-    agent, grammar, generator = make_generation_agent(name, ClutterConfig()), GRAMMARS[objects], rng(3)
+    agent, grammar, generator = (
+        make_generation_agent(name, ClutterConfig()),
+        GRAMMARS[objects],
+        rng(3),
+    )
     counts, forms = list[int](), set[object]()
     for _ in range(16):
         derivation = agent.derive(grammar, NodeBudget(25), generator)

@@ -15,7 +15,9 @@ def optimal(A: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float6
     return bool((x >= 0).all() and gradient.max() < 1e-8 and np.abs(gradient * x).max() < 1e-8)
 
 
-@pytest.mark.parametrize("kind", ["full rank", "low rank", "twin columns", "small whole numbers", "one direction"])
+@pytest.mark.parametrize(
+    "kind", ["full rank", "low rank", "twin columns", "small whole numbers", "one direction"]
+)
 @pytest.mark.parametrize("within_reach", [True, False])
 def test_nnls(kind: str, within_reach: bool) -> None:
     """As good as SciPy's, where that one's answer has not grown so large (of a low rank, beyond 1e13) that it means nothing."""
@@ -28,12 +30,18 @@ def test_nnls(kind: str, within_reach: bool) -> None:
             rank = max(1, min(rows, columns) // 2)
             A = generator.standard_normal((rows, rank)) @ generator.standard_normal((rank, columns))
         elif kind == "twin columns":
-            A[:, generator.integers(columns, size=columns // 2)] = A[:, generator.integers(columns, size=columns // 2)]
+            A[:, generator.integers(columns, size=columns // 2)] = A[
+                :, generator.integers(columns, size=columns // 2)
+            ]
         elif kind == "small whole numbers":
             A = np.round(A)
         elif kind == "one direction":
             A += 3 * generator.standard_normal((rows, 1))
-        b = A @ np.maximum(generator.standard_normal(columns), 0) if within_reach else generator.standard_normal(rows)
+        b = (
+            A @ np.maximum(generator.standard_normal(columns), 0)
+            if within_reach
+            else generator.standard_normal(rows)
+        )
         b /= max(1.0, float(np.linalg.norm(b)))
         x, rest = nnls(np.ascontiguousarray(A.T), b, 1e-9)
         np.testing.assert_allclose(rest, b - A @ x, atol=1e-9)

@@ -42,11 +42,18 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
     """A hexagonal prism, a frustum, a wedge that is high at -x, a box askew in its frame, and a bracket, not convex."""
     folder = tmp_path_factory.mktemp("user") / "own"
     folder.mkdir()
-    wedge = [[x, y, z] for y in (-0.03, 0.03) for x, z in ((-0.06, 0.0), (0.06, 0.0), (-0.06, 0.08))]
+    wedge = [
+        [x, y, z] for y in (-0.03, 0.03) for x, z in ((-0.06, 0.0), (0.06, 0.0), (-0.06, 0.08))
+    ]
     outline = [[0.0, 0.0], [0.10, 0.0], [0.10, 0.03], [0.03, 0.03], [0.03, 0.08], [0.0, 0.08]]
     corners = [[x, y, z] for y in (-0.03, 0.03) for x, z in outline]
     front = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    sides = [triangle for i in range(6) for j in [(i + 1) % 6] for triangle in ([i, i + 6, j], [j, i + 6, j + 6])]
+    sides = [
+        triangle
+        for i in range(6)
+        for j in [(i + 1) % 6]
+        for triangle in ([i, i + 6, j], [j, i + 6, j + 6])
+    ]
     bracket = trimesh.Trimesh(corners, front + [[6 + c, 6 + b, 6 + a] for a, b, c in front] + sides)
     bracket.fix_normals()
     meshes = {
@@ -54,7 +61,9 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
         "frustum": hull(np.vstack([regular(4, 0.06, 0.0), regular(4, 0.03, 0.06)])),
         "wedge": hull(np.array(wedge)),
         "bracket": bracket,
-        "askew": hull(np.array(list(product((-0.025, 0.025), (-0.030, 0.030), (-0.035, 0.035)))) @ ASKEW.T),
+        "askew": hull(
+            np.array(list(product((-0.025, 0.025), (-0.030, 0.030), (-0.035, 0.035)))) @ ASKEW.T
+        ),
     }
     for name, mesh in meshes.items():
         mesh.export(folder / f"{name}.stl")
@@ -66,11 +75,17 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
 
 
 def as_made(
-    object_class: ObjectClass, xy: tuple[float, float], floor: float, degrees: float = 0.0, name: str = "own"
+    object_class: ObjectClass,
+    xy: tuple[float, float],
+    floor: float,
+    degrees: float = 0.0,
+    name: str = "own",
 ) -> SceneObject:
     """On its z, turned about it."""
     R_TO = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return SceneObject(name, object_class, Pose.of(R_TO, (*xy, floor - float(object_class.corners[:, 2].min()))))
+    return SceneObject(
+        name, object_class, Pose.of(R_TO, (*xy, floor - float(object_class.corners[:, 2].min())))
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,7 +100,13 @@ def as_made(
     ],
 )
 def test_own_meshes_near_the_edge_of_a_box(
-    class_name: str, x: float, degrees: float, stable: bool, own: dict[str, ObjectClass], fast: FastJudge, judge: DrakeJudge
+    class_name: str,
+    x: float,
+    degrees: float,
+    stable: bool,
+    own: dict[str, ObjectClass],
+    fast: FastJudge,
+    judge: DrakeJudge,
 ) -> None:
     """The edge is at 115 mm."""
     scene = scene_of(BELOW, as_made(own[class_name], (x, 0.0), 0.060, degrees))
@@ -100,7 +121,10 @@ def test_a_box_on_a_frustums_small_top(
     x: float, stable: bool, own: dict[str, ObjectClass], fast: FastJudge, judge: DrakeJudge
 ) -> None:
     """Its top is a square of 42 mm on its corner; its outline would carry the box at 30 mm."""
-    scene = scene_of(as_made(own["frustum"], (0.0, 0.0), 0.0), resting("gelatin_box", xy=(x, 0.0), floor=0.060, name="box"))
+    scene = scene_of(
+        as_made(own["frustum"], (0.0, 0.0), 0.0),
+        resting("gelatin_box", xy=(x, 0.0), floor=0.060, name="box"),
+    )
     mine = fast.judge(scene, rng(1))
     assert isinstance(mine, Verdict)
     assert mine.stable is judge.judge(scene, rng(1)).stable is stable
@@ -121,35 +145,51 @@ def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: FastJudge) -> 
     assert over["own"] == pytest.approx(0.115 - (0.123 - 0.020), abs=1.01 * STEP)
 
 
-def test_a_mesh_stands_on_a_face_askew_in_its_frame(own: dict[str, ObjectClass], fast: FastJudge) -> None:
+def test_a_mesh_stands_on_a_face_askew_in_its_frame(
+    own: dict[str, ObjectClass], fast: FastJudge
+) -> None:
     """On each of its six faces."""
     for turn in ("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270):
         R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
         lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
-        margins = fast.margins(scene_of(SceneObject("own", own["askew"], Pose.of(R_TO, (0.0, 0.0, -lowest)))))
+        margins = fast.margins(
+            scene_of(SceneObject("own", own["askew"], Pose.of(R_TO, (0.0, 0.0, -lowest))))
+        )
         assert not isinstance(margins, CannotJudge)
         assert margins["own"] >= 0.025 - 1.01 * STEP, turn
 
 
 def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: FastJudge) -> None:
-    found = fast.stability(scene_of(as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")))
+    found = fast.stability(
+        scene_of(
+            as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")
+        )
+    )
     assert found == CannotJudge(CannotJudgeReason.EDGE_CONTACT, "box")
 
 
-def test_the_caster_sees_own_meshes_as_the_camera_does(own: dict[str, ObjectClass], config: ClutterConfig) -> None:
+def test_the_caster_sees_own_meshes_as_the_camera_does(
+    own: dict[str, ObjectClass], config: ClutterConfig
+) -> None:
     """Turned any way. Of a few hundred pixels hardly one is judged otherwise."""
     turns = Rotation.random(4, rng=rng(2)).as_matrix()
     tumbled = [
         SceneObject(name, own[name], Pose.of(turn, (x, 0.02, 0.15)))
-        for name, turn, x in zip(("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False)
+        for name, turn, x in zip(
+            ("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False
+        )
     ]
     scene = scene_of(*tumbled, resting("sugar_box", xy=(0.05, 0.0), floor=0.25, name="before"))
     shares = RayCaster(config.cell.camera).visible_shares(scene.objects)
-    assert shares == pytest.approx(OverheadCamera(config.cell.camera).visible_shares(scene), abs=0.01)
+    assert shares == pytest.approx(
+        OverheadCamera(config.cell.camera).visible_shares(scene), abs=0.01
+    )
     assert sum(0.02 < share < 0.98 for share in shares.values()) >= 2
 
 
-def test_what_is_not_convex_is_left_to_drake(own: dict[str, ObjectClass], config: ClutterConfig, judge: DrakeJudge) -> None:
+def test_what_is_not_convex_is_left_to_drake(
+    own: dict[str, ObjectClass], config: ClutterConfig, judge: DrakeJudge
+) -> None:
     scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
     answer = CannotJudge(CannotJudgeReason.NOT_CONVEX, "bracket")
     fast = FastJudge(config)

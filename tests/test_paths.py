@@ -53,7 +53,9 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
     """How much of each limit a motion uses, at most, at 1,500 times."""
     times = np.linspace(0.0, trajectory.end_time(), 1500)
     q = np.array([trajectory.value(t).ravel() for t in times])
-    v, a = (np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2))
+    v, a = (
+        np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2)
+    )
     torque = torques(dynamics_plant(ARM, payload), q, v, a)
     pairs = {
         "speed": v / ROBOT.velocity_limits,
@@ -62,7 +64,10 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
     }
     X_FL = np.eye(4)
     X_FL[:3, 3] = [0.0, 0.0, ARM.gripper.length + payload.p_GCm[2]]
-    of_load = np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0) / (times[1] - times[0]) ** 2
+    of_load = (
+        np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0)
+        / (times[1] - times[0]) ** 2
+    )
     pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.acceleration
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
@@ -72,7 +77,9 @@ def test_trajectories_keep_the_limits(payload: Payload) -> None:
     draw = rng(0)
     for _ in range(3):
         middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
-        trajectory = timed(smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]])), ARM, payload)
+        trajectory = timed(
+            smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]])), ARM, payload
+        )
         assert trajectory is not None
         shares = shares_of_limits(trajectory, payload)
         assert max(shares.values()) < 1.01, shares
@@ -82,14 +89,18 @@ def test_trajectories_keep_the_limits(payload: Payload) -> None:
 @pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
 def test_a_motion_that_is_too_fast_is_slowed_until_one_limit_is_met(payload: Payload) -> None:
     way = smooth(straight(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
-    too_fast = PathParameterizedTrajectory(way, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]]))
+    too_fast = PathParameterizedTrajectory(
+        way, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]])
+    )
     found = slowed(too_fast, ARM, payload)
     assert found is not None
     assert 0.95 < max(shares_of_limits(found, payload).values()) < 1.01
     assert found.value(found.end_time()) == pytest.approx(too_fast.value(0.3))
     again = slowed(found, ARM, payload)
     assert again is not None
-    assert again.end_time() == pytest.approx(found.end_time(), rel=0.01), "as it is, if the limits hold"
+    assert again.end_time() == pytest.approx(found.end_time(), rel=0.01), (
+        "as it is, if the limits hold"
+    )
 
 
 def test_as_quick_as_drakes_toppra() -> None:
@@ -98,11 +109,17 @@ def test_as_quick_as_drakes_toppra() -> None:
         middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
         path = smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]]))
         toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
-        toppra.AddJointVelocityLimit(-MARGIN * ROBOT.velocity_limits, MARGIN * ROBOT.velocity_limits)
-        toppra.AddJointAccelerationLimit(-MARGIN * ROBOT.acceleration_limits, MARGIN * ROBOT.acceleration_limits)
+        toppra.AddJointVelocityLimit(
+            -MARGIN * ROBOT.velocity_limits, MARGIN * ROBOT.velocity_limits
+        )
+        toppra.AddJointAccelerationLimit(
+            -MARGIN * ROBOT.acceleration_limits, MARGIN * ROBOT.acceleration_limits
+        )
         found = timed(path, ARM, Payload())
         assert found is not None
-        assert found.end_time() == pytest.approx(toppra.SolvePathParameterization().end_time(), rel=0.01)
+        assert found.end_time() == pytest.approx(
+            toppra.SolvePathParameterization().end_time(), rel=0.01
+        )
 
 
 def test_the_faster_joint_decides() -> None:

@@ -31,7 +31,9 @@ def seen(detector: LabelDetector, scene: Scene) -> Observation:
     return detector.look(scene).observation
 
 
-def placement(detector: LabelDetector, scene: Scene, pick: str, place: str = TRAY, seed: int = 0) -> Pose | None:
+def placement(
+    detector: LabelDetector, scene: Scene, pick: str, place: str = TRAY, seed: int = 0
+) -> Pose | None:
     return placed_at(seen(detector, scene), Move(pick, place), rng(seed))
 
 
@@ -47,14 +49,20 @@ def carried_by(scene: Scene, name: str) -> set[str]:
         o.name
         for o in scene.objects
         if o.X_TO.p[2] > start.X_TO.p[2]
-        and (np.minimum(o.bounds_T[1], start.bounds_T[1]) > np.maximum(o.bounds_T[0], start.bounds_T[0]))[:2].all()
+        and (
+            np.minimum(o.bounds_T[1], start.bounds_T[1])
+            > np.maximum(o.bounds_T[0], start.bounds_T[0])
+        )[:2].all()
     }
 
 
 def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = ()) -> float:
     """How deep the object at its new pose penetrates any other, m."""
     placed = SceneObject(name, scene[name].object_class, X_TO)
-    return max((penetration(placed, o) for o in scene.objects if o.name not in (name, *besides)), default=-np.inf)
+    return max(
+        (penetration(placed, o) for o in scene.objects if o.name not in (name, *besides)),
+        default=-np.inf,
+    )
 
 
 def test_on_an_empty_tray_the_object_goes_to_the_edge(detector: LabelDetector) -> None:
@@ -105,7 +113,9 @@ def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) ->
     generator = rng(seed)
     moves = legal_moves(observation)
     checked = 0
-    for move in [moves[i] for i in generator.permutation(len(moves))[:25]] + [m for m in moves if m.place == TRAY]:
+    for move in [moves[i] for i in generator.permutation(len(moves))[:25]] + [
+        m for m in moves if m.place == TRAY
+    ]:
         X_TO = placed_at(observation, move, generator)
         if X_TO is None:
             continue
@@ -127,7 +137,9 @@ def inside_outline(o: SceneObject, xy: NDArray[np.float64]) -> bool:
     p_O = (points - o.X_TO.p) @ o.X_TO.rotation
     half = np.asarray(o.object_class.size) / 2 + 1e-9
     if o.object_class.shape.value == "cylinder":
-        return bool(((np.hypot(p_O[:, 0], p_O[:, 1]) < half[0]) & (np.abs(p_O[:, 2]) < half[2])).any())
+        return bool(
+            ((np.hypot(p_O[:, 0], p_O[:, 1]) < half[0]) & (np.abs(p_O[:, 2]) < half[2])).any()
+        )
     return bool((np.abs(p_O) < half).all(axis=1).any())
 
 
@@ -136,7 +148,11 @@ def test_no_room_on_the_tray(detector: LabelDetector) -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     assert placement(detector, scene, "box") is None
     # Beside it 50 mm are left: enough for the marker of 18 mm with 10 mm of clearance on either side.
-    with_marker = scene_of(resting("cracker_box", name="box"), resting("large_marker", floor=0.060, name="m"), side=0.26)
+    with_marker = scene_of(
+        resting("cracker_box", name="box"),
+        resting("large_marker", floor=0.060, name="m"),
+        side=0.26,
+    )
     X_TO = placement(detector, with_marker, "m")
     assert X_TO is not None
     assert 0.080 + 0.010 + 0.009 <= abs(X_TO.p[1]) <= 0.130 - 0.010 - 0.009
@@ -151,7 +167,9 @@ def test_on_a_free_top_the_object_goes_to_its_middle(name: str, detector: LabelD
     X_TO = placement(detector, scene, "picked", "below")
     assert X_TO is not None
     assert X_TO.p[:2] == pytest.approx([0.05, 0.05], abs=1.5 * CELL)
-    assert SceneObject("picked", CLASSES[name], X_TO).bounds_T[0][2] == pytest.approx(0.060 + CONFIG.release_height, abs=1e-9)
+    assert SceneObject("picked", CLASSES[name], X_TO).bounds_T[0][2] == pytest.approx(
+        0.060 + CONFIG.release_height, abs=1e-9
+    )
     assert deepest_with(scene, "picked", X_TO) <= 0
 
 
@@ -201,7 +219,9 @@ def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
     assert without_walls.rotation == pytest.approx(box.X_TO.rotation)
 
 
-@pytest.mark.parametrize("move", [Move("ghost"), Move("below", "ghost"), Move("gelatin"), Move("below", "gelatin")])
+@pytest.mark.parametrize(
+    "move", [Move("ghost"), Move("below", "ghost"), Move("gelatin"), Move("below", "gelatin")]
+)
 def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) -> None:
     hidden = resting("gelatin_box", xy=(0.05, 0.05), name="gelatin")
     scene = scene_of(hidden, resting("cracker_box", xy=(0.05, 0.05), floor=0.028, name="below"))
@@ -211,7 +231,10 @@ def test_only_what_is_in_view_can_be_moved(move: Move, detector: LabelDetector) 
 
 
 def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> None:
-    scene = scene_of(resting("tomato_soup_can", name="can"), resting("gelatin_box", xy=(0.0805, 0.0), name="picked"))
+    scene = scene_of(
+        resting("tomato_soup_can", name="can"),
+        resting("gelatin_box", xy=(0.0805, 0.0), name="picked"),
+    )
     X_TO = placed_at(detector.look(scene).observation, Move("picked", "can"), rng())
     assert X_TO is not None
     assert X_TO.p[:2] == pytest.approx([0.0, 0.0], abs=0.0075)
@@ -219,7 +242,10 @@ def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> Non
 
 def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
     """Behind a high wall the floor cannot be seen; no place is chosen there, whatever the seed."""
-    wall = [resting("cereal_box_large", Orientation.UPRIGHT_90, (0.22, y), name=f"wall {y}") for y in (-0.1, 0.1)]
+    wall = [
+        resting("cereal_box_large", Orientation.UPRIGHT_90, (0.22, y), name=f"wall {y}")
+        for y in (-0.1, 0.1)
+    ]
     scene = scene_of(*wall, resting("tomato_soup_can", xy=(-0.2, 0.0), name="picked"))
     observation = seen(detector, scene)
     for seed in range(10):
@@ -240,12 +266,26 @@ def test_clear_tops(detector: LabelDetector) -> None:
     )
     observation = seen(detector, scene)
     clear = {d.name: has_clear_top(observation, d) for d in observation.detections}
-    assert clear == {"below": False, "above": True, "marker": True, "can": False, "on the can": True, "far": True}
+    assert clear == {
+        "below": False,
+        "above": True,
+        "marker": True,
+        "can": False,
+        "on the can": True,
+        "far": True,
+    }
 
 
-@pytest.mark.parametrize("orientation", list(Orientation), ids=lambda orientation: str(orientation.name))
-def test_an_object_alone_has_a_clear_top_and_its_height(orientation: Orientation, detector: LabelDetector) -> None:
-    objects = [resting(name, orientation, xy) for name, xy in (("cracker_box", (-0.15, 0.0)), ("large_marker", (0.2, 0.1)))]
+@pytest.mark.parametrize(
+    "orientation", list(Orientation), ids=lambda orientation: str(orientation.name)
+)
+def test_an_object_alone_has_a_clear_top_and_its_height(
+    orientation: Orientation, detector: LabelDetector
+) -> None:
+    objects = [
+        resting(name, orientation, xy)
+        for name, xy in (("cracker_box", (-0.15, 0.0)), ("large_marker", (0.2, 0.1)))
+    ]
     observation = seen(detector, scene_of(*objects))
     for o in objects:
         assert has_clear_top(observation, observation[o.name])

@@ -49,8 +49,12 @@ def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
     approach, carry, retreat = (phase.trajectory for phase in plan.phases)
     home = np.array(DEFAULT_CELL.robot.home)
     assert approach.value(0.0).ravel() == pytest.approx(home)
-    assert carry.value(0.0).ravel() == pytest.approx(approach.value(approach.end_time()).ravel(), abs=1e-9)
-    assert retreat.value(0.0).ravel() == pytest.approx(carry.value(carry.end_time()).ravel(), abs=1e-9)
+    assert carry.value(0.0).ravel() == pytest.approx(
+        approach.value(approach.end_time()).ravel(), abs=1e-9
+    )
+    assert retreat.value(0.0).ravel() == pytest.approx(
+        carry.value(carry.end_time()).ravel(), abs=1e-9
+    )
     assert retreat.value(retreat.end_time()).ravel() == pytest.approx(home)
     for trajectory in (approach, carry, retreat):
         for time in (0.0, trajectory.end_time()):
@@ -60,7 +64,9 @@ def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
 def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: Plan) -> None:
     carry, tool = plan.phases[1].trajectory, ToolKinematics(DEFAULT_CELL)
     X_TG_pick, X_TG_place = (tool.pose(carry.value(t).ravel()) for t in (0.0, carry.end_time()))
-    assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), "the top of the sugar box"
+    assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), (
+        "the top of the sugar box"
+    )
     assert X_TG_pick[:3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
     for X_TG, X_TO in ((X_TG_pick, plan.X_TO_pick), (X_TG_place, plan.X_TO_place)):
         expected = (rigid_transform(X_TO) @ plan.X_OG).GetAsMatrix4()
@@ -75,14 +81,18 @@ def hits_nothing(plan: Plan, objects: list[SceneObject]) -> None:
         if phase.name == "carry":
             scene.hold(plan.pick, plan.X_OG)
         else:
-            scene.put_one(plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place)
+            scene.put_one(
+                plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place
+            )
         least = own = math.inf
         for time in np.linspace(0.0, phase.duration, 300):
             for here in scene.close(phase.trajectory.value(time).ravel(), 0.03):
                 if here.pair == (plan.pick, "floor"):
                     assert here.distance > -0.001
                 elif here.pair == ("cup", plan.pick):
-                    assert here.distance > -0.0005, "the lip, which is on a spring, hardly goes into the face"
+                    assert here.distance > -0.0005, (
+                        "the lip, which is on a spring, hardly goes into the face"
+                    )
                 elif here.pair[1] in scene.arm_names:
                     own = min(own, here.distance)
                 else:
@@ -130,9 +140,15 @@ def test_what_carries_something_is_not_picked() -> None:
 def test_too_heavy() -> None:
     """A weak vacuum does not hold half a kilogram; and an arm may not be asked for more than its payload."""
     weak = cell_with("gripper.vacuum=0.1")
-    assert reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
+    assert (
+        reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
+        is PlanFailure.TOO_HEAVY
+    )
     frail = cell_with("robot.payload=1")
-    assert reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))) is PlanFailure.TOO_HEAVY
+    assert (
+        reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
+        is PlanFailure.TOO_HEAVY
+    )
 
 
 def test_out_of_reach() -> None:
@@ -148,7 +164,10 @@ def test_a_tower_beside_it_is_in_the_way() -> None:
     """A low box between two high ones: the gripper's body does not fit."""
     low = resting("gelatin_box", Orientation.UPRIGHT_0, name="low")
     places = [(x, z) for x in (0.06, -0.06) for z in (0.0, 0.23)]
-    walls = [resting("cracker_box", Orientation.UPRIGHT_0, (x, 0.0), z, f"wall_{k}") for k, (x, z) in enumerate(places)]
+    walls = [
+        resting("cracker_box", Orientation.UPRIGHT_0, (x, 0.0), z, f"wall_{k}")
+        for k, (x, z) in enumerate(places)
+    ]
     found = planner().plan([low, *walls], "low", lifted(low, 0.2, -0.2))
     assert reason(found) is PlanFailure.IN_COLLISION
     assert isinstance(found, NoPlan)
@@ -158,7 +177,9 @@ def test_a_tower_beside_it_is_in_the_way() -> None:
 
 
 def test_time_may_run_out() -> None:
-    found = planner(config=PlannerConfig(time_limit=0.0)).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    found = planner(config=PlannerConfig(time_limit=0.0)).plan(
+        PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
+    )
     assert reason(found) is PlanFailure.TIME_OUT
 
 
@@ -198,9 +219,14 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
             ahead = {c.pair: c.distance for c in scene.close(q + step * np.eye(6)[joint], 0.21)}
             behind = {c.pair: c.distance for c in scene.close(q - step * np.eye(6)[joint], 0.21)}
             for pair, (_, gradient) in found.items():
-                sides = (ahead[pair] - found[pair][0]) / step, (found[pair][0] - behind[pair]) / step
+                sides = (
+                    (ahead[pair] - found[pair][0]) / step,
+                    (found[pair][0] - behind[pair]) / step,
+                )
                 if abs(sides[0] - sides[1]) < 1e-2:  # not where the nearest corner changes
-                    errors["tomato_soup_can" in pair].append(abs(float(gradient[joint] - sum(sides) / 2)))
+                    errors["tomato_soup_can" in pair].append(
+                        abs(float(gradient[joint] - sum(sides) / 2))
+                    )
     assert min(len(of_some) for of_some in errors.values()) > 50
     assert np.quantile(errors[True] + errors[False], 0.9) < 5e-4
     assert max(errors[False]) < 5e-3
@@ -208,7 +234,9 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
 
 
 def test_optimised_ways_are_quicker(plan: Plan) -> None:
-    sure = planner(config=PlannerConfig(optimise=False)).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    sure = planner(config=PlannerConfig(optimise=False)).plan(
+        PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
+    )
     assert isinstance(sure, Plan)
     assert sure.duration == sure.sure == plan.sure
     assert plan.duration < 0.9 * plan.sure

@@ -141,7 +141,9 @@ def test_gradients_of_distances_of_seven_joints() -> None:
             sides = []
             for joint in range(7):
                 moved = [scene.close(q + sign * step * np.eye(7)[joint], 0.31) for sign in (1, -1)]
-                ahead, behind = ([c.distance for c in found if c.pair == here.pair] for found in moved)
+                ahead, behind = (
+                    [c.distance for c in found if c.pair == here.pair] for found in moved
+                )
                 if len(ahead) == len(behind) == 1:
                     sides.append(abs(gradient[joint] - (ahead[0] - behind[0]) / (2 * step)))
             if len(sides) == 7:

@@ -25,7 +25,9 @@ def fitter() -> PoseFitter:
     return PoseFitter(DEFAULT_CELL.camera)
 
 
-def placed(object_class: ObjectClass, R_TO: NDArray[np.float64], xy: NDArray[np.float64]) -> SceneObject:
+def placed(
+    object_class: ObjectClass, R_TO: NDArray[np.float64], xy: NDArray[np.float64]
+) -> SceneObject:
     """An object on the tray in an orientation, (3, 3), over xy (m)."""
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
     return SceneObject(object_class.name, object_class, Pose.of(R_TO, (xy[0], xy[1], -lowest)))
@@ -39,13 +41,20 @@ def alone(name: str, up: int, generator: np.random.Generator) -> SceneObject:
     return placed(CLASSES[name], yaw @ R_AO, generator.uniform(-0.2, 0.2, 2))
 
 
-def noisy(depth: NDArray[np.float32], sigma: float, generator: np.random.Generator) -> NDArray[np.float32]:
+def noisy(
+    depth: NDArray[np.float32], sigma: float, generator: np.random.Generator
+) -> NDArray[np.float32]:
     """The depth with Gaussian noise, m."""
     return np.asarray(depth + sigma * generator.standard_normal(depth.shape), np.float32)
 
 
 def fitted(
-    fitter: PoseFitter, camera: OverheadCamera, scene: Scene, name: str, generator: np.random.Generator, sigma: float = 0.0
+    fitter: PoseFitter,
+    camera: OverheadCamera,
+    scene: Scene,
+    name: str,
+    generator: np.random.Generator,
+    sigma: float = 0.0,
 ) -> FittedPose:
     """The pose of an object of a scene, the guess 1 cm off."""
     depth, label = camera.depth_and_label(scene)
@@ -53,18 +62,28 @@ def fitted(
     off = generator.standard_normal(3)
     guess = true.X_TO.p + 0.01 * off / np.linalg.norm(off)
     mask = label == scene.names.index(name)
-    found = fitter.fit(true.object_class, mask, noisy(depth, sigma, generator) if sigma else depth, guess)
+    found = fitter.fit(
+        true.object_class, mask, noisy(depth, sigma, generator) if sigma else depth, guess
+    )
     assert found is not None
     return found
 
 
-CASES = [(name, up) for name in PANTRY for up in ((0, 1, 2) if CLASSES[name].shape is Shape.BOX else (0, 2))]
+CASES = [
+    (name, up)
+    for name in PANTRY
+    for up in ((0, 1, 2) if CLASSES[name].shape is Shape.BOX else (0, 2))
+]
 
 
 @pytest.fixture(scope="module")
-def errors(fitter: PoseFitter, camera: OverheadCamera) -> dict[float, dict[tuple[str, int], tuple[float, float]]]:
+def errors(
+    fitter: PoseFitter, camera: OverheadCamera
+) -> dict[float, dict[tuple[str, int], tuple[float, float]]]:
     """Errors in m and rad of every class in every rest, by noise (m)."""
-    camera.render(scene_of(*(resting(name, xy=(3.0, 0.0), name=name) for name in PANTRY)))  # one engine for all
+    camera.render(
+        scene_of(*(resting(name, xy=(3.0, 0.0), name=name) for name in PANTRY))
+    )  # one engine for all
     found: dict[float, dict[tuple[str, int], tuple[float, float]]] = {0.0: {}, 0.0015: {}}
     for sigma, (name, up) in itertools.product(found, CASES):
         o = alone(name, up, generator := rng(up))
@@ -73,17 +92,28 @@ def errors(fitter: PoseFitter, camera: OverheadCamera) -> dict[float, dict[tuple
     return found
 
 
-def test_every_class_in_every_rest(errors: dict[float, dict[tuple[str, int], tuple[float, float]]]) -> None:
+def test_every_class_in_every_rest(
+    errors: dict[float, dict[tuple[str, int], tuple[float, float]]],
+) -> None:
     exact = np.array(list(errors[0.0].values()))
     assert np.median(exact[:, 0]) < 0.002
     assert np.median(exact[:, 1]) < math.radians(1.5)
 
 
-@pytest.mark.parametrize(("sigma", "most", "most_turned"), [(0.0, 0.006, 5.0), (0.0015, 0.010, 6.0)])
+@pytest.mark.parametrize(
+    ("sigma", "most", "most_turned"), [(0.0, 0.006, 5.0), (0.0015, 0.010, 6.0)]
+)
 def test_none_is_far_off(
-    sigma: float, most: float, most_turned: float, errors: dict[float, dict[tuple[str, int], tuple[float, float]]]
+    sigma: float,
+    most: float,
+    most_turned: float,
+    errors: dict[float, dict[tuple[str, int], tuple[float, float]]],
 ) -> None:
-    far = {case: e for case, e in errors[sigma].items() if e[0] > most or e[1] > math.radians(most_turned)}
+    far = {
+        case: e
+        for case, e in errors[sigma].items()
+        if e[0] > most or e[1] > math.radians(most_turned)
+    }
     assert far == {}
 
 
@@ -101,10 +131,21 @@ def test_half_covered(sigma: float, fitter: PoseFitter, camera: OverheadCamera) 
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.0015])
-@pytest.mark.parametrize(("name", "axis"), [("sugar_box", (0, 1, 0)), ("cracker_box", (1, 1, 0)), ("tomato_soup_can", (1, 0, 0))])
-def test_tilted(name: str, axis: tuple[float, ...], sigma: float, fitter: PoseFitter, camera: OverheadCamera) -> None:
-    tilt = Rotation.from_rotvec(math.radians(25) * np.array(axis) / np.linalg.norm(axis)).as_matrix()
-    o = placed(CLASSES[name], tilt @ resting(name, Orientation.FLAT_30).X_TO.rotation, np.array([0.1, 0.05]))
+@pytest.mark.parametrize(
+    ("name", "axis"),
+    [("sugar_box", (0, 1, 0)), ("cracker_box", (1, 1, 0)), ("tomato_soup_can", (1, 0, 0))],
+)
+def test_tilted(
+    name: str, axis: tuple[float, ...], sigma: float, fitter: PoseFitter, camera: OverheadCamera
+) -> None:
+    tilt = Rotation.from_rotvec(
+        math.radians(25) * np.array(axis) / np.linalg.norm(axis)
+    ).as_matrix()
+    o = placed(
+        CLASSES[name],
+        tilt @ resting(name, Orientation.FLAT_30).X_TO.rotation,
+        np.array([0.1, 0.05]),
+    )
     found = fitted(fitter, camera, scene_of(o), name, rng(2), sigma)
     moved, turned = pose_error(o.object_class, found.X_TO, o.X_TO)
     assert moved < 0.006
@@ -113,7 +154,9 @@ def test_tilted(name: str, axis: tuple[float, ...], sigma: float, fitter: PoseFi
 
 @pytest.mark.parametrize("fault", ["wide", "narrow", "strays"])
 @pytest.mark.parametrize("name", ["sugar_box", "tomato_soup_can", "large_marker"])
-def test_a_mask_with_faults(name: str, fault: str, fitter: PoseFitter, camera: OverheadCamera) -> None:
+def test_a_mask_with_faults(
+    name: str, fault: str, fitter: PoseFitter, camera: OverheadCamera
+) -> None:
     """Two pixels too wide, one too narrow, or with pixels far from the object."""
     o = resting(name, Orientation.FLAT_30, (0.12, -0.1))
     depth, label = camera.depth_and_label(scene_of(o))
@@ -124,7 +167,12 @@ def test_a_mask_with_faults(name: str, fault: str, fitter: PoseFitter, camera: O
         mask = np.asarray(binary_erosion(mask))
     else:
         mask.flat[rng(5).integers(mask.size, size=60)] = True
-    found = fitter.fit(o.object_class, mask, noisy(depth, 0.0015, rng(5)), o.X_TO.p + np.array([0.006, -0.006, 0.005]))
+    found = fitter.fit(
+        o.object_class,
+        mask,
+        noisy(depth, 0.0015, rng(5)),
+        o.X_TO.p + np.array([0.006, -0.006, 0.005]),
+    )
     assert found is not None
     moved, turned = pose_error(o.object_class, found.X_TO, o.X_TO)
     assert moved < 0.006
@@ -140,7 +188,10 @@ def test_a_resting_object_is_exactly_at_rest(fitter: PoseFitter, camera: Overhea
 
 def test_deterministic(camera: OverheadCamera) -> None:
     scene = scene_of(resting("master_chef_can", xy=(0.1, 0.1)))
-    fits = [fitted(PoseFitter(DEFAULT_CELL.camera), camera, scene, "master_chef_can", rng(4), 0.0015) for _ in range(2)]
+    fits = [
+        fitted(PoseFitter(DEFAULT_CELL.camera), camera, scene, "master_chef_can", rng(4), 0.0015)
+        for _ in range(2)
+    ]
     assert fits[0] == fits[1]
 
 
@@ -156,7 +207,9 @@ def test_nothing_to_fit(fitter: PoseFitter) -> None:
 
 def test_bad_arguments(fitter: PoseFitter) -> None:
     with pytest.raises(ValueError, match=r"\(480, 640\)"):
-        fitter.fit(CLASSES["sugar_box"], np.ones((4, 4), bool), np.ones((4, 4), np.float32), np.zeros(3))
+        fitter.fit(
+            CLASSES["sugar_box"], np.ones((4, 4), bool), np.ones((4, 4), np.float32), np.zeros(3)
+        )
 
 
 def test_pose_error_knows_the_symmetries() -> None:
@@ -164,8 +217,12 @@ def test_pose_error_knows_the_symmetries() -> None:
     R = X_TO.rotation
     box, can = CLASSES["sugar_box"], CLASSES["tomato_soup_can"]
     for half_turn in ([math.pi, 0, 0], [0, math.pi, 0], [0, 0, math.pi]):
-        same = Pose.of(R @ Rotation.from_rotvec(half_turn).as_matrix(), X_TO.p + np.array([0.0, 0.003, 0.004]))
-        assert np.array(pose_error(box, same, X_TO)) == pytest.approx(np.array([0.005, 0.0]), abs=1e-6)
+        same = Pose.of(
+            R @ Rotation.from_rotvec(half_turn).as_matrix(), X_TO.p + np.array([0.0, 0.003, 0.004])
+        )
+        assert np.array(pose_error(box, same, X_TO)) == pytest.approx(
+            np.array([0.005, 0.0]), abs=1e-6
+        )
     quarter = Pose.of(R @ Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix(), X_TO.p)
     assert pose_error(box, quarter, X_TO)[1] == pytest.approx(math.pi / 2)
     assert pose_error(can, quarter, X_TO)[1] == pytest.approx(0.0, abs=1e-6)

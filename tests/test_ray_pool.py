@@ -134,7 +134,11 @@ def test_results_and_their_order_are_those_of_one_worker_here(
     cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
 ) -> None:
     """One of the three finds no room, and holds nothing up."""
-    there = list(map_ordered(partial(Draws, tmp_path), iter(range(12)), workers=3, ray_address=cluster.address))
+    there = list(
+        map_ordered(
+            partial(Draws, tmp_path), iter(range(12)), workers=3, ray_address=cluster.address
+        )
+    )
     assert [item for item, _ in there] == list(range(12))
     assert bits(there) == alone
     assert all(numbers.flags.writeable for _, numbers in there)
@@ -150,7 +154,9 @@ def test_items_of_killed_workers_are_done_again_but_not_for_ever(
         next(results)
 
 
-def test_items_of_a_lost_node_are_done_again(cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]) -> None:
+def test_items_of_a_lost_node_are_done_again(
+    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+) -> None:
     """By the worker on the other node, where there is no room for the lost one."""
     node = next(iter(cluster.worker_nodes))
 
@@ -162,20 +168,38 @@ def test_items_of_a_lost_node_are_done_again(cluster: Cluster, tmp_path: Path, a
     loser.start()
     try:
         make_worker = partial(Draws, tmp_path, trap=node.node_id)
-        assert bits(map_ordered(make_worker, range(12), workers=2, ray_address=cluster.address)) == alone
+        assert (
+            bits(map_ordered(make_worker, range(12), workers=2, ray_address=cluster.address))
+            == alone
+        )
     finally:
         loser.join()
         cluster.add_node(num_cpus=1)
     assert node not in cluster.list_all_nodes()
 
 
-def test_generate_with_a_killed_worker_writes_the_same_scenes(cluster: Cluster, tmp_path: Path) -> None:
+def test_generate_with_a_killed_worker_writes_the_same_scenes(
+    cluster: Cluster, tmp_path: Path
+) -> None:
     job = GenerationJob("random", "ycb7", None, nodes=5, seed=5, config=ClutterConfig())
     (tmp_path / "alone/scenes").mkdir(parents=True)
     for index, made in enumerate(map_ordered(partial(SceneGenerator, job), range(3), workers=1)):
-        save_scene(tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, DEFAULT_CELL, made.verdict)
+        save_scene(
+            tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, DEFAULT_CELL, made.verdict
+        )
     command = [sys.executable, "-c", "from drake_clutter.cli import main; main()"]
-    command += ["generate", "--nodes", "5", "--count", "3", "--seed", "5", "--json", "--out", str(tmp_path / "there")]
+    command += [
+        "generate",
+        "--nodes",
+        "5",
+        "--count",
+        "3",
+        "--seed",
+        "5",
+        "--json",
+        "--out",
+        str(tmp_path / "there"),
+    ]
     command += ["--workers", "2", "--ray", cluster.address]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         os.kill(wait_for(lambda: processes_at_work(cluster))[0], signal.SIGKILL)
@@ -186,7 +210,9 @@ def test_generate_with_a_killed_worker_writes_the_same_scenes(cluster: Cluster, 
 
 
 def test_exceptions_come_in_their_place_and_as_themselves(cluster: Cluster) -> None:
-    results = map_ordered(partial(failing_worker, 3), range(10), workers=2, ray_address=cluster.address)
+    results = map_ordered(
+        partial(failing_worker, 3), range(10), workers=2, ray_address=cluster.address
+    )
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(LookupError, match=r"^item 3$"):
         next(results)
@@ -194,11 +220,15 @@ def test_exceptions_come_in_their_place_and_as_themselves(cluster: Cluster) -> N
         next(map_ordered(broken_factory, range(3), workers=1, ray_address=cluster.address))
 
 
-def test_workers_are_like_local_ones(cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_are_like_local_ones(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Processes of their own, which start in this folder and are told to use one thread."""
     monkeypatch.chdir(tmp_path)
     Path("here.txt").write_text("found")
-    seen = list(map_ordered(make_look_around, ["here.txt"] * 6, workers=2, ray_address=cluster.address))
+    seen = list(
+        map_ordered(make_look_around, ["here.txt"] * 6, workers=2, ray_address=cluster.address)
+    )
     pids = {pid for pid, _, _ in seen}
     assert len(pids) <= 2
     assert os.getpid() not in pids
@@ -231,7 +261,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that
 for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_address="{cluster.address}"):
     print(result, flush=True)
 """
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         assert process.stdout is not None
         assert int(process.stdout.readline()) > 0
         workers = wait_for(lambda: processes_at_work(cluster))
@@ -249,10 +281,17 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_cluster_that_is_not_there_is_not_waited_for(tmp_path: Path) -> None:
     settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
-    verdict = {"stable": True, "hidden": ["below"], "visible_share": {"below": 0.0, "above": 1.0}, "settled": settled}
+    verdict = {
+        "stable": True,
+        "hidden": ["below"],
+        "visible_share": {"below": 0.0, "above": 1.0},
+        "settled": settled,
+    }
     (tmp_path / "scene.yaml").write_text(broken(verdict=verdict))
     start = time.monotonic()
-    result = run("evaluate", tmp_path, "--out", tmp_path / "out.json", "--ray", "127.0.0.1:9", code=2)
+    result = run(
+        "evaluate", tmp_path, "--out", tmp_path / "out.json", "--ray", "127.0.0.1:9", code=2
+    )
     assert "--ray 127.0.0.1:9: no cluster to work with" in result.stderr
     assert "allowed is auto, " in result.stderr
     assert time.monotonic() - start < 60

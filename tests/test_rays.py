@@ -24,7 +24,14 @@ CAMERA = DEFAULT_CELL.camera
 RAYS = RayCaster(CAMERA)
 # Detects whatever it meets, so that its masks are a label image.
 OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))
-ALL_SHAPES = ("cracker_box", "sugar_box", "gelatin_box", "tomato_soup_can", "master_chef_can", "large_marker")
+ALL_SHAPES = (
+    "cracker_box",
+    "sugar_box",
+    "gelatin_box",
+    "tomato_soup_can",
+    "master_chef_can",
+    "large_marker",
+)
 
 
 def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
@@ -42,7 +49,9 @@ def tumbled(seed: int, spread: float = 0.22) -> Scene:
     objects = []
     for index, (class_name, turn) in enumerate(zip(2 * ALL_SHAPES, turns, strict=True)):
         p_TO = (*generator.uniform(-spread, spread, 2), generator.uniform(0.16, 0.40))
-        objects.append(SceneObject(f"{class_name} {index}", CLASSES[class_name], Pose.of(turn, p_TO)))
+        objects.append(
+            SceneObject(f"{class_name} {index}", CLASSES[class_name], Pose.of(turn, p_TO))
+        )
     return scene_of(*objects)
 
 
@@ -57,11 +66,18 @@ RESTING = scene_of(
     resting("sugar_box", Orientation.UPRIGHT_0, (0.25, -0.25), name="wall"),
     resting("gelatin_box", xy=(0.27, -0.31), name="in its shadow"),
 )
-SCENES: Mapping[str, Scene] = {"resting": RESTING, "tumbled 0": tumbled(0), "tumbled 1": tumbled(1), "laid out": random_scene(1)}
+SCENES: Mapping[str, Scene] = {
+    "resting": RESTING,
+    "tumbled 0": tumbled(0),
+    "tumbled 1": tumbled(1),
+    "laid out": random_scene(1),
+}
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
-def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(scene: Scene, detector: LabelDetector) -> None:
+def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
+    scene: Scene, detector: LabelDetector
+) -> None:
     """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
     look, rendered = detector.look(scene), detector.camera.label(scene)
     observation, shares = RAYS.observe(scene)
@@ -77,7 +93,10 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(scene: S
     for detection, seen in zip(observation.detections, look.observation.detections, strict=True):
         assert (detection.object_class, detection.X_TO) == (seen.object_class, seen.X_TO)
         assert np.array_equal(detection.mask, cast == scene.names.index(detection.name))
-    assert (observation.camera, observation.support) == (look.observation.camera, look.observation.support)
+    assert (observation.camera, observation.support) == (
+        look.observation.camera,
+        look.observation.support,
+    )
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
@@ -102,7 +121,10 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
 
 @pytest.mark.parametrize(
     "config",
-    [Camera.over(1.1, width=320, height=240, fov_y_deg=60.0), Camera.over(1.6, width=200, height=300, fov_y_deg=20.0)],
+    [
+        Camera.over(1.1, width=320, height=240, fov_y_deg=60.0),
+        Camera.over(1.6, width=200, height=300, fov_y_deg=20.0),
+    ],
     ids=["wide", "narrow"],
 )
 def test_another_camera(config: Camera) -> None:
@@ -110,18 +132,32 @@ def test_another_camera(config: Camera) -> None:
     Fewer pixels: one is up to a hundredth of an object."""
     scene = tumbled(2)
     camera, caster = OverheadCamera(config), RayCaster(config)
-    assert caster.visible_shares(scene.objects) == pytest.approx(camera.visible_shares(scene), abs=0.02)
+    assert caster.visible_shares(scene.objects) == pytest.approx(
+        camera.visible_shares(scene), abs=0.02
+    )
     rendered = camera.label(scene)
-    assert (labels(scene, RayCaster(config.model_copy(update={"visibility_threshold": 1e-9}))) == rendered).mean() >= 0.9995
-    cut = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).any() for m in (rendered == k for k in range(len(scene.objects)))]
+    assert (
+        labels(scene, RayCaster(config.model_copy(update={"visibility_threshold": 1e-9})))
+        == rendered
+    ).mean() >= 0.9995
+    cut = [
+        np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).any()
+        for m in (rendered == k for k in range(len(scene.objects)))
+    ]
     assert any(cut) == (config.fov_y_deg == 20.0)
 
 
 @pytest.mark.parametrize(
     ("name", "length", "width", "height"),
-    [("cracker_box", 0.230, 0.160, 0.060), ("sugar_box", 0.175, 0.089, 0.038), ("gelatin_box", 0.085, 0.073, 0.028)],
+    [
+        ("cracker_box", 0.230, 0.160, 0.060),
+        ("sugar_box", 0.175, 0.089, 0.038),
+        ("gelatin_box", 0.085, 0.073, 0.028),
+    ],
 )
-@pytest.mark.parametrize("orientation", [Orientation.FLAT_0, Orientation.FLAT_30, Orientation.FLAT_90])
+@pytest.mark.parametrize(
+    "orientation", [Orientation.FLAT_0, Orientation.FLAT_30, Orientation.FLAT_90]
+)
 def test_a_box_from_straight_above_covers_its_top(
     name: str, length: float, width: float, height: float, orientation: Orientation
 ) -> None:
@@ -138,7 +174,10 @@ def test_a_box_from_straight_above_covers_its_top(
 def test_a_box_in_a_corner_shows_its_sides() -> None:
     """The hull of its eight corners in the picture, by the shoelace formula."""
     box = resting("cracker_box", Orientation.UPRIGHT_0, (0.2, 0.15), name="box")
-    low, high = (CAMERA.project(np.array([[x, y, z] for x in (0.12, 0.28) for y in (0.12, 0.18)])) for z in (0.0, 0.23))
+    low, high = (
+        CAMERA.project(np.array([[x, y, z] for x in (0.12, 0.28) for y in (0.12, 0.18)]))
+        for z in (0.0, 0.23)
+    )
     # The top is nearer and seems larger, away from the middle: of the bottom, the corner beyond the top's is inside.
     outline = np.array([low[0], low[1], high[1], high[3], high[2], low[2]])
     following = np.roll(outline, -1, axis=0)
@@ -190,7 +229,9 @@ def test_what_was_cast_before_is_no_matter() -> None:
 def test_other_places_than_those_of_the_poses() -> None:
     scene = tumbled(1)
     offsets = rng(3).uniform(-0.05, 0.05, (len(scene.objects), 3))
-    moved = scene.at({o.name: o.X_TO.moved(offset) for o, offset in zip(scene.objects, offsets, strict=True)})
+    moved = scene.at(
+        {o.name: o.X_TO.moved(offset) for o, offset in zip(scene.objects, offsets, strict=True)}
+    )
     shapes = Shapes()
     caster = RayCaster(CAMERA, shapes)
     rows = shapes.rows(scene.objects)
@@ -206,7 +247,9 @@ def test_out_of_the_frame_nothing_is_hidden() -> None:
     assert RAYS.visible_shares(FAR.objects) == {"near": 1.0, "far": 1.0}
     assert RAYS.visible_shares([FAR["far"]]) == {"far": 1.0}
     assert RAYS.cover(FAR, "far") == {}
-    assert (RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.X_TC.translation()[2])).all()
+    assert (
+        RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.X_TC.translation()[2])
+    ).all()
 
 
 def test_only_what_a_ray_meets_is_detected() -> None:
@@ -217,7 +260,10 @@ def test_only_what_a_ray_meets_is_detected() -> None:
 
 def test_half_covered() -> None:
     """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
-    objects = [resting("cracker_box", name="below"), resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above")]
+    objects = [
+        resting("cracker_box", name="below"),
+        resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"),
+    ]
     shares = RAYS.visible_shares(objects)
     assert shares["below"] == pytest.approx(0.5, abs=1 / 92)  # the box is 92 pixels long
     assert shares["above"] == 1.0
@@ -236,14 +282,19 @@ HEAP = scene_of(
 
 
 @pytest.mark.parametrize(
-    ("scene", "name"), [(HEAP, "hidden"), (HEAP, "one"), (tumbled(0, 0.08), "sugar_box 1")], ids=["0", "1", "2"]
+    ("scene", "name"),
+    [(HEAP, "hidden"), (HEAP, "one"), (tumbled(0, 0.08), "sugar_box 1")],
+    ids=["0", "1", "2"],
 )
 def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> None:
     """Without a set of others, the object is met by the rays before which there are none but these; by all subsets of five."""
     cover = RAYS.cover(scene, name)
     total = sum(cover.values())
     assert total == int((labels(scene_of(scene[name])) == 0).sum())
-    before_most = sorted((o for o in scene.objects if o.name != name), key=lambda o: -sum(cover[c] for c in cover if o.name in c))
+    before_most = sorted(
+        (o for o in scene.objects if o.name != name),
+        key=lambda o: -sum(cover[c] for c in cover if o.name in c),
+    )
     others, kept = before_most[:5], before_most[5:]
     free = []
     for count in range(len(others) + 1):
@@ -257,7 +308,9 @@ def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> 
 
 
 def test_cover_of_a_lone_cover() -> None:
-    scene = scene_of(resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover"))
+    scene = scene_of(
+        resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover")
+    )
     pixels = 0.085 * 0.073 * (CAMERA.focal_length / (CAMERA.X_TC.translation()[2] - 0.028)) ** 2
     cover = RAYS.cover(scene, "box")
     assert cover == {frozenset({"cover"}): pytest.approx(pixels, rel=0.05)}

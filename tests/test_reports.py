@@ -20,7 +20,14 @@ from drake_clutter.reports.diagram_picture import connections, draw_diagram
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
-from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason, Move, MoveResult, Outcome
+from drake_clutter.scenes.interfaces import (
+    Frame,
+    Instability,
+    InstabilityReason,
+    Move,
+    MoveResult,
+    Outcome,
+)
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import run_episode, teleport_backends
@@ -78,7 +85,15 @@ def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> P
     outcome = Outcome(MoveResult.COLLAPSED, task.scene, fallen)
     collapse = Step(Decision(Move("cracker_box_2")), outcome, step.look, (), -1.0)
     summary = {"agent": HOSTILE, "seed": 3, "success": True, "moves": [{"move": HOSTILE}]}
-    write_episode_page(out, f"Episode {HOSTILE}", task.start, task.first_look, [step, stuck, collapse], summary, DEFAULT_CELL)
+    write_episode_page(
+        out,
+        f"Episode {HOSTILE}",
+        task.start,
+        task.first_look,
+        [step, stuck, collapse],
+        summary,
+        DEFAULT_CELL,
+    )
     return out
 
 
@@ -86,11 +101,15 @@ def test_the_page_refers_only_to_files_that_lie_beside_it(folder: Path) -> None:
     source = (folder / "index.html").read_text(encoding="utf-8")
     page = Page(source)
     assert not re.search(r"https?://|@import|url\(", source)
-    assert {"recording.html", "images/start_oblique.png", "images/move_01_after.png"} <= set(page.references)
+    assert {"recording.html", "images/start_oblique.png", "images/move_01_after.png"} <= set(
+        page.references
+    )
     for reference in page.references:
         assert (folder / reference).is_file(), reference
     written = {f"images/{path.name}" for path in (folder / "images").iterdir()}
-    assert written == {reference for reference in page.references if reference.startswith("images/")}
+    assert written == {
+        reference for reference in page.references if reference.startswith("images/")
+    }
     assert "$" not in source  # every field of the template is filled in
     assert all(page.alts)
 
@@ -172,7 +191,9 @@ def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
 
 def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) -> None:
     step = replace(task.steps[0], outcome=Outcome(MoveResult.NO_FREE_SPOT, SCENE))
-    assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {SCENE["cracker_box_2"].X_TO}
+    assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {
+        SCENE["cracker_box_2"].X_TO
+    }
 
 
 def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
@@ -187,7 +208,15 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
     (step,) = task.steps
     other = next(name for name in task.known if name != step.move.pick)
     decision = Decision(step.move, {other: 0.6, step.move.pick: 0.4}, (other, step.move.pick))
-    write_episode_page(tmp_path, "Believed", task.start, task.first_look, [replace(step, decision=decision)], {}, DEFAULT_CELL)
+    write_episode_page(
+        tmp_path,
+        "Believed",
+        task.start,
+        task.first_look,
+        [replace(step, decision=decision)],
+        {},
+        DEFAULT_CELL,
+    )
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert f"it knew 2 of {len(task.scene.objects)} objects" in text
     assert text.index("60%") < text.index("40%")
@@ -211,7 +240,9 @@ def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> 
 @pytest.mark.parametrize(("count", "columns", "rows"), [(1, 2, 1), (7, 4, 2), (48, 8, 6)])
 def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> None:
     picture = np.full((90, 120, 3), 128, np.uint8)
-    write_contact_sheet(tmp_path / "sheet.png", [(picture, f"{i:04d}  hidden 2", i != 1) for i in range(count)])
+    write_contact_sheet(
+        tmp_path / "sheet.png", [(picture, f"{i:04d}  hidden 2", i != 1) for i in range(count)]
+    )
     with Image.open(tmp_path / "sheet.png") as sheet:
         gap = sheet.width - columns * TILE[0]
         assert sheet.size == (columns * TILE[0] + gap, rows * TILE[1] + gap)
@@ -226,17 +257,25 @@ def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> N
 @pytest.mark.parametrize("count", [0, MAX_THUMBNAILS + 1])
 def test_a_contact_sheet_holds_at_least_one_and_not_too_many(tmp_path: Path, count: int) -> None:
     with pytest.raises(ValueError, match="allowed are 1 to 48"):
-        write_contact_sheet(tmp_path / "sheet.png", [(np.zeros((4, 4, 3), np.uint8), "", True)] * count)
+        write_contact_sheet(
+            tmp_path / "sheet.png", [(np.zeros((4, 4, 3), np.uint8), "", True)] * count
+        )
 
 
 def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> None:
     builder = DiagramBuilder()
-    there, back = builder.AddNamedSystem("there", PassThrough(1)), builder.AddNamedSystem("back", ZeroOrderHold(0.1, 1))
+    there, back = (
+        builder.AddNamedSystem("there", PassThrough(1)),
+        builder.AddNamedSystem("back", ZeroOrderHold(0.1, 1)),
+    )
     builder.Connect(there.get_output_port(), back.get_input_port())
     builder.Connect(back.get_output_port(), there.get_input_port())
     diagram = builder.Build()
     ports = {"ports": ["y → u"]}
-    assert list(connections(diagram).edges(data=True)) == [("there", "back", ports), ("back", "there", ports)]
+    assert list(connections(diagram).edges(data=True)) == [
+        ("there", "back", ports),
+        ("back", "there", ports),
+    ]
     draw_diagram(diagram, tmp_path / "loop.svg")
     words = re.findall(r">([^<]+)</text>", (tmp_path / "loop.svg").read_text())
     assert {"there", "back", "PassThrough", "ZeroOrderHold", "y → u"} <= set(words)

@@ -8,11 +8,20 @@ import pytest
 from drake_clutter import resources
 
 
-def test_results_do_not_make_a_commit_dirty_and_code_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_make_a_commit_dirty_and_code_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def git(*arguments: str) -> None:
-        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments], cwd=tmp_path, check=True)
+        subprocess.run(
+            ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments],
+            cwd=tmp_path,
+            check=True,
+        )
 
-    code, results = tmp_path / "drake_clutter" / "code.py", tmp_path / "training" / "results" / "row.json"
+    code, results = (
+        tmp_path / "drake_clutter" / "code.py",
+        tmp_path / "training" / "results" / "row.json",
+    )
     for file in (code, results):
         file.parent.mkdir(parents=True)
         file.write_text("1")

@@ -91,7 +91,9 @@ def test_a_joint_without_a_limit(tmp_path: Path, taken_out: str, kind: str) -> N
     if kind == "position":
         text = text.replace('elbow_joint" type="revolute"', 'elbow_joint" type="continuous"')
     spec = ros_spec(tmp_path, text)
-    assert message(spec) == (f"robot.limits.{kind}: is missing for joint 'elbow_joint'; allowed is {PLACES}")
+    assert message(spec) == (
+        f"robot.limits.{kind}: is missing for joint 'elbow_joint'; allowed is {PLACES}"
+    )
     given: Any = ((-3.0, 3.0),) * 6 if kind == "position" else (2.0,) * 6
     arm = load_robot(changed(spec, **{f"limits_{kind}": given}))
     assert arm.joint_names[2] == "elbow_joint"
@@ -138,7 +140,9 @@ def test_an_stl_that_is_none(tmp_path: Path) -> None:
     allowed = "is no STL mesh; allowed are OBJ, glTF, VTK and STL"
     assert message(spec) == f"{tmp_path / 'tool.stl'}: {allowed}"
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-    (tmp_path / "tool.stl").write_text(f"solid one\nfacet normal 0 0 1\nouter loop\n{corner}endloop\nendfacet\nendsolid one\n")
+    (tmp_path / "tool.stl").write_text(
+        f"solid one\nfacet normal 0 0 1\nouter loop\n{corner}endloop\nendfacet\nendsolid one\n"
+    )
     assert load_robot(changed(spec, payload=2.0)).num_joints == 6
 
 
@@ -152,10 +156,26 @@ def test_a_gripper_in_the_arms_file() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "expected"),
     [
-        ('xyz="0 0 0.1625"', 'xyz="${height} 0 0"', "Expected 3 values for attribute xyz got ${height} 0 0"),
-        ('lower="-6.2"', 'lower="7"', "condition '(pos_lower_limits.array() <= pos_upper_limits.array()).all()'"),
-        ("</robot>", '<link name="loose"/></robot>', "link 'loose' hangs on no joint; allowed is an arm alone"),
-        ("<limit", '<mimic joint="elbow_joint"/><limit', "joint 'shoulder_pan_joint' mimics another; allowed are joints"),
+        (
+            'xyz="0 0 0.1625"',
+            'xyz="${height} 0 0"',
+            "Expected 3 values for attribute xyz got ${height} 0 0",
+        ),
+        (
+            'lower="-6.2"',
+            'lower="7"',
+            "condition '(pos_lower_limits.array() <= pos_upper_limits.array()).all()'",
+        ),
+        (
+            "</robot>",
+            '<link name="loose"/></robot>',
+            "link 'loose' hangs on no joint; allowed is an arm alone",
+        ),
+        (
+            "<limit",
+            '<mimic joint="elbow_joint"/><limit',
+            "joint 'shoulder_pan_joint' mimics another; allowed are joints",
+        ),
     ],
 )
 def test_a_damaged_arm(tmp_path: Path, before: str, after: str, expected: str) -> None:

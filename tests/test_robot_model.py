@@ -318,6 +318,12 @@ def test_motors_are_in_the_order_of_the_joints_whatever_the_file_s(tmp_path: Pat
         plant = MultibodyPlant(0.001)
         instance = add_robot(plant, arm, visuals=False)
         plant.Finalize()
-        motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices(instance)]
-        assert tuple(motor.joint().name() for motor in motors) == arm.joint_names == robot("iiwa14").joint_names
+        motors = [
+            plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices(instance)
+        ]
+        assert (
+            tuple(motor.joint().name() for motor in motors)
+            == arm.joint_names
+            == robot("iiwa14").joint_names
+        )
         assert [motor.effort_limit() for motor in motors] == arm.torque_limits.tolist()

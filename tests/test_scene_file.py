@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import CATALOGUE, CLASSES, DEFAULT_CELL, TRAY, cell_with, random_scene, resting, rng, scene_of, tray
+from conftest import (
+    CATALOGUE,
+    CLASSES,
+    DEFAULT_CELL,
+    TRAY,
+    cell_with,
+    random_scene,
+    resting,
+    rng,
+    scene_of,
+    tray,
+)
 
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
@@ -24,7 +35,9 @@ def stable_verdict(scene: Scene) -> Verdict:
     generator = rng(1)
     settled = {o.name: o.X_TO.moved(generator.normal(size=3) * 1e-5) for o in scene.objects}
     shares = {name: float(generator.uniform()) for name in scene.names}
-    return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < 0.3))
+    return Verdict(
+        None, settled, shares, tuple(name for name, share in shares.items() if share < 0.3)
+    )
 
 
 def unstable_verdict(scene: Scene) -> Verdict:
@@ -74,13 +87,19 @@ def test_poses_of_every_size_survive(tmp_path: Path) -> None:
     """YAML 1.1 reads 1e-05 as a text; what is written has a point."""
     objects = [
         resting("sugar_box", xy=(x, y), floor=z, name=f"box {index}")
-        for index, (x, y, z) in enumerate([(1e-5, -1e-17, 0), (1e22, 1 / 3, 5e-324), (-1e-300, 0.0, 1e16)])
+        for index, (x, y, z) in enumerate(
+            [(1e-5, -1e-17, 0), (1e22, 1 / 3, 5e-324), (-1e-300, 0.0, 1e16)]
+        )
     ]
-    assert reloaded(tmp_path, scene_of(*objects, side=0.1 + 0.2)).scene == scene_of(*objects, side=0.1 + 0.2)
+    assert reloaded(tmp_path, scene_of(*objects, side=0.1 + 0.2)).scene == scene_of(
+        *objects, side=0.1 + 0.2
+    )
 
 
 def test_a_file_holds_the_cell_that_it_was_made_with(tmp_path: Path) -> None:
-    cell = cell_with("robot.base.x=-0.8", "cameras.overhead.pose.roll=165", "gripper.extension=0.15")
+    cell = cell_with(
+        "robot.base.x=-0.8", "cameras.overhead.pose.roll=165", "gripper.extension=0.15"
+    )
     save_scene(tmp_path / "scene.yaml", SCENE, cell)
     read = load_scene(tmp_path / "scene.yaml", CATALOGUE)
     assert read.cell == cell
@@ -100,8 +119,19 @@ def test_a_file_of_version_1_names_the_tray_alone(tmp_path: Path) -> None:
 
 
 def test_names_are_any_text(tmp_path: Path) -> None:
-    names = ["yes", "1", "a: b", "Dose \N{LATIN SMALL LETTER O WITH DIAERESIS}", "null", "1e-5", "# no", "  spaced  "]
-    scene = scene_of(*(resting("large_marker", xy=(0, 0.03 * k), name=name) for k, name in enumerate(names)))
+    names = [
+        "yes",
+        "1",
+        "a: b",
+        "Dose \N{LATIN SMALL LETTER O WITH DIAERESIS}",
+        "null",
+        "1e-5",
+        "# no",
+        "  spaced  ",
+    ]
+    scene = scene_of(
+        *(resting("large_marker", xy=(0, 0.03 * k), name=name) for k, name in enumerate(names))
+    )
     read = reloaded(tmp_path, scene, stable_verdict(scene))
     assert read.scene.names == tuple(names)
     assert read.verdict == stable_verdict(scene)
@@ -125,7 +155,12 @@ objects:
     assert box.X_TO.quaternion == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
     assert math.hypot(*box.X_TO.quaternion) == pytest.approx(1, abs=1e-15)
     assert Pose((0.2, 0.0, 0.0505)) == can.X_TO
-    assert (read.verdict, read.scene.graph, read.scene.seed, read.scene.derivation) == (None, None, None, ())
+    assert (read.verdict, read.scene.graph, read.scene.seed, read.scene.derivation) == (
+        None,
+        None,
+        None,
+        (),
+    )
     assert read.scene.support == TRAY
     assert read.settled_scene is read.scene or read.settled_scene == read.scene
 
@@ -166,7 +201,9 @@ def written(folder: Path, document: Any) -> Path:
 
 def object_node() -> int:
     """Index of the first object in the graph's list of nodes."""
-    return next(index for index, node in enumerate(DOCUMENT["graph"]["nodes"]) if node["kind"] in CLASSES)
+    return next(
+        index for index, node in enumerate(DOCUMENT["graph"]["nodes"]) if node["kind"] in CLASSES
+    )
 
 
 X_TO: Path_ = ("objects", 0, "X_TO")
@@ -181,7 +218,11 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("tray",), 0.7, "tray: 0.7; allowed is a mapping with side"),
     (("tray",), {"side": 0.7}, "allowed is a tray or a cell"),
     (("cell",), "ur10", "cell: 'ur10'; allowed is a mapping with robot, gripper, support, cameras"),
-    (("cell", "support", "size", 0), 5, "cell.support.size[0]: 5; allowed is a finite number from 0.1 to 2"),
+    (
+        ("cell", "support", "size", 0),
+        5,
+        "cell.support.size[0]: 5; allowed is a finite number from 0.1 to 2",
+    ),
     (("cell", "cameras"), {}, "cell.cameras: {}; allowed is a mapping of at least one entry"),
     (("tray",), {"side": 0}, "tray.side: 0; allowed is a finite number from 0.1 to 2"),
     (("tray",), {"side": math.nan}, "tray.side: nan"),
@@ -191,7 +232,11 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("objects",), None, "objects: None; allowed is a list"),
     (("objects",), {"a": 1}, "objects: {'a': 1}; allowed is a list"),
     (("objects", 0), "box", "objects[0]: 'box'; allowed is a mapping"),
-    (("objects", 1, "class"), "teapot", "objects[1].class: 'teapot'; allowed is one of cracker_box"),
+    (
+        ("objects", 1, "class"),
+        "teapot",
+        "objects[1].class: 'teapot'; allowed is one of cracker_box",
+    ),
     (("objects", 1, "class"), GONE, "objects[1].class: is missing; needed are name, class, X_TO"),
     (("objects", 1, "class"), 3, "objects[1].class: 3; allowed is a text"),
     (("objects", 1, "name"), GONE, "objects[1].name: is missing"),
@@ -199,12 +244,24 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("objects", 1, "name"), None, "objects[1].name: None"),
     (("objects", 1, "name"), "tray", "objects[1].name: 'tray'; allowed is any name but tray"),
     (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is there twice"),
-    (("objects", 1, "colour"), "red", "objects[1].colour: is unknown; allowed are name, class, X_TO, node"),
+    (
+        ("objects", 1, "colour"),
+        "red",
+        "objects[1].colour: is unknown; allowed are name, class, X_TO, node",
+    ),
     (("objects", 1, "node"), "1", "objects[1].node: '1'; allowed is a whole number"),
     (("objects", 1, "node"), True, "objects[1].node: True; allowed is a whole number"),
-    (("objects", 1, "node"), 99, "allowed is a structure node, or the class of the object that names this node"),
+    (
+        ("objects", 1, "node"),
+        99,
+        "allowed is a structure node, or the class of the object that names this node",
+    ),
     (X_TO, GONE, "objects[0].X_TO: is missing"),
-    (X_TO, [0, 0, 0], "objects[0].X_TO: [0, 0, 0]; allowed is a mapping with translation, quaternion"),
+    (
+        X_TO,
+        [0, 0, 0],
+        "objects[0].X_TO: [0, 0, 0]; allowed is a mapping with translation, quaternion",
+    ),
     ((*X_TO, "translation"), GONE, "objects[0].X_TO.translation: is missing"),
     ((*X_TO, "translation"), [0, 0], "X_TO.translation: [0, 0]; allowed is a list of 3 numbers"),
     ((*X_TO, "translation"), [0, 0, 0, 0], "X_TO.translation: [0, 0, 0, 0]"),
@@ -227,7 +284,11 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     ((*NODE, "id"), 0, "allowed is an id that no other node has"),
     ((*NODE, "colour"), 1, "colour: is unknown; allowed are id, kind"),
     (("graph", "edges"), [], "allowed is an acyclic graph in which the tray leads to every node"),
-    ((*EDGE, "kind"), "flat_45", "graph.edges[0].kind: 'flat_45'; allowed is one of primitive, flat_0"),
+    (
+        (*EDGE, "kind"),
+        "flat_45",
+        "graph.edges[0].kind: 'flat_45'; allowed is one of primitive, flat_0",
+    ),
     ((*EDGE, "kind"), 0, "graph.edges[0].kind: 0; allowed is a text"),
     ((*EDGE, "child"), GONE, "graph.edges[0].child: is missing"),
     ((*EDGE, "child"), 99, "joins a node that is not there"),
@@ -240,13 +301,27 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("verdict", "hidden"), ["ghost"], "ghost' is no object"),
     (("verdict", "hidden"), "none", "verdict.hidden: 'none'; allowed is a list"),
     (("verdict", "visible_share", "ghost"), 0.5, "ghost' is no object"),
-    (("verdict", "visible_share", SCENE.names[0]), "all", f"verdict.visible_share.{SCENE.names[0]}: 'all'"),
-    (("verdict", "settled", "ghost"), {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]}, "'ghost' is no object"),
-    (("verdict", "settled", SCENE.names[0]), None, f"verdict.settled.{SCENE.names[0]}: None; allowed is a mapping"),
+    (
+        ("verdict", "visible_share", SCENE.names[0]),
+        "all",
+        f"verdict.visible_share.{SCENE.names[0]}: 'all'",
+    ),
+    (
+        ("verdict", "settled", "ghost"),
+        {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]},
+        "'ghost' is no object",
+    ),
+    (
+        ("verdict", "settled", SCENE.names[0]),
+        None,
+        f"verdict.settled.{SCENE.names[0]}: None; allowed is a mapping",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("path", "value", "message"), REFUSED, ids=[message[:40] for _, _, message in REFUSED])
+@pytest.mark.parametrize(
+    ("path", "value", "message"), REFUSED, ids=[message[:40] for _, _, message in REFUSED]
+)
 def test_a_broken_field_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
     file = written(tmp_path, changed(DOCUMENT, path, value))
     with pytest.raises(InputError) as refusal:
@@ -258,14 +333,32 @@ def test_a_broken_field_is_named(path: Path_, value: Any, message: str, tmp_path
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (("verdict", "instability", "reason"), "bored", "verdict.instability.reason: 'bored'; allowed is one of toppled, slid"),
-        (("verdict", "instability", "tilt"), "much", "verdict.instability.tilt: 'much'; allowed is a finite number"),
-        (("verdict", "instability", "displacement"), math.inf, "verdict.instability.displacement: inf"),
+        (
+            ("verdict", "instability", "reason"),
+            "bored",
+            "verdict.instability.reason: 'bored'; allowed is one of toppled, slid",
+        ),
+        (
+            ("verdict", "instability", "tilt"),
+            "much",
+            "verdict.instability.tilt: 'much'; allowed is a finite number",
+        ),
+        (
+            ("verdict", "instability", "displacement"),
+            math.inf,
+            "verdict.instability.displacement: inf",
+        ),
         (("verdict", "instability", "object"), GONE, "verdict.instability.object: is missing"),
-        (("verdict", "instability"), None, "verdict.instability: allowed is one for an unstable scene"),
+        (
+            ("verdict", "instability"),
+            None,
+            "verdict.instability: allowed is one for an unstable scene",
+        ),
     ],
 )
-def test_a_broken_instability_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
+def test_a_broken_instability_is_named(
+    path: Path_, value: Any, message: str, tmp_path: Path
+) -> None:
     file = written(tmp_path, changed(UNSTABLE, path, value))
     with pytest.raises(InputError) as refusal:
         load_scene(file, CATALOGUE)
@@ -275,12 +368,18 @@ def test_a_broken_instability_is_named(path: Path_, value: Any, message: str, tm
 def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> None:
     """1 mm is allowed, as settled objects press on each other and hand-written poses are rounded."""
     for gap, allowed in ((0.0, True), (-0.0009, True), (-0.0011, False), (-0.020, False)):
-        scene = scene_of(resting("sugar_box", name="below"), resting("pudding_box", floor=0.038 + gap, name="above"))
+        scene = scene_of(
+            resting("sugar_box", name="below"),
+            resting("pudding_box", floor=0.038 + gap, name="above"),
+        )
         save_scene(tmp_path / "scene.yaml", scene, DEFAULT_CELL)
         if allowed:
             assert load_scene(tmp_path / "scene.yaml", CATALOGUE).scene == scene
         else:
-            with pytest.raises(InputError, match=rf"objects: below and above overlap by {-1000 * gap:.1f} mm; allowed is 1 mm"):
+            with pytest.raises(
+                InputError,
+                match=rf"objects: below and above overlap by {-1000 * gap:.1f} mm; allowed is 1 mm",
+            ):
                 load_scene(tmp_path / "scene.yaml", CATALOGUE)
 
 
@@ -394,6 +493,8 @@ def test_a_graph_that_no_derivation_ends_with_is_refused(graph: str, tmp_path: P
 
 def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
     graph = "graph: {nodes: [{id: 0, kind: tray}], edges: []}\n"
-    (path := tmp_path / "scene.yaml").write_text(ONE_BOX.replace("name: a", "name: a, node: 0") + graph)
+    (path := tmp_path / "scene.yaml").write_text(
+        ONE_BOX.replace("name: a", "name: a, node: 0") + graph
+    )
     with pytest.raises(InputError, match="node"):
         load_scene(path, CATALOGUE)

@@ -21,13 +21,38 @@ from drake_clutter.yaml_text import yaml_text
 
 def places(value: Any, at: Path_ = ()) -> Iterator[Path_]:
     """The paths of all values in a document."""
-    for key, item in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+    for key, item in (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    ):
         yield (*at, key)
         yield from places(item, (*at, key))
 
 
 PLACES = list(places(DOCUMENT))
-STRANGE = [GONE, None, True, False, 0, -1, 7, 10**9, 0.5, -0.0, math.nan, math.inf, -math.inf, 1e308, 1e-320, "", "tray", "end"]
+STRANGE = [
+    GONE,
+    None,
+    True,
+    False,
+    0,
+    -1,
+    7,
+    10**9,
+    0.5,
+    -0.0,
+    math.nan,
+    math.inf,
+    -math.inf,
+    1e308,
+    1e-320,
+    "",
+    "tray",
+    "end",
+]
 STRANGE += [
     SCENE.names[0],
     "flat_0",
@@ -53,8 +78,14 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
 @settings(max_examples=400)
-@given(changes=st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE)), min_size=1, max_size=3))
-def test_any_value_anywhere_loads_or_is_refused(fuzzed: Path, changes: list[tuple[Path_, Any]]) -> None:
+@given(
+    changes=st.lists(
+        st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE)), min_size=1, max_size=3
+    )
+)
+def test_any_value_anywhere_loads_or_is_refused(
+    fuzzed: Path, changes: list[tuple[Path_, Any]]
+) -> None:
     document = DOCUMENT
     for path, value in changes:
         try:
@@ -74,7 +105,9 @@ WHOLE = yaml.dump(DOCUMENT, sort_keys=False, default_flow_style=None, width=160)
     taken=st.integers(0, 40),
     inserted=st.text(alphabet="0123456789.-:,[]{}'\"&*!|>%@?#\n\t abcez\x00é", max_size=6),
 )
-def test_any_edit_of_the_text_loads_or_is_refused(fuzzed: Path, start: int, taken: int, inserted: str) -> None:
+def test_any_edit_of_the_text_loads_or_is_refused(
+    fuzzed: Path, start: int, taken: int, inserted: str
+) -> None:
     fuzzed.write_text(WHOLE[:start] + inserted + WHOLE[start + taken :], encoding="utf-8")
     loads_or_is_refused(fuzzed)
 
@@ -83,19 +116,33 @@ POSE = {"translation": [0, 0, 2], "rpy_deg": [180, 0, 0]}
 SCENARIO: dict[str, Any] = {
     "nodes": 25,
     "camera_noise": True,
-    "arm": {"base": [-0.65, 0.0, 0.3, 0.0], "home": [0] * 6, "suction": {"cup_diameter": 0.03}, "payload": 10.0},
+    "arm": {
+        "base": [-0.65, 0.0, 0.3, 0.0],
+        "home": [0] * 6,
+        "suction": {"cup_diameter": 0.03},
+        "payload": 10.0,
+    },
     "world": {
         "camera": {"width": 320, "altitude": 2.0, "hidden_below": 0.2},
         "layout": {"tray_side": 0.5, "stack_gap": 0.02},
-        "cell": {"support": {"wall_height": 0.1}, "cameras": {"overhead": {"pose": POSE, "height": 240}}},
+        "cell": {
+            "support": {"wall_height": 0.1},
+            "cameras": {"overhead": {"pose": POSE, "height": 240}},
+        },
     },
 }
 SCENARIO_PLACES = list(places(SCENARIO))
 
 
 @settings(max_examples=300)
-@given(changes=st.lists(st.tuples(st.sampled_from(SCENARIO_PLACES), st.sampled_from(STRANGE)), max_size=3))
-def test_any_value_anywhere_in_a_config_loads_or_is_refused(fuzzed: Path, changes: list[tuple[Path_, Any]]) -> None:
+@given(
+    changes=st.lists(
+        st.tuples(st.sampled_from(SCENARIO_PLACES), st.sampled_from(STRANGE)), max_size=3
+    )
+)
+def test_any_value_anywhere_in_a_config_loads_or_is_refused(
+    fuzzed: Path, changes: list[tuple[Path_, Any]]
+) -> None:
     document = SCENARIO
     for path, value in changes:
         try:

@@ -17,8 +17,12 @@ SCENES = [random_scene(seed) for seed in (1, 2, 3)]
 def entry(number: int, *, frozen: bool) -> SetScene:
     scene = SCENES[number]
     assert scene.graph is not None
-    poses = tuple(pose.moved((0.001, 0.0, 0.0)) for pose in scene.poses.values()) if frozen else None
-    return SetScene(scene.derivation, canonical_form(scene.graph, CATALOGUE.classes), number, "solvable", poses)
+    poses = (
+        tuple(pose.moved((0.001, 0.0, 0.0)) for pose in scene.poses.values()) if frozen else None
+    )
+    return SetScene(
+        scene.derivation, canonical_form(scene.graph, CATALOGUE.classes), number, "solvable", poses
+    )
 
 
 @pytest.mark.parametrize("frozen", [False, True])
@@ -52,7 +56,9 @@ def test_laid_anew_it_is_the_same_scene_elsewhere() -> None:
     scenes = [lay_anew(derivation, grammar, WORLD, rng(seed)) for seed in (1, 1, 2)]
     for scene in scenes:
         assert scene.names == first.names
-        assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx([o.X_TO.p[2] for o in first.objects])
+        assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx(
+            [o.X_TO.p[2] for o in first.objects]
+        )
     assert scenes[0].poses == scenes[1].poses != scenes[2].poses
 
 
@@ -75,8 +81,16 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
 
 def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
     """Of the sets that are shipped, up to symmetry; and none is there twice."""
-    sets = {path: load_scene_set(path, CATALOGUE) for path in (Path(__file__).parents[1] / "training/scenes").glob("*.json")}
-    learned_from = {scene.form for path, held in sets.items() if path.stem.startswith("train_") for scene in held.scenes}
+    sets = {
+        path: load_scene_set(path, CATALOGUE)
+        for path in (Path(__file__).parents[1] / "training/scenes").glob("*.json")
+    }
+    learned_from = {
+        scene.form
+        for path, held in sets.items()
+        if path.stem.startswith("train_")
+        for scene in held.scenes
+    }
     assert len(learned_from) >= 9000
     for path, held in sets.items():
         forms = {scene.form for scene in held.scenes}

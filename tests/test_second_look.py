@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from drake_clutter.perception.second_look import LEAST, doubtful, halves, possible, surfaces, unexplained
+from drake_clutter.perception.second_look import (
+    LEAST,
+    doubtful,
+    halves,
+    possible,
+    surfaces,
+    unexplained,
+)
 
 SHAPE = (30, 40)
 LEFT, RIGHT = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)

@@ -23,7 +23,11 @@ from drake_clutter.perception.segmentation import (
     points,
     segments,
 )
-from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
+from drake_clutter.perception.segmentation_learning import (
+    SegmentationConfig,
+    SegmentationLearner,
+    example,
+)
 from drake_clutter.resources import shipped_path
 from drake_clutter.scenes.scene import Pose
 
@@ -42,9 +46,14 @@ def picture(number: int) -> LabelledImage:
         patch = slice(row - half, row + half), slice(column - half, column + half)
         depth[patch], label[patch] = 1.6 - height, k
         pixel = (1.6 - height) / CAMERA.focal_length
-        x, y = (column - 0.5 - (CAMERA.width / 2 - 1)) * pixel, -(row - 0.5 - (CAMERA.height / 2 - 1)) * pixel
+        x, y = (
+            (column - 0.5 - (CAMERA.width / 2 - 1)) * pixel,
+            -(row - 0.5 - (CAMERA.height / 2 - 1)) * pixel,
+        )
         poses.append(Pose((x, y, height / 2)))
-    return LabelledImage(np.zeros((120, 160, 3), np.uint8), depth, label, CLASSES, tuple(poses), np.full(2, 100))
+    return LabelledImage(
+        np.zeros((120, 160, 3), np.uint8), depth, label, CLASSES, tuple(poses), np.full(2, 100)
+    )
 
 
 def test_the_window_holds_the_tray() -> None:
@@ -77,7 +86,9 @@ def test_slopes_are_given_and_holes_are_as_high_as_what_is_beside_them() -> None
     points_T[10:14, 20:24, 2] = np.nan
     height, known, along_rows, along_columns = network_input(points_T, None)
     assert not known[12, 22]
-    assert height[12, 22] == pytest.approx(0.5 * 22 * 0.0025 / 0.25), "of the row two below, which is nearest"
+    assert height[12, 22] == pytest.approx(0.5 * 22 * 0.0025 / 0.25), (
+        "of the row two below, which is nearest"
+    )
     assert along_columns[30, 20] == pytest.approx(np.arctan(0.5), abs=1e-3)
     assert along_rows[30, 20] == pytest.approx(0.0, abs=1e-3)
 
@@ -107,8 +118,15 @@ def test_turned_and_mirrored_examples_vote_for_the_same_middles(seed: int) -> No
 
 def test_votes_for_one_place_are_one_object() -> None:
     draw = rng(3)
-    centres = np.array([[0.0, 0.0, 0.02], [0.0, 0.0, 0.06], [0.2, 0.1, 0.02]])  # two lie across each other
-    votes = np.vstack([centre + draw.normal(0, 0.003, (count, 3)) for centre, count in zip(centres, (900, 300, 40), strict=True)])
+    centres = np.array(
+        [[0.0, 0.0, 0.02], [0.0, 0.0, 0.06], [0.2, 0.1, 0.02]]
+    )  # two lie across each other
+    votes = np.vstack(
+        [
+            centre + draw.normal(0, 0.003, (count, 3))
+            for centre, count in zip(centres, (900, 300, 40), strict=True)
+        ]
+    )
     number = gathered(np.vstack([votes, [[0.5, 0.5, 0.5]]]), 0.015, 8)
     assert number[-1] < 0, "one vote is no object"
     assert [len(set(part)) for part in np.split(number[:-1], [900, 1200])] == [1, 1, 1]
@@ -142,11 +160,16 @@ def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_something_else_is_refused() -> None:
     student = shipped_path("training/checkpoints/student.safetensors")
-    with pytest.raises(InputError, match=r"student\.safetensors: is a checkpoint of a student; allowed is one of a detector"):
+    with pytest.raises(
+        InputError,
+        match=r"student\.safetensors: is a checkpoint of a student; allowed is one of a detector",
+    ):
         SegmentationNetwork.load(student)
 
 
-def test_a_warm_start_answers_as_what_it_begins_with_whatever_the_colours_and_other_classes_are() -> None:
+def test_a_warm_start_answers_as_what_it_begins_with_whatever_the_colours_and_other_classes_are() -> (
+    None
+):
     learned = SegmentationNetwork(CLASSES, False).eval()
     network = SegmentationNetwork(("mug", *reversed(CLASSES)), True).eval()
     network.begin_with(learned)

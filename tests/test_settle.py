@@ -19,15 +19,30 @@ from drake_clutter.simulation.settle import Settled, settle
 UPRIGHT = Orientation.UPRIGHT_0
 # Cracker boxes lie 230 mm along x, 60 mm high; a sugar box is 175 mm long, so it overhangs by half when shifted by 115 mm.
 BELOW = resting("cracker_box", name="below")
-STANDING_PAIR = [resting("sugar_box", UPRIGHT, (0.0, y), name=name) for name, y in (("left", -0.039), ("right", 0.039))]
-MARKER_PAIR = [resting("large_marker", xy=(0.0, y), name=name) for name, y in (("left", -0.010), ("right", 0.010))]
+STANDING_PAIR = [
+    resting("sugar_box", UPRIGHT, (0.0, y), name=name)
+    for name, y in (("left", -0.039), ("right", 0.039))
+]
+MARKER_PAIR = [
+    resting("large_marker", xy=(0.0, y), name=name)
+    for name, y in (("left", -0.010), ("right", 0.010))
+]
 
 STABLE: dict[str, list[SceneObject]] = {
     "box on box": [BELOW, resting("sugar_box", floor=0.060, name="above")],
-    "overhang of less than half": [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
-    "a box bridges a standing pair": [*STANDING_PAIR, resting("cracker_box", floor=0.175, name="above")],
+    "overhang of less than half": [
+        BELOW,
+        resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above"),
+    ],
+    "a box bridges a standing pair": [
+        *STANDING_PAIR,
+        resting("cracker_box", floor=0.175, name="above"),
+    ],
     "a marker that lies": [resting("large_marker", name="marker")],
-    "a pair of markers bears a box": [*MARKER_PAIR, resting("gelatin_box", floor=0.018, name="above")],
+    "a pair of markers bears a box": [
+        *MARKER_PAIR,
+        resting("gelatin_box", floor=0.018, name="above"),
+    ],
 }
 FALLING: dict[str, tuple[list[SceneObject], InstabilityReason, str]] = {
     "overhang of more than half": (
@@ -42,13 +57,23 @@ FALLING: dict[str, tuple[list[SceneObject], InstabilityReason, str]] = {
         [resting("large_marker", name="below"), resting("gelatin_box", floor=0.018, name="above")],
         *(InstabilityReason.TOPPLED, "above"),
     ),
-    "a box on its shelf above nothing": ([resting("gelatin_box", floor=0.2, name="above")], InstabilityReason.SLID, "above"),
+    "a box on its shelf above nothing": (
+        [resting("gelatin_box", floor=0.2, name="above")],
+        InstabilityReason.SLID,
+        "above",
+    ),
     "a stack beside the tray": (
-        [resting("cracker_box", xy=(0.6, 0.0), name="a"), resting("sugar_box", xy=(0.6, 0.0), floor=0.060, name="b")],
+        [
+            resting("cracker_box", xy=(0.6, 0.0), name="a"),
+            resting("sugar_box", xy=(0.6, 0.0), floor=0.060, name="b"),
+        ],
         *(InstabilityReason.LEFT_TRAY, "a"),
     ),
     "a tall box beyond the edge of its foot": (
-        [resting("gelatin_box", name="foot"), resting("cracker_box", UPRIGHT, (0.060, 0.0), floor=0.028, name="above")],
+        [
+            resting("gelatin_box", name="foot"),
+            resting("cracker_box", UPRIGHT, (0.060, 0.0), floor=0.028, name="above"),
+        ],
         *(InstabilityReason.TOPPLED, "above"),
     ),
 }
@@ -62,11 +87,15 @@ def test_what_stands(objects: list[SceneObject], judge: DrakeJudge) -> None:
     assert set(verdict.settled) == set(verdict.visible_share) == set(scene.names)
     for o in objects:
         assert np.linalg.norm(verdict.settled[o.name].p - o.X_TO.p) < 0.003
-    assert [name for name, share in verdict.visible_share.items() if share < 0.30] == list(verdict.hidden)
+    assert [name for name, share in verdict.visible_share.items() if share < 0.30] == list(
+        verdict.hidden
+    )
 
 
 @pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
-def test_what_falls(objects: list[SceneObject], reason: InstabilityReason, name: str, judge: DrakeJudge) -> None:
+def test_what_falls(
+    objects: list[SceneObject], reason: InstabilityReason, name: str, judge: DrakeJudge
+) -> None:
     verdict = judge.judge(scene_of(*objects), rng())
     assert verdict.instability is not None
     assert (verdict.instability.reason, verdict.instability.object) == (reason, name)
@@ -74,14 +103,19 @@ def test_what_falls(objects: list[SceneObject], reason: InstabilityReason, name:
     assert (verdict.visible_share, verdict.hidden) == ({}, ())
     start = next(o for o in objects if o.name == name)
     moved = np.linalg.norm(verdict.settled[name].p - start.X_TO.p)
-    assert verdict.instability.displacement == pytest.approx(moved, abs=0.0011)  # the random offset comes before
+    assert verdict.instability.displacement == pytest.approx(
+        moved, abs=0.0011
+    )  # the random offset comes before
     limits = SettleConfig()
-    assert verdict.instability.displacement >= limits.max_displacement or verdict.instability.tilt >= math.radians(
-        limits.max_tilt_deg
+    assert (
+        verdict.instability.displacement >= limits.max_displacement
+        or verdict.instability.tilt >= math.radians(limits.max_tilt_deg)
     )
 
 
-def test_the_same_rng_gives_the_same_poses_bit_for_bit(config: ClutterConfig, judge: DrakeJudge) -> None:
+def test_the_same_rng_gives_the_same_poses_bit_for_bit(
+    config: ClutterConfig, judge: DrakeJudge
+) -> None:
     scene = scene_of(*STABLE["box on box"], resting("large_marker", xy=(0.2, 0.2), name="marker"))
     verdict = judge.judge(scene, rng(3))
     assert judge.judge(scene, rng(3)) == verdict
@@ -94,7 +128,10 @@ def test_an_object_on_its_own_settles_alike_wherever_it_stands(config: ClutterCo
     ended = []
     for order in (places, places[::-1]):
         judge = DrakeJudge(config)
-        verdicts = {xy: judge.judge(scene_of(resting("sugar_box", UPRIGHT, xy, name="box")), rng(1)) for xy in order}
+        verdicts = {
+            xy: judge.judge(scene_of(resting("sugar_box", UPRIGHT, xy, name="box")), rng(1))
+            for xy in order
+        }
         ended.append({xy: verdict.settled["box"] for xy, verdict in verdicts.items()})
     assert ended[0] == ended[1]  # whichever place was simulated
     offsets = {xy: np.subtract(pose.translation[:2], xy) for xy, pose in ended[0].items()}
@@ -165,11 +202,26 @@ def test_the_first_stack_that_falls_decides(judge: DrakeJudge) -> None:
 def test_not_at_rest() -> None:
     """A box in free fall for 0.1 s moves at 1 m/s; with limits that wide, it has not fallen over: it is still moving."""
     config = SettleConfig(max_time=0.1, max_displacement=1.0)
-    result = settle([resting("sugar_box", floor=0.2, name="box"), resting("large_marker", xy=(0, 0.2), name="m")], TRAY, config)
+    result = settle(
+        [
+            resting("sugar_box", floor=0.2, name="box"),
+            resting("large_marker", xy=(0, 0.2), name="m"),
+        ],
+        TRAY,
+        config,
+    )
     assert result.instability is not None
-    assert (result.instability.reason, result.instability.object) == (InstabilityReason.NOT_AT_REST, "box")
-    steps, dt = 51, config.time_step  # it looks half a step after 0.1 s, when the step that began at 0.1 s is done
-    assert result.instability.displacement == pytest.approx(9.81 * dt**2 * steps * (steps + 1) / 2, rel=1e-3)  # implicit Euler
+    assert (result.instability.reason, result.instability.object) == (
+        InstabilityReason.NOT_AT_REST,
+        "box",
+    )
+    steps, dt = (
+        51,
+        config.time_step,
+    )  # it looks half a step after 0.1 s, when the step that began at 0.1 s is done
+    assert result.instability.displacement == pytest.approx(
+        9.81 * dt**2 * steps * (steps + 1) / 2, rel=1e-3
+    )  # implicit Euler
     assert result.instability.tilt == pytest.approx(0.0, abs=1e-6)
 
 
@@ -179,8 +231,15 @@ def test_the_end_comes_when_all_are_calm_or_still() -> None:
     assert calm.instability is None
     assert calm.motion[-1].time == pytest.approx(0.2)  # four calm samples
     still = settle([box], TRAY, SettleConfig(max_time=0.8, calm_samples=100), record=True)
-    assert still.motion[-1].time == pytest.approx(0.5), "half a second in which nothing left its place"
-    patient = settle([box], TRAY, SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0), record=True)
+    assert still.motion[-1].time == pytest.approx(0.5), (
+        "half a second in which nothing left its place"
+    )
+    patient = settle(
+        [box],
+        TRAY,
+        SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0),
+        record=True,
+    )
     assert patient.motion[-1].time == pytest.approx(0.8)
 
 
@@ -235,9 +294,14 @@ def test_tilt_between(class_name: str, axis: str, degrees: float, tilt: float) -
     start = resting(class_name, Orientation.FLAT_30).X_TO
     turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     end = Pose.of(start.rotation @ turn, (1.0, 2.0, 3.0))
-    assert math.degrees(tilt_between(CLASSES[class_name], start, end)) == pytest.approx(tilt, abs=1e-5)
+    assert math.degrees(tilt_between(CLASSES[class_name], start, end)) == pytest.approx(
+        tilt, abs=1e-5
+    )
 
 
 def test_an_instability_says_what_happened() -> None:
-    assert str(Instability(InstabilityReason.TOPPLED, "can_3", 0.0123, math.radians(20))) == "can_3 toppled (12 mm, 20 deg)"
+    assert (
+        str(Instability(InstabilityReason.TOPPLED, "can_3", 0.0123, math.radians(20)))
+        == "can_3 toppled (12 mm, 20 deg)"
+    )
     assert not Verdict(Instability(InstabilityReason.SLID, "a", 0.02, 0.0), {}, {}, ()).stable

@@ -24,7 +24,9 @@ from drake_clutter.validation import load_typed
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory: pytest.TempPathFactory) -> ClutterConfig:
     """The shelf of docs/work_cell.md."""
-    (text,) = (b.text for b in blocks(ROOT / "docs/work_cell.md", "yaml") if "wall_height" in b.text)
+    (text,) = (
+        b.text for b in blocks(ROOT / "docs/work_cell.md", "yaml") if "wall_height" in b.text
+    )
     path: Path = tmp_path_factory.mktemp("shelf") / "shelf.yaml"
     path.write_text(text, encoding="utf-8")
     return load_config(path)
@@ -78,7 +80,9 @@ def test_what_slides_out_of_the_open_side_has_left(shelf: ClutterConfig) -> None
 
 
 def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
-    scene = Scene((resting("pudding_box"), resting("sugar_box", xy=(0.0, 0.25))), shelf.cell.support)
+    scene = Scene(
+        (resting("pudding_box"), resting("sugar_box", xy=(0.0, 0.25))), shelf.cell.support
+    )
     observation = LabelDetector(shelf.cell.camera).look(scene).observation
     for o in scene.objects:
         places = free_places(observation, Move(o.name), shelf.exploration)
@@ -88,8 +92,12 @@ def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
             assert (np.abs(placed[1].apply(placed[0])[:, :2]) < shelf.cell.support.half_size).all()
 
 
-@pytest.mark.parametrize(("board", "result"), [(0.80, MoveResult.PLACED), (0.45, MoveResult.NOT_PLANNED)])
-def test_the_arm_reaches_in_or_says_why_not(shelf: ClutterConfig, board: float, result: MoveResult) -> None:
+@pytest.mark.parametrize(
+    ("board", "result"), [(0.80, MoveResult.PLACED), (0.45, MoveResult.NOT_PLANNED)]
+)
+def test_the_arm_reaches_in_or_says_why_not(
+    shelf: ClutterConfig, board: float, result: MoveResult
+) -> None:
     """Under the high board a box is moved; a low one leaves the arm no room."""
     world = load_typed(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
     picked = resting("pudding_box", xy=(-0.05, 0.1))

@@ -13,7 +13,16 @@ import torch
 from conftest import rng, training_script
 
 from drake_clutter.agents.generation import make_generation_agent
-from drake_clutter.agents.soft_q import Replay, SoftQConfig, SoftQLearner, aims, chances, play, soft_value, softmax_choice
+from drake_clutter.agents.soft_q import (
+    Replay,
+    SoftQConfig,
+    SoftQLearner,
+    aims,
+    chances,
+    play,
+    soft_value,
+    softmax_choice,
+)
 from drake_clutter.assets import build_assets
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
@@ -44,7 +53,9 @@ def test_the_soft_value() -> None:
     values = torch.tensor([[1.0, 2.0, 5.0], [1.0, 1.0, 1.0]])
     mask = torch.tensor([[True, True, False], [False, False, False]])
     expected = 0.5 * np.log((np.exp(2.0) + np.exp(4.0)) / 2)
-    torch.testing.assert_close(soft_value(values, mask, 0.5), torch.tensor([expected, 0.0], dtype=torch.float32))
+    torch.testing.assert_close(
+        soft_value(values, mask, 0.5), torch.tensor([expected, 0.0], dtype=torch.float32)
+    )
 
 
 def test_aims_by_hand() -> None:
@@ -57,14 +68,22 @@ def test_aims_by_hand() -> None:
     v1 = 0.5 * np.log((np.exp(1.0) + np.exp(2.0) + np.exp(0.0)) / 3)
     second = 0.2 + 1.0  # the third state has one feasible action
     policy = float(np.exp((0.0 - v1) / 0.5)) / 3
-    for trace, chance, passed_on in ((0.0, 0.3, 0.0), (0.5, policy / 2, 0.5), (1.0, policy, 1.0), (1.0, 4 * policy, 0.25)):
+    for trace, chance, passed_on in (
+        (0.0, 0.3, 0.0),
+        (0.5, policy / 2, 0.5),
+        (1.0, policy, 1.0),
+        (1.0, 4 * policy, 0.25),
+    ):
         found = aims(values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace)
         expected = [[0.1 + v1 + passed_on * (second - 0.0), second], [0.1, second]]
         torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
 
 
 def test_chances_are_those_of_the_choice() -> None:
-    values, mask = np.array([[0.3, 0.1, 0.7, 9.0]], np.float32), np.array([[True, True, True, False]])
+    values, mask = (
+        np.array([[0.3, 0.1, 0.7, 9.0]], np.float32),
+        np.array([[True, True, True, False]]),
+    )
     given = [chances(values, mask, np.array([action]), 0.2)[0] for action in range(3)]
     expected = np.exp(values[0, :3] / 0.2) / np.exp(values[0, :3] / 0.2).sum()
     assert given == pytest.approx(expected.tolist())
@@ -76,7 +95,11 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
     draw, seen = rng(0), set[int]()
     assert replay.draw(3, 4, draw) is None
     for moment in range(40):  # the ring of 15 is filled more than twice
-        step = {name: np.repeat(array[None], 4, axis=0) for name, array in example.items() if name in replay.arrays}
+        step = {
+            name: np.repeat(array[None], 4, axis=0)
+            for name, array in example.items()
+            if name in replay.arrays
+        }
         numbers = 10 * moment + np.arange(4)
         replay.add(
             **step,
@@ -101,7 +124,15 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
 
 def test_a_small_grammar_is_learned() -> None:
     """Graphs of five nodes hold at most three objects in a tower, of which two are hidden."""
-    config = SoftQConfig(steps=8_000, environments=16, batch=64, steps_per_update=8, replay=8_000, warm_up=500, temperature=0.02)
+    config = SoftQConfig(
+        steps=8_000,
+        environments=16,
+        batch=64,
+        steps_per_update=8,
+        replay=8_000,
+        warm_up=500,
+        temperature=0.02,
+    )
 
     def environment() -> ClutterGeneration:
         return ClutterGeneration(task=GenerationTask(nodes=5))
@@ -109,7 +140,14 @@ def test_a_small_grammar_is_learned() -> None:
     learner = SoftQLearner(environment, config, 0, CPU)
 
     def mean_score(temperature: float) -> float:
-        return float(np.mean([episode.score for episode in play(learner.network, environment, 100, temperature, 7)]))
+        return float(
+            np.mean(
+                [
+                    episode.score
+                    for episode in play(learner.network, environment, 100, temperature, 7)
+                ]
+            )
+        )
 
     by_chance = mean_score(1e6)
     while learner.step < config.steps:
@@ -151,8 +189,20 @@ def test_the_seed_decides() -> None:
     assert not torch.equal(trained(1), trained(2))
 
 
-SETTINGS = ["task.nodes=6", "learning.steps=480", "learning.environments=4", "learning.batch=16", "learning.warm_up=60"]
-SETTINGS += ["learning.replay=300", "learning.width=8", "evaluate_every=160", "evaluation_scenes=8", "save_every=80"]
+SETTINGS = [
+    "task.nodes=6",
+    "learning.steps=480",
+    "learning.environments=4",
+    "learning.batch=16",
+    "learning.warm_up=60",
+]
+SETTINGS += [
+    "learning.replay=300",
+    "learning.width=8",
+    "evaluate_every=160",
+    "evaluation_scenes=8",
+    "save_every=80",
+]
 
 
 def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> None:
@@ -166,12 +216,18 @@ def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> 
         time.sleep(0.02)
     killed.kill()
     killed.wait()
-    (tmp_path / "killed" / "generator.safetensors").unlink(missing_ok=True)  # if the kill came too late
+    (tmp_path / "killed" / "generator.safetensors").unlink(
+        missing_ok=True
+    )  # if the kill came too late
     train.main(tmp_path / "killed", settings=SETTINGS)
-    whole, again = (load_checkpoint(tmp_path / name / "generator.safetensors") for name in ("whole", "killed"))
+    whole, again = (
+        load_checkpoint(tmp_path / name / "generator.safetensors") for name in ("whole", "killed")
+    )
     assert whole.weights.keys() == again.weights.keys()
     assert all(torch.equal(whole.weights[name], again.weights[name]) for name in whole.weights)
-    histories = [json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")]
+    histories = [
+        json.loads((tmp_path / name / "history.json").read_text()) for name in ("whole", "killed")
+    ]
     assert [row["step"] for row in histories[0]] == [row["step"] for row in histories[1]]
     assert [row["score"] for row in histories[0]] == [row["score"] for row in histories[1]]
     assert whole.about["metrics"]["step"] == 480
@@ -179,8 +235,21 @@ def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> 
         train.main(tmp_path / "whole", settings=[*SETTINGS, "seed=1"])
 
 
-REFUSED = ["evaluate_every=0", "evaluation_scenes=0", "save_every=0", "task.nodes=2", "warm_start=1", "learning.steps=many"]
-REFUSED += ["learning.halve_every=0", "learning.segment=0", "learning.width=0", "learning.trace=1.5", "learning.target_rate=2"]
+REFUSED = [
+    "evaluate_every=0",
+    "evaluation_scenes=0",
+    "save_every=0",
+    "task.nodes=2",
+    "warm_start=1",
+    "learning.steps=many",
+]
+REFUSED += [
+    "learning.halve_every=0",
+    "learning.segment=0",
+    "learning.width=0",
+    "learning.trace=1.5",
+    "learning.target_rate=2",
+]
 REFUSED += ["learning.replay=35"]
 
 
@@ -193,12 +262,17 @@ def test_what_no_training_can_do_is_refused(setting: str, tmp_path: Path) -> Non
 
 
 def test_a_warm_start_of_another_width_is_refused() -> None:
-    narrow, wide = (SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12))
+    narrow, wide = (
+        SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12)
+    )
     with pytest.raises(InputError, match=r"learning\.width: 12"):
         wide.begin_with(narrow.network)
     other = SoftQLearner(small_environment, SMALL, 1, CPU)
     other.begin_with(narrow.network)
-    assert all(torch.equal(mine, theirs) for mine, theirs in zip(state_of(other), state_of(narrow), strict=True))
+    assert all(
+        torch.equal(mine, theirs)
+        for mine, theirs in zip(state_of(other), state_of(narrow), strict=True)
+    )
 
 
 def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
@@ -206,15 +280,28 @@ def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
     folder = tmp_path / "own"
     folder.mkdir()
     brick = "  brick: {shape: box, size_mm: [60, 100, 40], mass_g: 300}\n"
-    (folder / "catalogue.yaml").write_text(f"classes:\n{brick}object_sets:\n  mine: [sugar_box, tomato_soup_can, brick]\n")
+    (folder / "catalogue.yaml").write_text(
+        f"classes:\n{brick}object_sets:\n  mine: [sugar_box, tomato_soup_can, brick]\n"
+    )
     build_assets(folder)
     train = training_script("train_generator")
     train.main(tmp_path / "first", settings=SETTINGS)
-    own = [*SETTINGS, f"catalogue={folder}", "objects=mine", f"warm_start={tmp_path / 'first/generator.safetensors'}"]
+    own = [
+        *SETTINGS,
+        f"catalogue={folder}",
+        "objects=mine",
+        f"warm_start={tmp_path / 'first/generator.safetensors'}",
+    ]
     train.main(tmp_path / "second", settings=own)
-    agent = make_generation_agent(str(tmp_path / "second" / "generator.safetensors"), ClutterConfig())
+    agent = make_generation_agent(
+        str(tmp_path / "second" / "generator.safetensors"), ClutterConfig()
+    )
     grammar = SceneGrammar(load_catalogue(folder).object_set("mine"))
-    kinds = [kind for seed in range(10) for kind in agent.derive(grammar, NodeBudget(6), rng(seed)).graph.kinds()]
+    kinds = [
+        kind
+        for seed in range(10)
+        for kind in agent.derive(grammar, NodeBudget(6), rng(seed)).graph.kinds()
+    ]
     assert any("brick" in kind for kind in kinds)
 
 

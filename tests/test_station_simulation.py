@@ -51,7 +51,9 @@ def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
     """X_TL of the arm's links by name; the cup gives way on its bellows, and is left out."""
     plant, context = simulation.station.plant, simulation.plant_context
     return {
-        f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_of(body.EvalPoseInWorld(context))
+        f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_of(
+            body.EvalPoseInWorld(context)
+        )
         for body in simulation.station.arm.bodies
         if body.name() != "cup"
     }
@@ -108,7 +110,9 @@ def test_one_plan_after_the_other() -> None:
     assert simulation.finished == 2
     assert second.poses["pudding_box"].p[:2] == pytest.approx(place.p[:2], abs=0.003)
     assert 0 < second.motion[0].time <= 2 * STEP
-    assert second.motion[-1].time == pytest.approx(second.time - simulation.executor_state.start_time)
+    assert second.motion[-1].time == pytest.approx(
+        second.time - simulation.executor_state.start_time
+    )
 
 
 def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
@@ -167,7 +171,8 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
     path.write_text(STATIC)
     names = ("post", "other", "ur10", "epick")
     posts = tuple(
-        Fixture(name=name, model=str(path), pose=PoseSpec(translation=(0.6, 0.3 * k, 0.25))) for k, name in enumerate(names)
+        Fixture(name=name, model=str(path), pose=PoseSpec(translation=(0.6, 0.3 * k, 0.25)))
+        for k, name in enumerate(names)
     )
     around = ClearanceScene(CELL.model_copy(update={"fixtures": posts}), [])
     near = around.close(np.array(CELL.robot.home), 3.0)
@@ -176,14 +181,18 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
     nailed = tmp_path / "nailed.urdf"
     joint = '<link name="world"/><joint name="nail" type="fixed"><parent link="world"/><child link="top"/></joint>'
     nailed.write_text(BOARD.format(joint))
-    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"):
+    with pytest.raises(
+        InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"
+    ):
         ClearanceScene(with_board(nailed, 0.3), [])
 
 
 def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "door.urdf"
     path.write_text(BOARD.format(FLAP.format("revolute")))
-    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .* has parts that move; allowed"):
+    with pytest.raises(
+        InputError, match=r"fixtures\.shelf\.model: .* has parts that move; allowed"
+    ):
         StationSimulation(with_board(path, 0.3), SCENE)
     with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .*allowed is an SDF or URDF"):
         StationSimulation(with_board(tmp_path / "none.urdf", 0.3), SCENE)

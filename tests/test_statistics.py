@@ -23,7 +23,9 @@ def test_wilson_interval(successes: int, count: int, low: float, high: float) ->
 
 def test_mean_interval() -> None:
     """Standard deviation 2, so the mean of four is known to 1.96 * 2 / 2."""
-    assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx((2.7320508 - 1.959964, 2.7320508 + 1.959964))
+    assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx(
+        (2.7320508 - 1.959964, 2.7320508 + 1.959964)
+    )
     assert mean_interval([3.0]) is None
     assert mean_interval([]) is None
 

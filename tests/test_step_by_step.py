@@ -26,20 +26,37 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
             [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
             {"below": 115 - 95 * 514 / (514 + 411), "above": 20.0},
         ),
-        ([BELOW, resting("sugar_box", xy=(0.0, 0.077), floor=0.060, name="above")], {"below": 37.2, "above": 3.0}),
+        (
+            [BELOW, resting("sugar_box", xy=(0.0, 0.077), floor=0.060, name="above")],
+            {"below": 37.2, "above": 3.0},
+        ),
         # 5 mm and 20 mm beyond the edge: no contact elsewhere makes up for it.
-        ([BELOW, resting("sugar_box", xy=(0.120, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -5.0}),
-        ([BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="above")], {"below": -30.0, "above": -20.0}),
-        ([resting("cracker_box", name="a"), resting("gelatin_box", xy=(0.2, 0.2), name="b")], {"a": 80.0, "b": 36.5}),
+        (
+            [BELOW, resting("sugar_box", xy=(0.120, 0.0), floor=0.060, name="above")],
+            {"below": -30.0, "above": -5.0},
+        ),
+        (
+            [BELOW, resting("sugar_box", xy=(0.135, 0.0), floor=0.060, name="above")],
+            {"below": -30.0, "above": -20.0},
+        ),
+        (
+            [resting("cracker_box", name="a"), resting("gelatin_box", xy=(0.2, 0.2), name="b")],
+            {"a": 80.0, "b": 36.5},
+        ),
         ([resting("cereal_box_large", name="a")], {"a": 97.5}),
-        ([resting("tomato_soup_can", name="a")], {"a": 33.0 * math.cos(math.pi / 16)}),  # of 16 corners
+        (
+            [resting("tomato_soup_can", name="a")],
+            {"a": 33.0 * math.cos(math.pi / 16)},
+        ),  # of 16 corners
         ([resting("large_marker", name="a")], {"a": 6.0}),  # its strip
     ],
 )
 def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
     found = FAST.margins(scene_of(*objects))
     assert not isinstance(found, CannotJudge)
-    assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(margins, abs=0.11)
+    assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(
+        margins, abs=0.11
+    )
 
 
 def test_what_rolls_has_no_margin() -> None:
@@ -48,11 +65,19 @@ def test_what_rolls_has_no_margin() -> None:
     assert min(margins.values()) < MARGIN
 
 
-COUNTERWEIGHT = scene_of(BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight"))
+COUNTERWEIGHT = scene_of(
+    BELOW, TOO_FAR, resting("granola_box", xy=(0.05, 0.0), floor=0.098, name="weight")
+)
 BRIDGE = scene_of(*STANDING_PAIR, resting("cracker_box", floor=0.175, name="bridge"))
 TWO_STACKS = scene_of(
-    *(resting("cracker_box", xy=(0.0, -0.2), name="a"), resting("sugar_box", xy=(0.0, -0.2), floor=0.060, name="b")),
-    *(resting("cracker_box", xy=(0.0, 0.2), name="c"), resting("sugar_box", xy=(0.0, 0.2), floor=0.060, name="d")),
+    *(
+        resting("cracker_box", xy=(0.0, -0.2), name="a"),
+        resting("sugar_box", xy=(0.0, -0.2), floor=0.060, name="b"),
+    ),
+    *(
+        resting("cracker_box", xy=(0.0, 0.2), name="c"),
+        resting("sugar_box", xy=(0.0, 0.2), floor=0.060, name="d"),
+    ),
     resting("gelatin_box", xy=(0.0, -0.2), floor=0.098, name="e"),
 )
 
@@ -98,7 +123,9 @@ def test_only_an_object_of_the_scene_can_be_taken() -> None:
         (BRIDGE, {"left": {TRAY}, "right": {TRAY}, "bridge": {"left", "right"}}),
         # Its lower side is level with the marker's top within 2 mm, but the marker is beside it.
         (
-            scene_of(resting("large_marker", name="m"), resting("gelatin_box", xy=(0.0, 0.06), name="g")),
+            scene_of(
+                resting("large_marker", name="m"), resting("gelatin_box", xy=(0.0, 0.06), name="g")
+            ),
             {"m": {TRAY}, "g": {TRAY}},
         ),
         (
@@ -135,7 +162,9 @@ def test_what_only_its_load_holds_down_is_fixed() -> None:
     assert FAST.never_movable(HELD_DOWN) == frozenset({"foot", "held", "weight"})
     assert FAST.never_movable(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
     beside = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.25, -0.25), name="beside"))
-    on_top = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top"))
+    on_top = scene_of(
+        *HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top")
+    )
     for scene in (beside, on_top):
         assert FAST.stability(scene) is None
         assert FAST.never_movable(scene) == frozenset({"foot", "held", "weight"})
@@ -143,7 +172,9 @@ def test_what_only_its_load_holds_down_is_fixed() -> None:
 
 def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
     """A weight of 140 mm leaves strips of a box of 160 mm free over the foot: something may press there when it goes."""
-    narrower = scene_of(*HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight"))
+    narrower = scene_of(
+        *HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight")
+    )
     assert FAST.stability(narrower) is None
     assert FAST.losing_support(narrower, "weight") == ("held",)
     assert FAST.never_movable(narrower) == frozenset()
@@ -151,31 +182,45 @@ def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
 
 def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
     """A class without assets, which the fast judge does not need."""
-    return ObjectClass(name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere"))
+    return ObjectClass(
+        name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere")
+    )
 
 
 def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64]) -> Scene:
     """Two boxes, each with its middle beyond a foot of 20 mm x 90 mm, and over the gap between them what holds them down."""
-    foot = SceneObject("foot", block("foot", Shape.BOX, (0.09, 0.02, 0.10), 0.2), Pose((0.0, 0.0, 0.05)))
-    pair = [resting("gelatin_box", xy=(0.0, s * 0.0375), floor=0.10, name=f"half {s}") for s in (-1, 1)]
+    foot = SceneObject(
+        "foot", block("foot", Shape.BOX, (0.09, 0.02, 0.10), 0.2), Pose((0.0, 0.0, 0.05))
+    )
+    pair = [
+        resting("gelatin_box", xy=(0.0, s * 0.0375), floor=0.10, name=f"half {s}") for s in (-1, 1)
+    ]
     half = float(np.abs(R_TO[2] * np.array(class_of_load.size)).sum()) / 2
-    return scene_of(foot, *pair, SceneObject("load", class_of_load, Pose.of(R_TO, (0.0, 0.0, 0.128 + half))))
+    return scene_of(
+        foot, *pair, SceneObject("load", class_of_load, Pose.of(R_TO, (0.0, 0.0, 0.128 + half)))
+    )
 
 
 def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
     """A heavy roll over the gap covers what is free over the foot, and when one of the pair goes, nothing keeps it up: what can
     be put on it presses on its top, over the gap. On a flat load something could be put down first, over the other half."""
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    rolled = a_pair_on_a_narrow_foot(block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying)
+    rolled = a_pair_on_a_narrow_foot(
+        block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying
+    )
     assert FAST.stability(rolled) is None
     assert FAST.never_movable(rolled) == frozenset(rolled.names)
     flat = a_pair_on_a_narrow_foot(block("bar", Shape.BOX, (0.12, 0.018, 0.018), 3.0), np.eye(3))
     assert FAST.stability(flat) is None
     assert FAST.never_movable(flat) == frozenset()
-    assert all(FAST.losing_support(flat, name) for name in flat.names)  # though as it is, nothing can be taken
+    assert all(
+        FAST.losing_support(flat, name) for name in flat.names
+    )  # though as it is, nothing can be taken
 
 
-@pytest.mark.parametrize("scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())])
+@pytest.mark.parametrize(
+    "scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())]
+)
 def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
     assert FAST.never_movable(scene) == frozenset()
 
@@ -202,8 +247,13 @@ def test_a_tower_comes_apart_from_the_top() -> None:
 def test_what_holds_each_other_down_does_not_come_apart() -> None:
     """Two sugar boxes side by side on a can, 12.5 mm too far out to stay by themselves: two cracker boxes keep them down."""
     can = resting("tomato_soup_can", name="can")
-    leaning = [resting("sugar_box", xy=(0.0, side * 0.0455), floor=0.101, name=f"sugar{side}") for side in (-1, 1)]
-    load = [resting("cracker_box", floor=0.101 + 0.038 + k * 0.060, name=f"load{k}") for k in (0, 1)]
+    leaning = [
+        resting("sugar_box", xy=(0.0, side * 0.0455), floor=0.101, name=f"sugar{side}")
+        for side in (-1, 1)
+    ]
+    load = [
+        resting("cracker_box", floor=0.101 + 0.038 + k * 0.060, name=f"load{k}") for k in (0, 1)
+    ]
     held = scene_of(can, *leaning, *load)
     assert FAST.stability(held) is None
     assert FAST.comes_apart(held) is False

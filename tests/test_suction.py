@@ -27,12 +27,17 @@ def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
 def test_a_flat_face_seals() -> None:
     box, can = CLASSES["cracker_box"], CLASSES["tomato_soup_can"]
     assert unevenness(box, on_top(0.115), CUP.cup_diameter) == pytest.approx(0.0, abs=1e-12)
-    assert unevenness(can, on_top(0.0505, x=0.033 - 0.0130), CUP.cup_diameter) == pytest.approx(0.0, abs=1e-12)
+    assert unevenness(can, on_top(0.0505, x=0.033 - 0.0130), CUP.cup_diameter) == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 def test_an_edge_does_not() -> None:
     """The rim of a can, and a face narrower than the cup."""
-    assert unevenness(CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter) == math.inf
+    assert (
+        unevenness(CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter)
+        == math.inf
+    )
     onto_side = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]]).T  # 28 mm deep
     narrow = RigidTransform(RotationMatrix(onto_side), [0.0, 0.0425, 0.0])
     assert unevenness(CLASSES["gelatin_box"], narrow, 0.030) == math.inf
@@ -40,11 +45,15 @@ def test_an_edge_does_not() -> None:
 
 def test_tilt_and_curvature_show_in_millimetres() -> None:
     """A plane tilted by a across a ring of diameter d: d * tan(a). A cylinder of radius r: r - sqrt(r^2 - (d / 2)^2)."""
-    found = unevenness(CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.cup_diameter)
+    found = unevenness(
+        CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.cup_diameter
+    )
     assert found == pytest.approx(CUP.cup_diameter * math.tan(math.radians(5)), rel=1e-6)
     side = RigidTransform(ALONG_MINUS_X, [0.033, 0.0, 0.0])
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
-    assert unevenness(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(sagitta, rel=0.1)  # of a prism of 32 sides
+    assert unevenness(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(
+        sagitta, rel=0.1
+    )  # of a prism of 32 sides
 
 
 def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
@@ -52,7 +61,9 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
 
     def seals(diameter: float) -> bool:
         for o in load_catalogue().object_set("pantry14"):
-            for axis in range(3) if o.shape is Shape.BOX else [2] if o.only_rest is Rest.UPRIGHT else []:
+            for axis in (
+                range(3) if o.shape is Shape.BOX else [2] if o.only_rest is Rest.UPRIGHT else []
+            ):
                 z = -np.eye(3)[axis]
                 x = np.eye(3)[(axis + 1) % 3]
                 R = RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
@@ -61,7 +72,11 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
                     return False
         return True
 
-    assert [d for d in (0.015, 0.020, 0.025, 0.030, 0.040, 0.055) if seals(d)] == [0.015, 0.020, CUP.cup_diameter]
+    assert [d for d in (0.015, 0.020, 0.025, 0.030, 0.040, 0.055) if seals(d)] == [
+        0.015,
+        0.020,
+        CUP.cup_diameter,
+    ]
 
 
 def test_a_marker_cannot_be_held() -> None:
@@ -80,7 +95,9 @@ def test_shares_of_a_load_by_hand() -> None:
     assert CUP.load_ratio(zero, np.array([0.0, CUP.pull * 0.0125 / 2, 0.0])) == pytest.approx(1.0)
     assert CUP.load_ratio(np.array([CUP.friction * CUP.pull, 0.0, 0.0]), zero) == pytest.approx(1.0)
     assert CUP.load_ratio(np.array([0.0, 0.0, -5.0]), zero) == 0.0, "pressed on"
-    assert CUP.load_ratio(np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))) == pytest.approx(np.array([10, 20]) / CUP.pull)
+    assert CUP.load_ratio(np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))) == pytest.approx(
+        np.array([10, 20]) / CUP.pull
+    )
 
 
 def test_what_hangs_still_pulls_with_its_weight() -> None:
@@ -94,7 +111,9 @@ def test_accelerations_that_a_grasp_bears() -> None:
     low = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.0]))
     high = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.15]))
     assert 0 < high < low
-    share = CUP.load_ratio(*carried_load(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0])))
+    share = CUP.load_ratio(
+        *carried_load(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
+    )
     assert 0.8 / CUP.safety < share <= 1.001 / CUP.safety
     assert CUP.max_acceleration(CUP.pull / GRAVITY, np.zeros(3)) == -1.0
 

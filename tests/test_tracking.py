@@ -17,14 +17,18 @@ CAN = "tomato_soup_can"
 
 
 def at(x: float, y: float, name: str = CAN) -> SceneObject:
-    return SceneObject(name, CLASSES[name.rsplit("_", 1)[0] if name[-1].isdigit() else name], Pose((x, y, 0.05)))
+    return SceneObject(
+        name, CLASSES[name.rsplit("_", 1)[0] if name[-1].isdigit() else name], Pose((x, y, 0.05))
+    )
 
 
 def image(*objects: SceneObject, top: float = 0.1) -> Observation:
     """Of objects whose names say nothing; everywhere is seen what is `top` high, m."""
     depth = np.full((CAMERA.height, CAMERA.width), CAMERA.X_TC.translation()[2] - top, np.float32)
     nothing = np.zeros(depth.shape, bool)
-    detections = [Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)]
+    detections = [
+        Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)
+    ]
     return Observation(depth, tuple(detections), CAMERA, TRAY)
 
 
@@ -35,7 +39,10 @@ def names(known: list[SceneObject], observation: Observation) -> dict[str, tuple
 
 def test_what_is_new_gets_a_name_of_its_own() -> None:
     assert names([], image(at(0, 0), at(0.1, 0))) == {f"{CAN}_1": (0, 0), f"{CAN}_2": (0.1, 0)}
-    assert names([at(0, 0, f"{CAN}_1")], image(at(0.01, 0), at(0.2, 0))) == {f"{CAN}_1": (0.01, 0), f"{CAN}_2": (0.2, 0)}
+    assert names([at(0, 0, f"{CAN}_1")], image(at(0.01, 0), at(0.2, 0))) == {
+        f"{CAN}_1": (0.01, 0),
+        f"{CAN}_2": (0.2, 0),
+    }
 
 
 def test_the_names_of_what_was_lost_are_given_again_but_never_twice() -> None:
@@ -48,7 +55,10 @@ def test_the_names_of_what_was_lost_are_given_again_but_never_twice() -> None:
 
 def test_two_of_a_class_are_not_exchanged() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.03, 0, f"{CAN}_2")]
-    assert names(known, image(at(0.035, 0), at(0.012, 0))) == {f"{CAN}_1": (0.012, 0), f"{CAN}_2": (0.035, 0)}
+    assert names(known, image(at(0.035, 0), at(0.012, 0))) == {
+        f"{CAN}_1": (0.012, 0),
+        f"{CAN}_2": (0.035, 0),
+    }
 
 
 def test_classes_are_told_apart() -> None:
@@ -61,7 +71,9 @@ def test_what_is_gone_from_its_place_and_seen_elsewhere_has_moved() -> None:
     floor = image(at(-0.2, 0), at(0.2, 0.2), top=0.0)
     assert names(known, floor) == {f"{CAN}_1": (-0.2, 0), f"{CAN}_2": (0.2, 0.2)}
     covered = image(at(-0.2, 0), at(0.2, 0.2), top=0.1)
-    assert names(known, covered)[f"{CAN}_3"] == (-0.2, 0), "the first may still be where it was, below something"
+    assert names(known, covered)[f"{CAN}_3"] == (-0.2, 0), (
+        "the first may still be where it was, below something"
+    )
 
 
 def test_what_is_gone_and_not_in_view_is_lost() -> None:
@@ -85,19 +97,30 @@ def test_what_was_taken_for_something_else_is_lost() -> None:
     (can,) = seen.detections
     claimed = np.zeros(seen.depth.shape, bool)
     claimed[200:280, 280:360] = True
-    assert tracked([box], replace(seen, detections=(replace(can, mask=claimed),))).lost == ("sugar_box_1",)
+    assert tracked([box], replace(seen, detections=(replace(can, mask=claimed),))).lost == (
+        "sugar_box_1",
+    )
 
 
 def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
     """Two boxes, what is seen of them, and what is seen if they are taken for two that lie across them."""
     apart = CLASSES["sugar_box"].size[1] / 2 + 0.001
-    first = [resting("sugar_box", Orientation.FLAT_0, (0.0, y), name=f"sugar_box_{k}") for k, y in ((1, -apart), (2, apart))]
+    first = [
+        resting("sugar_box", Orientation.FLAT_0, (0.0, y), name=f"sugar_box_{k}")
+        for k, y in ((1, -apart), (2, apart))
+    ]
     seen = LabelDetector(CAMERA).look(scene_of(*first)).observation
     both = np.any([d.mask for d in seen.detections], axis=0)
     west = both & (np.arange(both.shape[1]) < np.nonzero(both)[1].mean())
-    across = [resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=f"seen {x}") for x in (-apart, apart)]
+    across = [
+        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=f"seen {x}")
+        for x in (-apart, apart)
+    ]
     masks = (west, both & ~west)
-    wrong = tuple(Detection(o.name, o.object_class, o.X_TO, mask) for o, mask in zip(across, masks, strict=True))
+    wrong = tuple(
+        Detection(o.name, o.object_class, o.X_TO, mask)
+        for o, mask in zip(across, masks, strict=True)
+    )
     return first, seen, replace(seen, detections=wrong)
 
 
@@ -107,7 +130,11 @@ def test_what_is_known_stands_until_something_explains_more() -> None:
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
     assert lost == ()
     (whole,) = across.detections[:1]
-    larger = replace(whole, mask=np.any([d.mask for d in across.detections], axis=0), object_class=CLASSES["cracker_box"])
+    larger = replace(
+        whole,
+        mask=np.any([d.mask for d in across.detections], axis=0),
+        object_class=CLASSES["cracker_box"],
+    )
     observation, lost = tracked(known[:1], replace(across, detections=(larger,)))
     assert [d.object_class.name for d in observation.detections] == ["cracker_box"]
     assert lost == ("sugar_box_1",)
@@ -133,6 +160,8 @@ def test_what_is_in_the_place_of_something_seen_is_lost() -> None:
     known, seen, _ = side_by_side()
     ghost = resting("gelatin_box", xy=known[0].X_TO.translation[:2], name="gelatin_box_1")
     hidden = resting("gelatin_box", xy=(0.25, 0.25), name="gelatin_box_2")
-    observation, lost = tracked([*known, ghost, hidden], replace(seen, depth=np.where(seen.depth > 0, np.float32(1.0), 0)))
+    observation, lost = tracked(
+        [*known, ghost, hidden], replace(seen, depth=np.where(seen.depth > 0, np.float32(1.0), 0))
+    )
     assert len(observation.detections) == 2
     assert lost == ("gelatin_box_1",)

@@ -22,9 +22,13 @@ from drake_clutter.simulation.judge import DrakeJudge
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
 
 
-def result(ended: str, hidden: int, found_after: tuple[int, ...], not_carried_out: int = 0) -> EpisodeResult:
+def result(
+    ended: str, hidden: int, found_after: tuple[int, ...], not_carried_out: int = 0
+) -> EpisodeResult:
     found = found_after[-1] if found_after else 0
-    return EpisodeResult("scene", "agent", ended, hidden, found, len(found_after), found_after, not_carried_out)
+    return EpisodeResult(
+        "scene", "agent", ended, hidden, found, len(found_after), found_after, not_carried_out
+    )
 
 
 def test_a_row_of_the_table() -> None:
@@ -35,7 +39,12 @@ def test_a_row_of_the_table() -> None:
         result(COLLAPSED, 4, (1, 1)),
         result(OUT, 1, (0,) * 20),
     ]
-    ceiling = [result(ALL, 2, (2, 2)), result(ALL, 3, (0, 3)), result(ALL, 4, (4,)), result("gave up", 1, ())]
+    ceiling = [
+        result(ALL, 2, (2, 2)),
+        result(ALL, 3, (0, 3)),
+        result(ALL, 4, (4,)),
+        result("gave up", 1, ()),
+    ]
     row = training_script("explorer_results").row_of(results, {"ceiling": ceiling})
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
@@ -45,7 +54,9 @@ def test_a_row_of_the_table() -> None:
     assert row["moves_of_successes"] == 7
     assert row["not_carried_out"] == 3 / 36
     low, high = row["moves_to_ceiling_ci95"]
-    assert (low, high) == (2 / 2, 12 / 2), "two scenes, drawn again and again: either of them twice, or both"
+    assert (low, high) == (2 / 2, 12 / 2), (
+        "two scenes, drawn again and again: either of them twice, or both"
+    )
     assert (row["moves_to_ceiling"], row["both_with_ceiling"]) == (14 / 4, 2)
 
 
@@ -53,7 +64,10 @@ def test_a_row_of_the_table() -> None:
 def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
     results = [result(ended, 1, (0,) * (moves - 1) + (1,)) for ended in (ALL, COLLAPSED)]
     row = training_script("explorer_results").row_of(results, {})
-    told = {limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")] for limit in (10, 20)}
+    told = {
+        limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")]
+        for limit in (10, 20)
+    }
     assert told == {10: [in_10, in_10, 2 * in_10], 20: [in_20, in_20, 2 * in_20]}
 
 
@@ -66,9 +80,13 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
     before = path.read_bytes()
     assert script.played(scenes, "random", 1, "equilibrium", 0, 1, path) == played
     assert path.read_bytes() == before
-    assert script.played(scenes, "random", 2, "equilibrium", 0, 1, path)[:1] == played, "others are added to it"
+    assert script.played(scenes, "random", 2, "equilibrium", 0, 1, path)[:1] == played, (
+        "others are added to it"
+    )
     assert played[0].hidden == scenes.scenes[0].hidden
-    with pytest.raises(InputError, match=r"random\.jsonl: holds records of something else \(agent, seed\)"):
+    with pytest.raises(
+        InputError, match=r"random\.jsonl: holds records of something else \(agent, seed\)"
+    ):
         script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
     with pytest.raises(InputError, match="--out: is missing"):
         script.main(tmp_path, only="sg_star_25", agents=["random"])
@@ -101,7 +119,11 @@ def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -
     yardstick.write_text(whole + '{"scene": ')  # it was killed while it wrote the second
     script.main(tmp_path, agents=["student"], count=2, **options)
     clear, student = json.loads(out.read_text())["rows"]
-    assert (clear["moves_to_largest_clear"], clear["both_with_largest_clear"], clear["episodes"]) == (1, 1, 1)
+    assert (
+        clear["moves_to_largest_clear"],
+        clear["both_with_largest_clear"],
+        clear["episodes"],
+    ) == (1, 1, 1)
     assert (student["both_with_largest_clear"], student["episodes"]) == (1, 2)
     assert "moves_to_ceiling" not in student, "nobody has played that"
     assert yardstick.read_text() == whole, "and nothing is played for it"
@@ -109,8 +131,22 @@ def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -
 
 def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
     add_rows, path = training_script("explorer_results").add_rows, tmp_path / "table.json"
-    add_rows(path, {"seed": 1}, [{"set": "b", "agent": "student", "episodes": 1}, {"set": "b", "agent": "random", "episodes": 1}])
-    add_rows(path, {"seed": 1}, [{"set": "b", "agent": "random", "episodes": 2}, {"set": "a", "agent": "random", "episodes": 2}])
+    add_rows(
+        path,
+        {"seed": 1},
+        [
+            {"set": "b", "agent": "student", "episodes": 1},
+            {"set": "b", "agent": "random", "episodes": 1},
+        ],
+    )
+    add_rows(
+        path,
+        {"seed": 1},
+        [
+            {"set": "b", "agent": "random", "episodes": 2},
+            {"set": "a", "agent": "random", "episodes": 2},
+        ],
+    )
     rows = json.loads(path.read_text())["rows"]
     assert [(row["set"], row["agent"], row["episodes"]) for row in rows] == [
         ("a", "random", 2),
@@ -124,7 +160,13 @@ def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
     script = training_script("make_scenes")
-    options = {"agent": "random", "nodes": 10, "seed": 1, "work": tmp_path / "work", "frozen": frozen}
+    options = {
+        "agent": "random",
+        "nodes": 10,
+        "seed": 1,
+        "work": tmp_path / "work",
+        "frozen": frozen,
+    }
     script.main(tmp_path / "first.json", count=2, **options)
     first = load_scene_set(tmp_path / "first.json", CATALOGUE)
     assert first.about["judge"] == "drake"
@@ -136,13 +178,17 @@ def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
     assert other.form not in {scene.form for scene in first.scenes}
 
 
-def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The fast judge calls this one stable; Drake has the last word."""
     script = training_script("make_scenes")
     judge = script.GraphJudge(GenerationJob("random", "ycb7", None, 10, 1, ClutterConfig()))
     index = next(k for k in range(20) if judge(k).get("hidden"))
     fall = Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.1, 1.0)
-    monkeypatch.setattr(DrakeJudge, "judge", lambda self, scene, rng: Verdict(fall, scene.poses, {}, ()))
+    monkeypatch.setattr(
+        DrakeJudge, "judge", lambda self, scene, rng: Verdict(fall, scene.poses, {}, ())
+    )
     record = judge(index)
     assert record == {"fast": True, "fell": "toppled"}
     fell = Counter[str]()
@@ -150,10 +196,20 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(monkeypatch: pyt
     assert fell == {"toppled": 1}
 
 
-@pytest.mark.parametrize(("frozen", "told"), [(False, r"something else \(weights\)"), (True, "scenes of other options")])
-def test_a_set_goes_on_with_the_weights_that_it_began_with(frozen: bool, told: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("frozen", "told"), [(False, r"something else \(weights\)"), (True, "scenes of other options")]
+)
+def test_a_set_goes_on_with_the_weights_that_it_began_with(
+    frozen: bool, told: str, tmp_path: Path
+) -> None:
     script, agent = training_script("make_scenes"), tmp_path / "agent.safetensors"
-    options = {"agent": str(agent), "nodes": 10, "work": tmp_path / "work", "count": 1, "frozen": frozen}
+    options = {
+        "agent": str(agent),
+        "nodes": 10,
+        "work": tmp_path / "work",
+        "count": 1,
+        "frozen": frozen,
+    }
 
     checkpoints = Path(__file__).parents[1] / "training" / "checkpoints"
 
@@ -170,7 +226,9 @@ def test_a_set_goes_on_with_the_weights_that_it_began_with(frozen: bool, told: s
 
 def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--count 1: only 0 of 20 scenes are stable"):
-        training_script("make_scenes").main(tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1)
+        training_script("make_scenes").main(
+            tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1
+        )
 
 
 def test_records_are_made_once(tmp_path: Path) -> None:
@@ -192,5 +250,7 @@ def test_records_are_made_once(tmp_path: Path) -> None:
     assert list(recorded(path, {"seed": 1}, make))[1:] == [0, 1, 2]
     assert list(recorded(path, {"seed": 1}, make))[1:] == [0, 1, 2]
     assert made == [0, 1, 1, 2]
-    with pytest.raises(InputError, match=r"records\.jsonl: holds records of something else \(seed\)"):
+    with pytest.raises(
+        InputError, match=r"records\.jsonl: holds records of something else \(seed\)"
+    ):
         next(recorded(path, {"seed": 2}, make))

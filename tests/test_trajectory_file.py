@@ -20,7 +20,11 @@ from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from ur10 import LINKS
 
-SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", floor=0.035), resting("large_marker", xy=(0.2, 0.2)))
+SCENE = scene_of(
+    resting("pudding_box"),
+    resting("gelatin_box", floor=0.035),
+    resting("large_marker", xy=(0.2, 0.2)),
+)
 MOVES = (Move("gelatin_box"), Move("large_marker"))
 
 
@@ -52,7 +56,9 @@ def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Out
             assert frame.poses[name].quaternion == pytest.approx(other.poses[name].quaternion)
 
 
-def test_the_cell_has_the_support_that_the_objects_stand_on(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> None:
+def test_the_cell_has_the_support_that_the_objects_stand_on(
+    outcomes: list[tuple[Move, Outcome]], tmp_path: Path
+) -> None:
     path, other = tmp_path / "trajectory.h5", DEFAULT_CELL.with_support(tray(0.9))
     write_trajectories(path, SCENE, outcomes, other)
     scene, cell, _ = read_trajectories(path, load_catalogue())
@@ -63,7 +69,9 @@ def test_the_cell_has_the_support_that_the_objects_stand_on(outcomes: list[tuple
 def test_the_arrays_belong_together(file: Path) -> None:
     with h5py.File(file) as stored:
         move = stored["move_0001"]
-        time, q, v, torque, suction = (move[name][()] for name in ("time", "q", "v", "torque", "suction"))
+        time, q, v, torque, suction = (
+            move[name][()] for name in ("time", "q", "v", "torque", "suction")
+        )
         assert move.attrs["result"] == MoveResult.PLACED.value
         assert move["X_TO"].shape == (len(time), 3, 7)
     middle = (q[2:] - q[:-2]) / (time[2:] - time[:-2])[:, None]
@@ -102,7 +110,15 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
     save_scene(tmp_path / "scene.yaml", SCENE, DEFAULT_CELL)
     moves = tmp_path / "moves.yaml"
     moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
-    arguments = ["move", str(tmp_path / "scene.yaml"), "--moves", str(moves), "--fidelity", "arm", "--plan-only"]
+    arguments = [
+        "move",
+        str(tmp_path / "scene.yaml"),
+        "--moves",
+        str(moves),
+        "--fidelity",
+        "arm",
+        "--plan-only",
+    ]
     told = runner.invoke(app, [*arguments, "--out", str(tmp_path / "plans")])
     assert told.exit_code == 0, told.output
     planned, refused = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
@@ -110,5 +126,9 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
     assert [phase["name"] for phase in planned["phases"]] == ["approach", "carry", "retreat"]
     assert planned["phases"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
     assert len(planned["phases"][1]["q"]) == len(planned["phases"][1]["time"])
-    assert (refused["planned"], refused["reason"], refused["about"]) == (False, "no seal", "large_marker")
+    assert (refused["planned"], refused["reason"], refused["about"]) == (
+        False,
+        "no seal",
+        "large_marker",
+    )
     assert refused["number"] is None, "its lip would be partly in the air"

@@ -48,7 +48,9 @@ def test_nothing_is_unseen_where_all_is_known() -> None:
 def test_what_is_known_has_a_shadow_down_to_the_floor() -> None:
     (shadow,) = unseen_blocks([UPPER], seen([LOWER, UPPER]), EMPTY)
     assert LOWER.top - 0.005 < shadow.top < LOWER.top
-    assert sorted(shadow.size[:2]) == pytest.approx(sorted(np.ptp(UPPER.corners_T, axis=0)[:2]), abs=1e-6)
+    assert sorted(shadow.size[:2]) == pytest.approx(
+        sorted(np.ptp(UPPER.corners_T, axis=0)[:2]), abs=1e-6
+    )
 
 
 def test_what_is_seen_but_not_known_is_taken_for_full() -> None:
@@ -60,7 +62,9 @@ def test_what_is_seen_but_not_known_is_taken_for_full() -> None:
 
 def test_noise_is_nothing() -> None:
     observation = seen([LOWER])
-    noisy = observation.depth + np.random.default_rng(0).normal(0, 0.0025, EMPTY.shape).astype(np.float32)
+    noisy = observation.depth + np.random.default_rng(0).normal(0, 0.0025, EMPTY.shape).astype(
+        np.float32
+    )
     noisy[100, 100] = 1.0  # a single wrong pixel
     noisy[200:210, 150:160] = 0.0  # not measured
     assert unseen_blocks([LOWER], replace(observation, depth=noisy), EMPTY) == ()

@@ -12,7 +12,12 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_clutter.cell.primitives import Rod
 from drake_clutter.resources import shipped_path
-from drake_clutter.robots.ur_kinematics import JOINTS, forward_kinematics, inverse_kinematics, jacobian
+from drake_clutter.robots.ur_kinematics import (
+    JOINTS,
+    forward_kinematics,
+    inverse_kinematics,
+    jacobian,
+)
 from ur10 import BASE_OUTLINE, LINKS, ur10_sdf
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
@@ -42,17 +47,25 @@ def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:
         plant.SetPositions(context, q)
         X_B6 = flange.CalcPoseInWorld(context).GetAsMatrix4()
         np.testing.assert_allclose(forward_kinematics(q), X_B6, atol=1e-9)
-        theirs = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, flange, np.zeros(3), world, world)
+        theirs = plant.CalcJacobianSpatialVelocity(
+            context, JacobianWrtVariable.kV, flange, np.zeros(3), world, world
+        )
         np.testing.assert_allclose(jacobian(q), theirs, atol=1e-9)
         for found in inverse_kinematics(X_B6):
             plant.SetPositions(context, found)
-            np.testing.assert_allclose(flange.CalcPoseInWorld(context).GetAsMatrix4(), X_B6, atol=1e-9)
+            np.testing.assert_allclose(
+                flange.CalcPoseInWorld(context).GetAsMatrix4(), X_B6, atol=1e-9
+            )
 
 
 def test_limits_and_masses_are_the_published_ones(plant: MultibodyPlant) -> None:
-    assert plant.CalcTotalMass(plant.CreateDefaultContext()) - 4.0 == pytest.approx(7.1 + 12.7 + 4.27 + 2 + 2 + 0.365)
+    assert plant.CalcTotalMass(plant.CreateDefaultContext()) - 4.0 == pytest.approx(
+        7.1 + 12.7 + 4.27 + 2 + 2 + 0.365
+    )
     assert plant.GetEffortUpperLimits().tolist() == [330, 330, 150, 56, 56, 56]
-    assert np.degrees(plant.GetVelocityUpperLimits()) == pytest.approx([120, 120, 180, 180, 180, 180], abs=1e-3)
+    assert np.degrees(plant.GetVelocityUpperLimits()) == pytest.approx(
+        [120, 120, 180, 180, 180, 180], abs=1e-3
+    )
     assert np.degrees(plant.GetPositionUpperLimits()) == pytest.approx([360] * 6)
     assert np.degrees(plant.GetPositionLowerLimits()) == pytest.approx([-360] * 6)
 
@@ -66,7 +79,9 @@ def test_every_inertia_is_physical(plant: MultibodyPlant) -> None:
 def within(points: NDArray[np.float64], rod: Rod) -> NDArray[np.bool_]:
     start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
-    return np.asarray(np.linalg.norm(points - start - along[..., None] * axis, axis=-1) <= rod.radius)
+    return np.asarray(
+        np.linalg.norm(points - start - along[..., None] * axis, axis=-1) <= rod.radius
+    )
 
 
 def left_uncovered(triangles: NDArray[np.float64], rods: tuple[Rod, ...]) -> int:
@@ -78,7 +93,12 @@ def left_uncovered(triangles: NDArray[np.float64], rods: tuple[Rod, ...]) -> int
             return 0
         a, b, c = rest.swapaxes(0, 1)
         ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        triangles = np.concatenate([np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        triangles = np.concatenate(
+            [
+                np.stack(part, axis=1)
+                for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+            ]
+        )
     return len(rest)
 
 
@@ -86,7 +106,11 @@ def left_uncovered(triangles: NDArray[np.float64], rods: tuple[Rod, ...]) -> int
 def test_the_capsules_cover_the_real_link(name: str) -> None:
     with np.load(OUTLINES) as outlines:
         triangles = outlines[f"{name}.corners"][outlines[f"{name}.triangles"]] * 1e-5
-    rods = BASE_OUTLINE if name == "base" else next(link.outline for link in LINKS if link.name == name)
+    rods = (
+        BASE_OUTLINE
+        if name == "base"
+        else next(link.outline for link in LINKS if link.name == name)
+    )
     assert left_uncovered(triangles, rods) == 0
     thinner = tuple(Rod(rod.start, rod.end, rod.radius - 0.003) for rod in rods)
     assert left_uncovered(triangles, thinner) > 0, "no capsule is 3 mm thicker than it has to be"

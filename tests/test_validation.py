@@ -30,6 +30,7 @@ from drake_clutter.validation import (
     config_yaml,
     load_typed,
     override,
+    renamed_fields,
     to_plain,
     validate,
 )
@@ -93,7 +94,10 @@ REFUSED = [
     ("height: .inf", "height: inf; allowed is a finite number"),
     ("height: 1" + "0" * 400, "allowed is a finite number"),
     ("height: 0x" + "f" * 5000, "height: a number; allowed is a finite number"),
-    ("lamps: {main: {power: -1}}", "lamps.main.power: -1; allowed is a finite number from 0 to inf"),
+    (
+        "lamps: {main: {power: -1}}",
+        "lamps.main.power: -1; allowed is a finite number from 0 to inf",
+    ),
     ("door: up", "door: 'up'; allowed is one of left, right"),
     ("door: [left]", "door: ['left']; allowed is one of left, right"),
     ("steps: 1", "steps: 1; allowed is a list"),
@@ -114,7 +118,10 @@ REFUSED = [
     ("lamps: [1]", "lamps: [1]; allowed is a mapping"),
     ("lamps: {main: 3}", "lamps.main: 3; allowed is a mapping with pose, power"),
     ("lamps: {1: {}}", "lamps[1]: 1; allowed is a text"),
-    ("lamps: {main: {pose: {x: 1}}}", "lamps.main.pose.x: is unknown; allowed are translation, rpy_deg"),
+    (
+        "lamps: {main: {pose: {x: 1}}}",
+        "lamps.main.pose.x: is unknown; allowed are translation, rpy_deg",
+    ),
     ("shelf: [{}, {power: on}]", "shelf[1].power: True; allowed is a finite number from 0 to inf"),
     ("shelf: [{}, {size: 1}]", "shelf[1].size: is unknown; allowed are pose, power"),
     ("- 1", f"[1]; allowed is a mapping with {FIELDS}"),
@@ -127,7 +134,10 @@ REFUSED = [
     ("lamps: &a {b: *a}", "is not YAML (line 1: found unconstructable recursive node)"),
     ("? [a]\n: b", "is not YAML (line 1: found unhashable key)"),
     ("seats: " + "[" * 3000 + "]" * 3000, "is not YAML"),
-    ("name: !!python/object:os.system {}", "is not YAML (line 1: could not determine a constructor"),
+    (
+        "name: !!python/object:os.system {}",
+        "is not YAML (line 1: could not determine a constructor",
+    ),
 ]
 
 
@@ -170,7 +180,9 @@ def test_a_long_value_is_cut(given: Any) -> None:
 
 
 def test_what_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.yaml: cannot be read \(No such file.*allowed is a room"):
+    with pytest.raises(
+        InputError, match=r"none\.yaml: cannot be read \(No such file.*allowed is a room"
+    ):
         read_yaml(tmp_path / "none.yaml", "a room")
     (tmp_path / "binary.yaml").write_bytes(b"\x89PNG\xff")
     with pytest.raises(InputError, match=r"binary\.yaml: is not YAML \(invalid start byte\)"):
@@ -186,7 +198,10 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
         ("steps={a: 1, a: 2}", "is not YAML (line 1: 'a' is there twice in a mapping)"),
         ("steps.1=-1", "--set steps.1=-1: steps[1]: -1; allowed is"),
         ("steps.2=1", "steps: {'2': 1}; allowed is a list"),
-        ("lamps.main.pose.yaw=north", "lamps.main.pose.rpy_deg[2]: 'north'; allowed is a finite number"),
+        (
+            "lamps.main.pose.yaw=north",
+            "lamps.main.pose.rpy_deg[2]: 'north'; allowed is a finite number",
+        ),
         ("lamps.main.yaw=3", "lamps.main.yaw: is unknown; allowed are pose, power"),
         ("door.left=1", "door: {'left': 1}; allowed is one of left, right"),
     ],
@@ -199,7 +214,13 @@ def test_a_broken_setting(setting: str, message: str) -> None:
 
 def test_settings_change_one_field_each() -> None:
     two = Room(lamps={"main": Lamp(power=2.0), "side": Lamp(power=3.0)})
-    settings = ["lamps.side.power=1e-3", "lamps.side.pose.yaw=90", "steps.1=5", "tool.radius=2E-2", "name=1e"]
+    settings = [
+        "lamps.side.power=1e-3",
+        "lamps.side.pose.yaw=90",
+        "steps.1=5",
+        "tool.radius=2E-2",
+        "name=1e",
+    ]
     made = load_typed(two, settings=settings)
     pose = PoseSpec(rpy_deg=(0.0, 0.0, 90.0))
     assert made.lamps == {"main": Lamp(power=2.0), "side": Lamp(power=0.001, pose=pose)}
@@ -211,12 +232,19 @@ def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> No
     given = {"lamps": {"new": {"power": 4.0}, "side": {"pose": {"translation": [1, 2, 3]}}}}
     made = override(two, given, "room")
     pose = PoseSpec(translation=(1.0, 2.0, 3.0))
-    assert list(made.lamps.items()) == [("new", Lamp(power=4.0)), ("side", Lamp(power=3.0, pose=pose))]
+    assert list(made.lamps.items()) == [
+        ("new", Lamp(power=4.0)),
+        ("side", Lamp(power=3.0, pose=pose)),
+    ]
 
 
 def test_another_kind_is_not_merged_with_the_one_before() -> None:
-    assert override(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(width=0.1)
-    assert override(Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room").tool == Cup(radius=0.5)
+    assert override(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(
+        width=0.1
+    )
+    assert override(Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room").tool == Cup(
+        radius=0.5
+    )
 
 
 @pytest.mark.parametrize("name", ["ur5e", "iiwa14"])
@@ -232,7 +260,9 @@ def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    room = Room(lamps={"side": Lamp(power=1e-5)}, name="1e-5", tool=Jaws(width=0.1), steps=(1e22, 1e-5))
+    room = Room(
+        lamps={"side": Lamp(power=1e-5)}, name="1e-5", tool=Jaws(width=0.1), steps=(1e22, 1e-5)
+    )
     assert validate(Room, to_plain(room), "room") == room
     (tmp_path / "room.yaml").write_text(config_yaml(room))
     assert load_typed(Room(), tmp_path / "room.yaml") == room
@@ -258,9 +288,15 @@ def schemas() -> list[Any]:
     """Every model and config class of the package."""
     root = Path(drake_clutter.__file__).parent
     files = [path.relative_to(root.parent).with_suffix("") for path in root.rglob("*.py")]
-    names = [".".join(file.parts) for file in files if not file.stem.startswith("__") and "_shipped" not in file.parts]
+    names = [
+        ".".join(file.parts)
+        for file in files
+        if not file.stem.startswith("__") and "_shipped" not in file.parts
+    ]
     modules = [importlib.import_module(name) for name in names]
-    classes = {value for module in modules for value in vars(module).values() if isinstance(value, type)}
+    classes = {
+        value for module in modules for value in vars(module).values() if isinstance(value, type)
+    }
     return sorted((c for c in classes if "__pydantic_core_schema__" in vars(c)), key=str)
 
 
@@ -278,12 +314,43 @@ def converting(node: Any) -> Iterator[Any]:
 
 def test_no_schema_converts() -> None:
     """A plain `int`, `float` or `bool` would take "3", true or 1: use `Between`, `Whole` and `Flag`."""
-    found = [(c.__name__, node) for c in schemas() for node in converting(vars(c)["__pydantic_core_schema__"])]
+    found = [
+        (c.__name__, node)
+        for c in schemas()
+        for node in converting(vars(c)["__pydantic_core_schema__"])
+    ]
     assert not found
 
 
 def test_yaml_is_read_in_one_place() -> None:
     root = Path(drake_clutter.__file__).parent
     files = [*root.rglob("*.py"), *(root.parent / "training").glob("*.py")]
-    users = {path.name for path in files if "yaml.safe_load" in path.read_text() or "yaml.load(" in path.read_text()}
+    users = {
+        path.name
+        for path in files
+        if "yaml.safe_load" in path.read_text() or "yaml.load(" in path.read_text()
+    }
     assert users == {"yaml_text.py"}
+
+
+@config_class
+@renamed_fields(rest_drift="max_rest_displacement")
+class _Renamed:
+    max_rest_displacement: NonNegative = 0.0025
+
+
+@config_class
+class _Holder:
+    settle: _Renamed = field(default_factory=_Renamed)
+
+
+def test_earlier_names_of_fields_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("settle: {rest_drift: 0.5}\n")
+    assert load_typed(_Holder(), path).settle.max_rest_displacement == 0.5
+    assert load_typed(_Holder(), None, ["settle.rest_drift=0.7"]) == _Holder(_Renamed(0.7))
+    assert validate(_Holder, {"settle": {"rest_drift": 0.5}}, "a") == _Holder(_Renamed(0.5))
+    assert to_plain(_Holder()) == {"settle": {"max_rest_displacement": 0.0025}}
+    both = {"settle": {"rest_drift": 0.5, "max_rest_displacement": 0.4}}
+    with pytest.raises(InputError, match=r"settle\.rest_drift: is unknown"):
+        validate(_Holder, both, "a")

@@ -20,16 +20,22 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.station.station_simulation import StationSimulation
 
 
-@pytest.mark.parametrize("rpy_deg", [(180.0, 0.0, 30.0), (0.0, 90.0, -17.0), (12.0, 20.0, 31.0), (-90.0, 180.0, 270.0)])
+@pytest.mark.parametrize(
+    "rpy_deg", [(180.0, 0.0, 30.0), (0.0, 90.0, -17.0), (12.0, 20.0, 31.0), (-90.0, 180.0, 270.0)]
+)
 def test_a_pose_is_roll_pitch_and_yaw(rpy_deg: tuple[float, float, float]) -> None:
     R = PoseSpec(rpy_deg=rpy_deg).transform.rotation().matrix()
-    assert pytest.approx(RollPitchYaw(np.radians(rpy_deg)).ToRotationMatrix().matrix(), abs=1e-12) == R
+    assert (
+        pytest.approx(RollPitchYaw(np.radians(rpy_deg)).ToRotationMatrix().matrix(), abs=1e-12) == R
+    )
 
 
 @pytest.mark.parametrize("yaw", [0.0, 30.0, -45.0, 90.0])
 def test_a_camera_that_looks_straight_down_is_vertical_at_any_yaw(yaw: float) -> None:
     assert Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(180.0, 0.0, yaw))).vertical
-    assert not Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(179.0, 0.0, yaw))).vertical
+    assert not Camera(
+        pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(179.0, 0.0, yaw))
+    ).vertical
 
 
 def test_a_pedestal_stands_upright_under_a_tilted_base() -> None:
@@ -60,13 +66,18 @@ def test_a_base_over_the_support_without_a_pedestal_is_not_in_it() -> None:
         (-0.437, 0.437, 45.0, False),  # beside the corner
     ],
 )
-def test_whether_a_turned_pedestal_stands_in_the_support(x: float, y: float, yaw: float, stands_in: bool) -> None:
+def test_whether_a_turned_pedestal_stands_in_the_support(
+    x: float, y: float, yaw: float, stands_in: bool
+) -> None:
     base = f"robot.base={{translation: [{x}, {y}, 0.3], rpy_deg: [0, 0, {yaw}]}}"
     assert cell_with(base).pedestal_in_support is stands_in
 
 
 def test_which_camera_is_the_first_counts() -> None:
-    one, two = (f"{name}: {{pose: {{translation: [0, 0, {z}], rpy_deg: [180, 0, 0]}}}}" for name, z in (("a", 1.6), ("b", 1.8)))
+    one, two = (
+        f"{name}: {{pose: {{translation: [0, 0, {z}], rpy_deg: [180, 0, 0]}}}}"
+        for name, z in (("a", 1.6), ("b", 1.8))
+    )
     first, second = cell_with(f"cameras={{{one}, {two}}}"), cell_with(f"cameras={{{two}, {one}}}")
     assert dict(first) == dict(second)
     assert first.camera != second.camera
@@ -94,14 +105,21 @@ def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
     cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
     objects = (resting("sugar_box"), resting("pudding_box", xy=(0.2, 0.0)))
     X_TO_place = objects[0].X_TO.moved((0.0, -0.2, 0.001))
-    plan = PickPlacePlanner(cell, PlannerConfig(optimise=False)).plan(objects, "sugar_box", X_TO_place)
+    plan = PickPlacePlanner(cell, PlannerConfig(optimise=False)).plan(
+        objects, "sugar_box", X_TO_place
+    )
     assert isinstance(plan, Plan)
     done = StationSimulation(cell, scene_of(*objects)).execute(plan)
-    assert done.poses["sugar_box"].p == pytest.approx(objects[0].X_TO.moved((0.0, -0.2, 0.0)).p, abs=2e-3)
+    assert done.poses["sugar_box"].p == pytest.approx(
+        objects[0].X_TO.moved((0.0, -0.2, 0.0)).p, abs=2e-3
+    )
 
 
 def test_a_camera_is_not_called_like_another_part() -> None:
     camera = "{pose: {translation: [0, 0, 1.6], rpy_deg: [180, 0, 0]}}"
-    with pytest.raises(InputError, match=r"cameras\.pedestal: a camera's name; allowed are names that differ from tray"):
+    with pytest.raises(
+        InputError,
+        match=r"cameras\.pedestal: a camera's name; allowed are names that differ from tray",
+    ):
         cell_with(f"cameras={{pedestal: {camera}, side: {camera}}}")
     assert cell_with(f"cameras={{camera: {camera}}}").camera == cell_with().camera

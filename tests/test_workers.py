@@ -70,7 +70,9 @@ def make_thread_setting() -> Callable[[int], str | None]:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_processes_are_replaced_by_fresh_ones(workers: int, tmp_path: Path) -> None:
-    done = list(map_ordered(partial(CountsFactories, tmp_path), range(5), workers=workers, fresh_after=2))
+    done = list(
+        map_ordered(partial(CountsFactories, tmp_path), range(5), workers=workers, fresh_after=2)
+    )
     first, last = done[: 2 * workers], done[2 * workers :]
     assert len(done) == 5
     assert set(first).isdisjoint(last)
@@ -143,7 +145,9 @@ for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
             os.killpg(process.pid, signal_number)  # as a terminal does
         else:
             process.send_signal(signal_number)
-        _, errors = process.communicate(timeout=10)  # returns when the last process that holds the pipes has ended
+        _, errors = process.communicate(
+            timeout=10
+        )  # returns when the last process that holds the pipes has ended
     assert (signal_number == signal.SIGINT) == errors.rstrip().endswith(b"KeyboardInterrupt")
 
 
@@ -170,7 +174,9 @@ def test_reads_only_a_few_items_ahead() -> None:
     assert len(read) <= 5 + 8
 
 
-def test_processes_get_one_thread_each_and_this_one_keeps_its_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_get_one_thread_each_and_this_one_keeps_its_setting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert list(map_ordered(make_thread_setting, range(2), workers=2)) == ["1", "1"]
     assert "OMP_NUM_THREADS" not in os.environ
@@ -182,6 +188,9 @@ def test_workers_below_one_are_refused_at_once() -> None:
 
 
 def test_item_rng() -> None:
-    draws = {item_rng(*path).integers(2**62) for path in [(0,), (0, 0), (0, 1), (0, 0, 0), (1,), (1, 0), (0, 1, 0)]}
+    draws = {
+        item_rng(*path).integers(2**62)
+        for path in [(0,), (0, 0), (0, 1), (0, 0, 0), (1,), (1, 0), (0, 1, 0)]
+    }
     assert len(draws) == 7
     assert item_rng(3, 4).normal() == item_rng(3, 4).normal()

@@ -38,9 +38,17 @@ class CloneExplorer(ExplorerTraining):
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of CloneExplorer.")] = None,
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of CloneExplorer.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
@@ -48,11 +56,17 @@ def main(
     one_thread_per_operation()
     chosen = device_of(device)
     environment = given.environment()
-    teacher, numbers = load_explorer(load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER)
+    teacher, numbers = load_explorer(
+        load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER
+    )
     if numbers != environment.numbers:
-        raise InputError(f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}")
+        raise InputError(
+            f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}"
+        )
     learner = Cloning(environment, teacher.to(chosen), given.learning, given.seed, chosen)
-    run = TrainingRun(out, given, learner, given.learning.rounds, [Path(given.scenes), Path(given.teacher)])
+    run = TrainingRun(
+        out, given, learner, given.learning.rounds, [Path(given.scenes), Path(given.teacher)]
+    )
     while learner.step < given.learning.rounds:
         learner.advance()
         if learner.step == given.learning.rounds or learner.step % given.evaluate_every == 0:

@@ -79,8 +79,16 @@ class Row:
 
 ROWS = [
     Row(perception, motion, scenes, agent, first, count)
-    for scenes, agent, first, count in (("sg_star_25", "student", 60, 100), ("sg_14", "student-14", 50, 50))
-    for perception, motion in (("depth", "settle"), ("depth-color", "settle"), ("depth", "arm"), ("labels", "arm"))
+    for scenes, agent, first, count in (
+        ("sg_star_25", "student", 60, 100),
+        ("sg_14", "student-14", 50, 50),
+    )
+    for perception, motion in (
+        ("depth", "settle"),
+        ("depth-color", "settle"),
+        ("depth", "arm"),
+        ("labels", "arm"),
+    )
 ]
 
 
@@ -97,7 +105,9 @@ class Player:
 
     def __init__(self) -> None:
         self._catalogue = load_catalogue()
-        self._set = cache(lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue))
+        self._set = cache(
+            lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue)
+        )
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
         self._ceiling = ArmCeiling(Scenario().world)
 
@@ -105,7 +115,9 @@ class Player:
         """Plays one, and tells how it went."""
         row, number = asked.row, asked.number
         held: SceneSet = self._set(row.scenes)
-        scenario = Scenario(agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number)
+        scenario = Scenario(
+            agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number
+        )
         scene = held.settled(number, held.grammar, scenario.world)
         begun = time.perf_counter()
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
@@ -150,7 +162,9 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     networks = [checkpoint_path(row.agent, TRAINED)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))
-    scenario = to_plain(Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"]))
+    scenario = to_plain(
+        Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"])
+    )
     scenario.pop("seed")  # each episode's own: the scene's number
     asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": scenario}
     asked |= {"weights": [sha256_of(file) for file in networks]}
@@ -168,12 +182,18 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:
     """What is kept of an episode."""
     results = Counter(step.outcome.result for step in task.steps)
-    reasons = Counter(s.outcome.detail.split(":")[0] for s in task.steps if s.outcome.result is MoveResult.NOT_PLANNED)
+    reasons = Counter(
+        s.outcome.detail.split(":")[0]
+        for s in task.steps
+        if s.outcome.result is MoveResult.NOT_PLANNED
+    )
     worst = task.steps[-1].outcome if task.steps and task.end is EpisodeEnd.COLLAPSED else None
     return {
         "hidden": len(task.hidden_at_start),
         "found": len(task.found),
-        "found_after": np.cumsum([len(step.newly_found) for step in task.steps], dtype=int).tolist(),
+        "found_after": np.cumsum(
+            [len(step.newly_found) for step in task.steps], dtype=int
+        ).tolist(),
         "moves": len(task.steps),
         "objects": len(task.scene.objects),
         "known": len(known),
@@ -199,7 +219,10 @@ def stage(episode: dict[str, Any]) -> str:
 def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The figures of a row."""
     won = [e["ended"] == EpisodeEnd.ALL_FOUND.value for e in episodes]
-    played, able = [e for e in episodes if e["ended"] != "exception"], [k for k, e in enumerate(episodes) if e["arm_can"]]
+    played, able = (
+        [e for e in episodes if e["ended"] != "exception"],
+        [k for k, e in enumerate(episodes) if e["arm_can"]],
+    )
     won_able = sum(won[k] for k in able)
     told = {
         "name": row.name,
@@ -209,11 +232,19 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "success": sum(won) / len(won),
         "success_ci95": wilson_interval(sum(won), len(won)),
     }
-    told |= {"arm_can": len(able) / len(episodes), "success_of_arm_can": won_able / len(able) if able else None}
+    told |= {
+        "arm_can": len(able) / len(episodes),
+        "success_of_arm_can": won_able / len(able) if able else None,
+    }
     told["success_of_arm_can_ci95"] = wilson_interval(won_able, len(able)) if able else None
-    told |= {key: float(np.mean([e[key] for e in played])) if played else None for key in ("hidden", "found")}
+    told |= {
+        key: float(np.mean([e[key] for e in played])) if played else None
+        for key in ("hidden", "found")
+    }
     told["found_ci95"] = mean_interval([e["found"] for e in played])
-    told["found_of_hidden"] = sum(e["found"] for e in played) / max(1, sum(e["hidden"] for e in played))
+    told["found_of_hidden"] = sum(e["found"] for e in played) / max(
+        1, sum(e["hidden"] for e in played)
+    )
     moves = [e["moves"] for e, success in zip(episodes, won, strict=True) if success]
     told["moves_of_successes"] = float(np.mean(moves)) if moves else None
     # Of the list of objects that the agent has at the end of a success.
@@ -225,18 +256,36 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     told["wall_seconds"] = float(np.median([e["wall"] for e in episodes]))
     told["not_planned"] = dict(sum((Counter(e["not_planned"]) for e in played), Counter[str]()))
     told["dropped"] = sum(e["results"].get(MoveResult.DROPPED.value, 0) for e in played)
-    told["failed_of"] = dict(Counter(stage(e) for e, success in zip(episodes, won, strict=True) if not success))
+    told["failed_of"] = dict(
+        Counter(stage(e) for e, success in zip(episodes, won, strict=True) if not success)
+    )
     return told
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """For the screen."""
     table = Table(
-        "set", "perception", "motion", "episodes", "success", "arm can", "of these", "found", "moves", "robot min", "wall s"
+        "set",
+        "perception",
+        "motion",
+        "episodes",
+        "success",
+        "arm can",
+        "of these",
+        "found",
+        "moves",
+        "robot min",
+        "wall s",
     )
     for row in rows:
         low, high = row["success_ci95"]
-        figures = ("arm_can", "success_of_arm_can", "found_of_hidden", "moves_of_successes", "robot_minutes")
+        figures = (
+            "arm_can",
+            "success_of_arm_can",
+            "found_of_hidden",
+            "moves_of_successes",
+            "robot_minutes",
+        )
         numbers = [row[key] for key in figures]
         cells = [
             row["scenes"],
@@ -251,21 +300,28 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = EPISODES,
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where the episodes go.")
+    ] = EPISODES,
     workers: Annotated[int, typer.Option(min=1)] = 1,
     count: Annotated[int | None, typer.Option(min=1, help="Of each row's scenes, at most.")] = None,
     only: Annotated[str | None, typer.Option(help="Of rows whose name contains this.")] = None,
     perception: Annotated[
-        str | None, typer.Option(metavar="FILE", help="A detector's checkpoint, in place of the shipped.")
+        str | None,
+        typer.Option(metavar="FILE", help="A detector's checkpoint, in place of the shipped."),
     ] = None,
     out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
 ) -> None:
     """Plays what is missing and prints the table."""
     if out == OUT and (perception or folder != EPISODES):
-        raise InputError(f"--out {out}: is of the shipped detectors and the episodes in {EPISODES}; give another file")
+        raise InputError(
+            f"--out {out}: is of the shipped detectors and the episodes in {EPISODES}; give another file"
+        )
     rows = [row for row in ROWS if only is None or only in row.name]
     if not rows:
-        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(row.name for row in ROWS)}")
+        raise InputError(
+            f"--only {only}; allowed is a part of one of {', '.join(row.name for row in ROWS)}"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     told = json.loads(out.read_text())["rows"] if out.exists() else []
     for row in rows:
@@ -273,7 +329,10 @@ def main(
             row = replace(row, perception=perception)
         there = min(row.count, count or row.count)
         made = row_of(row, episodes_of(row, there, workers, folder / f"{row.name}.jsonl"))
-        told = sorted([made, *(other for other in told if other["name"] != row.name)], key=lambda other: str(other["name"]))
+        told = sorted(
+            [made, *(other for other in told if other["name"] != row.name)],
+            key=lambda other: str(other["name"]),
+        )
         write_json(out, {"rows": told})
     Console(width=180).print(table_of(told))
 

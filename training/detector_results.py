@@ -63,7 +63,9 @@ def compared(
     said = detector.detect(depth, image.color).detections
     spent = time.perf_counter() - begun
     masks = [image.label == k for k in range(len(image.classes))]
-    overlap = np.array([[_iou(mask, d.mask) for d in said] for mask in masks]).reshape(len(masks), len(said))
+    overlap = np.array([[_iou(mask, d.mask) for d in said] for mask in masks]).reshape(
+        len(masks), len(said)
+    )
     rows, columns = linear_sum_assignment(-overlap)
     pairs = {int(k): said[d] for k, d in zip(rows, columns, strict=True) if overlap[k, d] >= 0.5}
     objects = []
@@ -94,7 +96,11 @@ def summarised(objects: list[Seen], false: int, seconds: list[float]) -> dict[st
 
     def recall(of: list[Seen]) -> dict[str, Any]:
         count = sum(o.named for o in of)
-        return {"objects": len(of), "recall": count / len(of), "ci95": wilson_interval(count, len(of))}
+        return {
+            "objects": len(of),
+            "recall": count / len(of),
+            "ci95": wilson_interval(count, len(of)),
+        }
 
     in_view = [o for o in objects if o.share >= ClutterConfig().cell.camera.visibility_threshold]
     return {
@@ -102,8 +108,12 @@ def summarised(objects: list[Seen], false: int, seconds: list[float]) -> dict[st
         "recall_by_visible_share": {name: recall(by_share[name]) for name in sorted(by_share)},
         "precision": len(named) / max(1, len(found) + false),
         "class_accuracy_of_found": len(named) / max(1, len(found)),
-        "translation_mm": [1000 * float(q) for q in np.nanquantile([o.translation for o in named], (0.5, 0.95))],
-        "rotation_deg": [float(np.degrees(q)) for q in np.nanquantile([o.turn for o in named], (0.5, 0.95))],
+        "translation_mm": [
+            1000 * float(q) for q in np.nanquantile([o.translation for o in named], (0.5, 0.95))
+        ],
+        "rotation_deg": [
+            float(np.degrees(q)) for q in np.nanquantile([o.turn for o in named], (0.5, 0.95))
+        ],
         "ms_per_frame": [1000 * float(q) for q in np.quantile(seconds, (0.5, 0.95))],
         "images": len(seconds),
     }
@@ -114,14 +124,21 @@ def main(
     out: Annotated[Path, typer.Option(help="JSON to write.")],
     scenes: Annotated[list[Path], typer.Option(help="Frozen sets.")],
     count: Annotated[int, typer.Option(help="Scenes of each.")] = 100,
-    images: Annotated[Path | None, typer.Option(help="Folder of make_images.py, of another seed than the training's.")] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Folder of make_images.py, of another seed than the training's."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the camera's noise.")] = 0,
     threads: Annotated[int, typer.Option(help="Of PyTorch.")] = 2,
 ) -> None:
     """Compares detections with the truth."""
     torch.set_num_threads(threads)
     config, catalogue, console = ClutterConfig(), load_catalogue(), Console(stderr=True)
-    network, camera, rows = SegmentationNetwork.load(detector), OverheadCamera(config.cell.camera), dict[str, Any]()
+    network, camera, rows = (
+        SegmentationNetwork.load(detector),
+        OverheadCamera(config.cell.camera),
+        dict[str, Any](),
+    )
 
     def shown(path: Path) -> tuple[list[str], list[LabelledImage]]:
         held = load_scene_set(path, catalogue)
@@ -132,14 +149,28 @@ def main(
             share = camera.visible_shares(scene, image.label)
             seen = np.bincount(image.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
             alone = np.array(
-                [round(n / share[o.name]) if share[o.name] > 0 else 1 for n, o in zip(seen, scene.objects, strict=True)]
+                [
+                    round(n / share[o.name]) if share[o.name] > 0 else 1
+                    for n, o in zip(seen, scene.objects, strict=True)
+                ]
             )
             names = tuple(o.object_class.name for o in scene.objects)
-            found.append(LabelledImage(image.color, image.depth, image.label, names, tuple(o.X_TO for o in scene.objects), alone))
+            found.append(
+                LabelledImage(
+                    image.color,
+                    image.depth,
+                    image.label,
+                    names,
+                    tuple(o.X_TO for o in scene.objects),
+                    alone,
+                )
+            )
         return [c.name for c in held.classes], found
 
     def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
-        eye = LearnedDetector(network, [catalogue.classes[n] for n in names], config.cell.camera, config.cell.support)
+        eye = LearnedDetector(
+            network, [catalogue.classes[n] for n in names], config.cell.camera, config.cell.support
+        )
         eye.detect(given[0].depth, given[0].color)  # compiles
         objects, false, seconds = list[Seen](), 0, list[float]()
         for k, image in enumerate(given):
@@ -151,7 +182,9 @@ def main(
         rows[path.stem] = told(*shown(path))
     if images is not None:
         held_out = ImageSet(images)
-        rows["images"] = told(list(network.classes), [held_out[k] for k in range(min(count, len(held_out)))])
+        rows["images"] = told(
+            list(network.classes), [held_out[k] for k in range(min(count, len(held_out)))]
+        )
     fields = {
         "detector": detector.name,
         "trained": load_checkpoint(detector).about["metrics"],

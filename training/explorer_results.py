@@ -43,27 +43,57 @@ SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
 COMPARED = {"ceiling": FULL_KNOWLEDGE, "largest_clear": "largest-clear"}
 """Whose moves the others' are compared with, by what the figures call them."""
-SEVEN = ("random", "largest-first", "largest-clear", "student-rg", "student-dagger", "student", FULL_KNOWLEDGE)
+SEVEN = (
+    "random",
+    "largest-first",
+    "largest-clear",
+    "student-rg",
+    "student-dagger",
+    "student",
+    FULL_KNOWLEDGE,
+)
 FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
-SETS_OF_SEVEN = ("paper_hardness", "sg_star_10", "sg_star_15", "sg_star_20", "sg_star_25", "sg_star_40", "rg_25")
+SETS_OF_SEVEN = (
+    "paper_hardness",
+    "sg_star_10",
+    "sg_star_15",
+    "sg_star_20",
+    "sg_star_25",
+    "sg_star_40",
+    "rg_25",
+)
 TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", FOURTEEN)}
 """Of every frozen set, the table that it belongs to, and who plays it."""
 
 
-def played(scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path) -> list[EpisodeResult]:
+def played(
+    scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path
+) -> list[EpisodeResult]:
     """The episodes of an agent on a set's first scenes; those that the file has not got are played, and written as they end."""
     config = ClutterConfig()
-    asked: dict[str, Any] = {"set": scenes.name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent, TRAINED)}
+    asked: dict[str, Any] = {
+        "set": scenes.name,
+        "sha256": scenes.sha256,
+        "agent": agent,
+        "weights": weights_of(agent, TRAINED),
+    }
     asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": to_plain(config)}
     commit = git_commit()
 
     def play(done: int) -> Iterator[dict[str, Any]]:
         missing = [Episode(SCENES / scenes.name, k, agent, k) for k in range(done, count)]
-        results = map_ordered(partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity), missing, workers=workers)
+        results = map_ordered(
+            partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity),
+            missing,
+            workers=workers,
+        )
         for result in track(results, path.stem, count, done, console=Console(stderr=True)):
             yield asdict(result) | {"commit": commit}
 
-    return [episode_of(record) for record in list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]]
+    return [
+        episode_of(record)
+        for record in list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]
+    ]
 
 
 def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
@@ -74,22 +104,38 @@ def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
 
 def file_of(folder: Path, name: str, agent: str) -> Path:
     """Of an agent's episodes on a set."""
-    told = f"{Path(agent).stem}_{weights_of(agent, TRAINED)[:8]}" if agent.endswith(".safetensors") else agent
+    told = (
+        f"{Path(agent).stem}_{weights_of(agent, TRAINED)[:8]}"
+        if agent.endswith(".safetensors")
+        else agent
+    )
     return folder / f"{name}_{told}.jsonl"
 
 
 def commits_of(path: Path, count: int) -> list[str]:
     """At which a file's first episodes were played."""
-    return list(dict.fromkeys(json.loads(line)["commit"] for line in path.read_text().splitlines()[1 : 1 + count]))
+    return list(
+        dict.fromkeys(
+            json.loads(line)["commit"] for line in path.read_text().splitlines()[1 : 1 + count]
+        )
+    )
 
 
-def row_of(results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
+def row_of(
+    results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]
+) -> dict[str, Any]:
     """The figures of an agent on scenes; `others`: how those fared on the first of them whose moves its own are compared with."""
     row = summarise_episodes(results, LIMITS)
     for name, theirs in others.items():
         both = zip(results, theirs, strict=False)
-        pairs = [(a.moves, b.moves) for a, b in both if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}]
-        row[f"moves_to_{name}"] = sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
+        pairs = [
+            (a.moves, b.moves)
+            for a, b in both
+            if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}
+        ]
+        row[f"moves_to_{name}"] = (
+            sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
+        )
         row[f"moves_to_{name}_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
         row[f"both_with_{name}"] = len(pairs)
     return row
@@ -108,9 +154,13 @@ def rows_there(path: Path, held: Mapping[str, Any]) -> list[dict[str, Any]]:
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"--out {path}: is no file of results ({error}); allowed is one, or a new file") from error
+        raise InputError(
+            f"--out {path}: is no file of results ({error}); allowed is one, or a new file"
+        ) from error
     if not same:
-        raise InputError(f"--out {path}: holds rows of other chances, fidelity or config; give another file")
+        raise InputError(
+            f"--out {path}: holds rows of other chances, fidelity or config; give another file"
+        )
     return rows
 
 
@@ -126,7 +176,12 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """For the screen."""
     told = []
     for row in rows:
-        begin = {"set": row["set"], "agent": row["agent"], "episodes": str(row["episodes"]), "hidden": f"{row['hidden']:.1f}"}
+        begin = {
+            "set": row["set"],
+            "agent": row["agent"],
+            "episodes": str(row["episodes"]),
+            "hidden": f"{row['hidden']:.1f}",
+        }
         ratios = {f"to {name}": row.get(f"moves_to_{name}") for name in COMPARED}
         end = {name: "" if ratio is None else f"{ratio:.2f}" for name, ratio in ratios.items()}
         told += [begin | cells | end for cells in in_words(row, LIMITS)]
@@ -137,15 +192,26 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = RESULTS / "episodes",
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the episodes go.")] = RESULTS
+    / "episodes",
     workers: Annotated[int, typer.Option(min=1)] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the episodes' chances.")] = 2000,
-    fidelity: Annotated[str, typer.Option(help="fast or settle; the published tables are settle.")] = "settle",
-    count: Annotated[int | None, typer.Option(min=1, help="Of each set's scenes; all if not given.")] = None,
+    fidelity: Annotated[
+        str, typer.Option(help="fast or settle; the published tables are settle.")
+    ] = "settle",
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Of each set's scenes; all if not given.")
+    ] = None,
     only: Annotated[str | None, typer.Option(help="Of sets whose name contains this.")] = None,
-    agents: Annotated[list[str] | None, typer.Option("--agent", help="These instead of the tables'; may be repeated.")] = None,
+    agents: Annotated[
+        list[str] | None,
+        typer.Option("--agent", help="These instead of the tables'; may be repeated."),
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="JSON to write; table2.json and table3.json if not given.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="JSON to write; table2.json and table3.json if not given."
+        ),
     ] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
@@ -172,20 +238,36 @@ def main(
         table, agents_of_table = TABLES[name]
         number = min(count or len(scenes.scenes), len(scenes.scenes))
         chosen = agents or agents_of_table
-        found = {agent: played(scenes, agent, number, fidelity, seed, workers, file_of(folder, name, agent)) for agent in chosen}
+        found = {
+            agent: played(
+                scenes, agent, number, fidelity, seed, workers, file_of(folder, name, agent)
+            )
+            for agent in chosen
+        }
         others = {}
         for label, agent in COMPARED.items():
             path = file_of(folder, name, agent)
             if path.exists():  # what the yardstick has played; nothing is played for it
                 there = min(number, path.read_text().count("\n") - 1)
                 others[label] = played(scenes, agent, there, fidelity, seed, workers, path)
-        solvable = [k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"]
+        solvable = [
+            k for k, scene in enumerate(scenes.scenes[:number]) if scene.solvable == "solvable"
+        ]
         rows = []
         for agent in chosen:
-            row: dict[str, Any] = {"set": name, "sha256": scenes.sha256, "agent": agent, "weights": weights_of(agent, TRAINED)}
-            row |= row_of(found[agent], others) | {"commits": commits_of(file_of(folder, name, agent), number)}
+            row: dict[str, Any] = {
+                "set": name,
+                "sha256": scenes.sha256,
+                "agent": agent,
+                "weights": weights_of(agent, TRAINED),
+            }
+            row |= row_of(found[agent], others) | {
+                "commits": commits_of(file_of(folder, name, agent), number)
+            }
             part = [found[agent][k] for k in solvable]
-            compared = {label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()}
+            compared = {
+                label: [o[k] for k in solvable if k < len(o)] for label, o in others.items()
+            }
             row["solvable"] = row_of(part, compared) if part else None
             rows.append(row)
         add_rows(out or RESULTS / f"{table}.json", held, rows)

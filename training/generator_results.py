@@ -53,16 +53,28 @@ class Row:
 
 
 SIZES = {10: 300, 15: 300, 20: 300, 25: 1000, 40: 300}
-TABLE = [Row(agent, nodes, count) for agent in ("random", "hill-climbing", "sg", "sg-star") for nodes, count in SIZES.items()]
+TABLE = [
+    Row(agent, nodes, count)
+    for agent in ("random", "hill-climbing", "sg", "sg-star")
+    for nodes, count in SIZES.items()
+]
 TABLE += [Row(agent, 25, 300, "pantry14") for agent in ("random", "sg-14")]
 # As files, from the top folder: other seeds of SG*, and the paper's reward.
-TABLE += [Row(f"training/checkpoints/sg_star_{name}.safetensors", 25, 300) for name in ("seed_1", "seed_2", "paper")]
-TRADE = [Row("sg-star", 25, 300, temperature=temperature) for temperature in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)]
+TABLE += [
+    Row(f"training/checkpoints/sg_star_{name}.safetensors", 25, 300)
+    for name in ("seed_1", "seed_2", "paper")
+]
+TRADE = [
+    Row("sg-star", 25, 300, temperature=temperature)
+    for temperature in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+]
 
 
 def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
     """Generates a row's scenes and says all that is to be said of them."""
-    job = GenerationJob(row.agent, row.objects, None, row.nodes, seed, ClutterConfig(), row.temperature)
+    job = GenerationJob(
+        row.agent, row.objects, None, row.nodes, seed, ClutterConfig(), row.temperature
+    )
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return track(made, row.folder, total=total, completed=done, console=Console(stderr=True))
@@ -76,7 +88,13 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
         assert file.verdict is not None
         assert file.scene.graph is not None
         found = judge.stability(file.scene)
-        fast = "cannot judge" if isinstance(found, CannotJudge) else "stable" if found is None else "falls"
+        fast = (
+            "cannot judge"
+            if isinstance(found, CannotJudge)
+            else "stable"
+            if found is None
+            else "falls"
+        )
         confusion[f"fast {fast}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
         top = {o.node: o.top for o in file.scene.objects}
         for nodes in file.scene.graph.stack_objects():
@@ -85,7 +103,9 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
     summary |= {
         "row": asdict(row),
         "fast_judge": dict(confusion),
-        "false_stable_of_called_stable": confusion["fast stable, drake falls"] / called if called else None,
+        "false_stable_of_called_stable": confusion["fast stable, drake falls"] / called
+        if called
+        else None,
         "stack_heights_5cm": [heights[k] for k in range(10)],
         "commit": git_commit(),
     }
@@ -94,11 +114,20 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
 
 def show(rows: list[dict[str, Any]], console: Console) -> None:
     """Prints the table."""
-    columns = {"stable": "stability_rate", "hidden": "hidden_mean", "solvable": "solvable_share", "distinct": "distinct_share"}
+    columns = {
+        "stable": "stability_rate",
+        "hidden": "hidden_mean",
+        "solvable": "solvable_share",
+        "distinct": "distinct_share",
+    }
     columns |= {"stacks": "mean_stacks", "balanced": "balanced_share", "bits": "class_entropy"}
     table = Table("agent", "objects", "nodes", "scenes", *columns)
     for row in rows:
-        agent = row["agent"] if row["temperature"] is None else f"{row['agent']} at {row['temperature']:g}"
+        agent = (
+            row["agent"]
+            if row["temperature"] is None
+            else f"{row['agent']} at {row['temperature']:g}"
+        )
         values = ["" if row[key] is None else f"{row[key]:.3g}" for key in columns.values()]
         table.add_row(agent, row["objects"], str(row["nodes"]), str(row["count"]), *values)
     console.print(table)
@@ -118,9 +147,18 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
     warmth = [row["temperature"] for row in rows]
-    hidden = np.array([[row["hidden_mean"], *(row["hidden_ci95"] or (np.nan, np.nan))] for row in rows])
-    left.errorbar(warmth, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6)
-    left.set(xscale="log", xlabel="temperature of the policy", ylabel="hidden objects in a stable scene", ylim=(0, None))
+    hidden = np.array(
+        [[row["hidden_mean"], *(row["hidden_ci95"] or (np.nan, np.nan))] for row in rows]
+    )
+    left.errorbar(
+        warmth, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6
+    )
+    left.set(
+        xscale="log",
+        xlabel="temperature of the policy",
+        ylabel="hidden objects in a stable scene",
+        ylim=(0, None),
+    )
     for key, name, marker in (
         ("stability_rate", "stable", "o"),
         ("solvable_share", "solvable", "s"),
@@ -128,9 +166,17 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
         ("balanced_share", "balanced", "^"),
     ):
         right.plot(warmth, [row[key] for row in rows], marker=marker, label=name)
-    even = [row["class_entropy"] / np.log2(len(load_catalogue().object_set(row["objects"]))) for row in rows]
+    even = [
+        row["class_entropy"] / np.log2(len(load_catalogue().object_set(row["objects"])))
+        for row in rows
+    ]
     right.plot(warmth, even, marker="v", label="classes, of the\ngreatest entropy")
-    right.set(xscale="log", xlabel="temperature of the policy", ylabel="share of the scenes", ylim=(0, 1.03))
+    right.set(
+        xscale="log",
+        xlabel="temperature of the policy",
+        ylabel="share of the scenes",
+        ylim=(0, 1.03),
+    )
     right.legend(loc="lower right", fontsize=16)
     for panel in (left, right):
         panel.grid(alpha=0.4)
@@ -144,10 +190,16 @@ def main(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the scenes go.")],
     workers: int = 1,
     seed: Annotated[int, typer.Option(help="Of the scenes; trainings have others.")] = 1000,
-    only: Annotated[str | None, typer.Option(help="Of rows whose folder's name contains this.")] = None,
-    at_most: Annotated[int | None, typer.Option(help="Scenes of a row for now; a later run adds the others.")] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Of rows whose folder's name contains this.")
+    ] = None,
+    at_most: Annotated[
+        int | None, typer.Option(help="Scenes of a row for now; a later run adds the others.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table1.json",
-    picture: Annotated[Path | None, typer.Option(help="PNG to write: the temperature's trade-off.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG to write: the temperature's trade-off.")
+    ] = None,
 ) -> None:
     """Measures what is missing and prints the table."""
     console = Console()
@@ -155,13 +207,17 @@ def main(
     if out.exists():
         earlier = json.loads(out.read_text())
         if earlier["seed"] != seed:
-            raise InputError(f"--out {out}: holds results of seed {earlier['seed']}; give the same seed or another file")
+            raise InputError(
+                f"--out {out}: holds results of seed {earlier['seed']}; give the same seed or another file"
+            )
         found = {Row(**row["row"]).folder: row for row in earlier["rows"]}
     for row in TABLE + TRADE:
         count = min(row.count, at_most or row.count)
         held = found[row.folder]["count"] if row.folder in found else 0
         if held < count and (only is None or only in row.folder):
-            found[row.folder] = measured(replace(row, count=count), folder / row.folder, workers, seed)
+            found[row.folder] = measured(
+                replace(row, count=count), folder / row.folder, workers, seed
+            )
             out.parent.mkdir(parents=True, exist_ok=True)
             write_json(out, {"seed": seed, "rows": list(found.values())})
     show(list(found.values()), console)

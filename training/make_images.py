@@ -78,7 +78,10 @@ class ImageJob:
 
     def is_heap(self, item: int) -> bool:
         """Whether an item is a heap, drawn so that heaps have their share of the images, not of the items."""
-        heaps, generated = self.dropped_share / HEAP_IMAGES, (1 - self.dropped_share) / GENERATED_IMAGES
+        heaps, generated = (
+            self.dropped_share / HEAP_IMAGES,
+            (1 - self.dropped_share) / GENERATED_IMAGES,
+        )
         return bool(item_rng(self.seed, item, 0).random() < heaps / (heaps + generated))
 
     def images(self, item: int) -> int:
@@ -90,7 +93,11 @@ class ImageJob:
         catalogue = load_catalogue()
         own = set(catalogue.object_set(self.objects))
         named = [(agent, objects or self.objects) for agent, objects in AGENTS.items()]
-        return [(agent, objects) for agent, objects in named if set(catalogue.object_set(objects)) <= own]
+        return [
+            (agent, objects)
+            for agent, objects in named
+            if set(catalogue.object_set(objects)) <= own
+        ]
 
 
 class ItemMaker:
@@ -109,14 +116,23 @@ class ItemMaker:
         camera = OverheadCamera(self._config.cell.camera, random_lamps(rng))
         known = dict[SceneObject, int]()
         images = (photograph(camera, scene, known, rng) for scene in scenes)
-        write_images(self._out / f"{item:06d}", images, self._config.cell.camera, list(load_catalogue().classes))
+        write_images(
+            self._out / f"{item:06d}",
+            images,
+            self._config.cell.camera,
+            list(load_catalogue().classes),
+        )
         del camera
         gc.collect()  # in this thread: a renderer that another one collects can abort the process
 
     def _heaps(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
         """Heaps of all objects down to one, at any of the moments."""
         classes = [self._classes[k] for k in rng.integers(len(self._classes), size=HEAP_OBJECTS)]
-        moments = dropped(above_tray(classes, self._config.cell.support, rng), self._config.settle.time_step, MOMENTS)
+        moments = dropped(
+            above_tray(classes, self._config.cell.support, rng),
+            self._config.settle.time_step,
+            MOMENTS,
+        )
         names = set(moments[-1].names)
         left = moments[-1]
         for most in np.linspace(len(names), 1, count).round():
@@ -129,14 +145,20 @@ class ItemMaker:
         agents = self._job.agents()
         agent, objects = agents[rng.integers(len(agents))]
         if agent not in self._generators:
-            self._generators[agent] = SceneGenerator(GenerationJob(agent, objects, None, NODES, self._job.seed, self._config))
+            self._generators[agent] = SceneGenerator(
+                GenerationJob(agent, objects, None, NODES, self._job.seed, self._config)
+            )
         scene, _ = self._generators[agent].lay_out(rng)
         yield scene
         for _ in range(count - 1):
             for _ in range(rng.integers(1, 3)):
                 taken = pick_free(scene, rng)
                 rest = without(scene, taken)
-                moved = put_elsewhere(taken, rest, rng) if rng.random() < PUT_ELSEWHERE or not rest.objects else None
+                moved = (
+                    put_elsewhere(taken, rest, rng)
+                    if rng.random() < PUT_ELSEWHERE or not rest.objects
+                    else None
+                )
                 scene = rest if moved is None else replace(rest, objects=(*rest.objects, moved))
             yield scene
 
@@ -148,7 +170,11 @@ def without(scene: Scene, taken: SceneObject) -> Scene:
 
 def pick_free(scene: Scene, rng: np.random.Generator) -> SceneObject:
     """An object of the scene over which nothing reaches higher."""
-    free = [o for o in scene.objects if not any(over.top > o.top and _overlap(o, over, 0.0) for over in scene.objects)]
+    free = [
+        o
+        for o in scene.objects
+        if not any(over.top > o.top and _overlap(o, over, 0.0) for over in scene.objects)
+    ]
     return free[rng.integers(len(free))]
 
 
@@ -183,11 +209,21 @@ def random_lamps(rng: np.random.Generator) -> RenderEngineVtkParams:
         x, y = rng.uniform(-0.9, 0.9, 2)
         warmth = rng.uniform(-0.12, 0.12)
         colour = Rgba(min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth))
-        lights.append(LightParameter(type="directional", direction=[x, y, 1.0], frame="camera", intensity=strength, color=colour))
+        lights.append(
+            LightParameter(
+                type="directional",
+                direction=[x, y, 1.0],
+                frame="camera",
+                intensity=strength,
+                color=colour,
+            )
+        )
     return RenderEngineVtkParams(backend=ENGINE.backend, lights=lights)
 
 
-def photograph(camera: OverheadCamera, scene: Scene, known: dict[SceneObject, int], rng: np.random.Generator) -> LabelledImage:
+def photograph(
+    camera: OverheadCamera, scene: Scene, known: dict[SceneObject, int], rng: np.random.Generator
+) -> LabelledImage:
     """An image of a scene, with colours drawn anew.
 
     Args:
@@ -204,7 +240,9 @@ def photograph(camera: OverheadCamera, scene: Scene, known: dict[SceneObject, in
     classes = tuple(o.object_class.name for o in scene.objects)
     alone = np.array([known[o] for o in scene.objects], np.int64)
     color = recoloured(images, len(classes), rng)
-    return LabelledImage(color, images.depth, images.label, classes, tuple(o.X_TO for o in scene.objects), alone)
+    return LabelledImage(
+        color, images.depth, images.label, classes, tuple(o.X_TO for o in scene.objects), alone
+    )
 
 
 def recoloured(images: Images, count: int, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -217,17 +255,30 @@ def recoloured(images: Images, count: int, rng: np.random.Generator) -> NDArray[
         turn = Rotation.from_rotvec(np.full(3, hue / np.sqrt(3))).as_matrix()  # about grey
         gain, shift = rng.uniform(0.75, 1.25) * rng.uniform(0.93, 1.07, 3), rng.uniform(-15, 15)
         color[mask] = color[mask] @ (gain[:, None] * turn).T.astype(np.float32) + np.float32(shift)
-    patches = rng.uniform(0, 255, 3) + rng.normal(0, rng.uniform(0, 50), (*rng.integers(2, 24, 2), 3))
+    patches = rng.uniform(0, 255, 3) + rng.normal(
+        0, rng.uniform(0, 50), (*rng.integers(2, 24, 2), 3)
+    )
     height, width = beyond.shape
-    background = Image.fromarray(patches.clip(0, 255).astype(np.uint8)).resize((width, height), Image.Resampling.BICUBIC)
+    background = Image.fromarray(patches.clip(0, 255).astype(np.uint8)).resize(
+        (width, height), Image.Resampling.BICUBIC
+    )
     color[beyond] = np.asarray(background)[beyond]
     return color.clip(0, 255).astype(np.uint8)
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the set; new, or an earlier run's of the same job.")],
-    count: Annotated[int, typer.Option(min=1, help="Images at least; the last item is made in full.")] = 20000,
-    dropped_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the images, that show dropped heaps.")] = 0.3,
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder of the set; new, or an earlier run's of the same job."
+        ),
+    ],
+    count: Annotated[
+        int, typer.Option(min=1, help="Images at least; the last item is made in full.")
+    ] = 20000,
+    dropped_share: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Of the images, that show dropped heaps.")
+    ] = 0.3,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     workers: Annotated[int, typer.Option(min=1)] = 1,
     objects: str = "pantry14",
@@ -236,10 +287,17 @@ def main(
     job = ImageJob(objects, dropped_share, seed)
     agents = [agent for agent, _ in job.agents()]
     there = [path.name for path in out.iterdir()] if out.is_dir() else []
-    output_directory(out, may_hold=frozenset({JOB_FILE, *(name for name in there if re.fullmatch(r"\.?\d{6}", name))}))
+    output_directory(
+        out,
+        may_hold=frozenset(
+            {JOB_FILE, *(name for name in there if re.fullmatch(r"\.?\d{6}", name))}
+        ),
+    )
     about = {**to_plain(job), "agents": agents}
     if JOB_FILE in there and json.loads((out / JOB_FILE).read_text()) != about:
-        raise InputError(f"--out {out}: holds images of another job; allowed is a folder that is new or of the same options")
+        raise InputError(
+            f"--out {out}: holds images of another job; allowed is a folder that is new or of the same options"
+        )
     write_json(out / JOB_FILE, about)
     items, images = list[int](), 0
     while images < count:
@@ -248,7 +306,9 @@ def main(
     missing = [item for item in items if f"{item:06d}" not in there]
     console = Console(stderr=True)
     made = map_ordered(partial(ItemMaker, job, out), missing, workers=workers)
-    for _ in track(made, f"{images} images", len(items), len(items) - len(missing), console=console):
+    for _ in track(
+        made, f"{images} images", len(items), len(items) - len(missing), console=console
+    ):
         pass
 
 

@@ -65,7 +65,10 @@ class GraphJudge:
 
     def __init__(self, job: GenerationJob) -> None:
         self._job, self._generator = job, SceneGenerator(job)
-        self._fast, self._drake = FastJudge(job.config, margin=GenerationTask().margin), DrakeJudge(job.config)
+        self._fast, self._drake = (
+            FastJudge(job.config, margin=GenerationTask().margin),
+            DrakeJudge(job.config),
+        )
         self._classes = load_catalogue().classes
 
     def __call__(self, index: int) -> dict[str, Any]:
@@ -74,14 +77,24 @@ class GraphJudge:
         rng = item_rng(self._job.seed, index)
         scene, _ = self._generator.lay_out(rng)
         verdict = self._fast.judge(scene, rng)
-        if isinstance(verdict, CannotJudge) or not verdict.hidden or self._fast.comes_apart(scene) is not True:
+        if (
+            isinstance(verdict, CannotJudge)
+            or not verdict.hidden
+            or self._fast.comes_apart(scene) is not True
+        ):
             return {"fast": False}
         drake = self._drake.judge(scene, rng)
         if drake.instability is not None:
             return {"fast": True, "fell": drake.instability.reason.value}
         assert scene.graph is not None
         form = canonical_form(scene.graph, self._classes)
-        return {"fast": True, "fell": None, "rules": scene.derivation, "form": form, "hidden": len(drake.hidden)}
+        return {
+            "fast": True,
+            "fell": None,
+            "rules": scene.derivation,
+            "form": form,
+            "hidden": len(drake.hidden),
+        }
 
 
 def graphs_of(records: Iterable[dict[str, Any]], fell: Counter[str]) -> Iterator[SetScene]:
@@ -111,22 +124,42 @@ def main(
     count: Annotated[int, typer.Option(min=1, help="Stable scenes to collect.")] = 3000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     temperature: Annotated[float | None, typer.Option(help="Of a trained agent.")] = None,
-    frozen: Annotated[bool, typer.Option("--frozen", help="Hold where the objects came to rest.")] = False,
-    not_in: Annotated[list[Path] | None, typer.Option(metavar="FILE", help="A set to leave out; may be repeated.")] = None,
+    frozen: Annotated[
+        bool, typer.Option("--frozen", help="Hold where the objects came to rest.")
+    ] = False,
+    not_in: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="A set to leave out; may be repeated.")
+    ] = None,
     workers: Annotated[int, typer.Option(min=1)] = 1,
 ) -> None:
     """Makes a set."""
     console = Console(stderr=True)
-    taken = {scene.form for path in not_in or [] for scene in load_scene_set(path, load_catalogue()).scenes}
+    taken = {
+        scene.form
+        for path in not_in or []
+        for scene in load_scene_set(path, load_catalogue()).scenes
+    }
     job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
-    about: dict[str, Any] = {"objects": objects, "agent": agent, "nodes": nodes, "seed": seed, "temperature": temperature}
-    about |= {"judge": "drake", "without": [path.name for path in not_in or []], "commit": git_commit()}
+    about: dict[str, Any] = {
+        "objects": objects,
+        "agent": agent,
+        "nodes": nodes,
+        "seed": seed,
+        "temperature": temperature,
+    }
+    about |= {
+        "judge": "drake",
+        "without": [path.name for path in not_in or []],
+        "commit": git_commit(),
+    }
     found, drawn = list[SetScene](), 0
     if not frozen:
         judged = recorded(
             work / JUDGED,
             job.fields,
-            lambda done: map_ordered(partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers),
+            lambda done: map_ordered(
+                partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers
+            ),
         )
         about["commit"] = next(judged)["commit"]  # at which they were judged
         fell = Counter[str]()
@@ -136,7 +169,13 @@ def main(
         judged.close()
     while frozen and len(found) < count and drawn < MOST_DRAWS * count:
         drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
-        generate(job, drawn, work, workers, lambda scenes, done, total: track(scenes, out.stem, total, done, console=console))
+        generate(
+            job,
+            drawn,
+            work,
+            workers,
+            lambda scenes, done, total: track(scenes, out.stem, total, done, console=console),
+        )
         found = list(without_repeats(judged_by_drake(work), taken))
     if len(found) < count:
         told = f"only {len(found)} of {MOST_DRAWS * count} scenes are stable, hide something, and are no repeats"

@@ -30,9 +30,24 @@ PAPER_GENERATORS = {
 FEWEST_PAIRS = 10
 """Scenes that both of two explorers solve, at least, if their moves are compared."""
 PAPER_EXPLORERS: dict[str, dict[str, tuple[float, float | None]]] = {
-    "sg_star_10": {"random": (0.05, 0.76), "largest-first": (0.88, 2.93), "student-rg": (0.92, 3.06), "student": (0.91, 3.13)},
-    "sg_star_15": {"random": (0.03, 1.15), "largest-first": (0.58, 3.33), "student-rg": (0.84, 4.40), "student": (0.82, 4.27)},
-    "sg_star_20": {"random": (0.00, 0.93), "largest-first": (0.32, 3.64), "student-rg": (0.36, 4.24), "student": (0.64, 4.71)},
+    "sg_star_10": {
+        "random": (0.05, 0.76),
+        "largest-first": (0.88, 2.93),
+        "student-rg": (0.92, 3.06),
+        "student": (0.91, 3.13),
+    },
+    "sg_star_15": {
+        "random": (0.03, 1.15),
+        "largest-first": (0.58, 3.33),
+        "student-rg": (0.84, 4.40),
+        "student": (0.82, 4.27),
+    },
+    "sg_star_20": {
+        "random": (0.00, 0.93),
+        "largest-first": (0.32, 3.64),
+        "student-rg": (0.36, 4.24),
+        "student": (0.64, 4.71),
+    },
     "paper_hardness": {
         "random": (0.00, 0.90),
         "largest-first": (0.10, 2.70),
@@ -72,18 +87,27 @@ def read(name: str) -> dict[str, Any]:
 
 def picture(name: str, told: str) -> str:
     """A picture with a line below; nothing if it has not been drawn."""
-    return f"![{told}](images/{name}.png)\n\n*{told}.*\n\n" if (IMAGES / f"{name}.png").exists() else ""
+    return (
+        f"![{told}](images/{name}.png)\n\n*{told}.*\n\n"
+        if (IMAGES / f"{name}.png").exists()
+        else ""
+    )
 
 
 def sheets() -> str:
     """Links to 48 scenes of each agent."""
-    links = [f"[{path.stem.removeprefix('sheet_')}](images/{path.name})" for path in sorted(IMAGES.glob("sheet_*.png"))]
+    links = [
+        f"[{path.stem.removeprefix('sheet_')}](images/{path.name})"
+        for path in sorted(IMAGES.glob("sheet_*.png"))
+    ]
     return f"48 scenes of 25 nodes by each agent: {', '.join(links)}.\n\n" if links else ""
 
 
 def generator_row(row: dict[str, Any], source: str) -> list[str]:
     """Of Table I."""
-    hidden, stable = PAPER_GENERATORS.get((row["agent"], row["objects"]), {}).get(row["nodes"], (None, None))
+    hidden, stable = PAPER_GENERATORS.get((row["agent"], row["objects"]), {}).get(
+        row["nodes"], (None, None)
+    )
     if row.get("temperature") is not None:
         hidden = stable = None
     agent = Path(row["agent"]).stem
@@ -91,21 +115,39 @@ def generator_row(row: dict[str, Any], source: str) -> list[str]:
     told = [name, row["objects"], str(row["nodes"]), str(row["count"])]
     told += [laid_out(row), with_interval(row, "stability_rate", "stability_ci95"), number(stable)]
     told += [with_interval(row, "hidden_mean", "hidden_ci95", 1), number(hidden)]
-    told += [with_interval(row, "solvable_share", "solvable_ci95"), number(row.get("distinct_share"))]
+    told += [
+        with_interval(row, "solvable_share", "solvable_ci95"),
+        number(row.get("distinct_share")),
+    ]
     told += [number(row.get("mean_stacks"), 1), number(row.get("balanced_share"))]
-    return [*told, number(row.get("class_entropy")), number(row.get("false_stable_of_called_stable"), 3), source]
+    return [
+        *told,
+        number(row.get("class_entropy")),
+        number(row.get("false_stable_of_called_stable"), 3),
+        source,
+    ]
 
 
 def laid_out(row: dict[str, Any]) -> str:
     """The share of the derived graphs that can be laid out."""
-    return number(row["count"] / (row["count"] + sum(row["layout_failures"].values()))) if "layout_failures" in row else ""
+    return (
+        number(row["count"] / (row["count"] + sum(row["layout_failures"].values())))
+        if "layout_failures" in row
+        else ""
+    )
 
 
 def generators() -> str:
     """Table I, the trade-off and the seeds."""
     rows = list(read("table1.json").get("rows", []))
     order = ["sg-star", "sg", "hill-climbing", "random", "sg-14"]
-    rows.sort(key=lambda row: (row["temperature"] or 0, order.index(row["agent"]) if row["agent"] in order else 9, row["nodes"]))
+    rows.sort(
+        key=lambda row: (
+            row["temperature"] or 0,
+            order.index(row["agent"]) if row["agent"] in order else 9,
+            row["nodes"],
+        )
+    )
     told = [generator_row(row, f"`table1.json`, {row['commit']}") for row in rows]
     measured = {(row["agent"], row["objects"], row["nodes"]) for row in rows}
     fourteen = read("sg_14_110.json")
@@ -116,7 +158,19 @@ def generators() -> str:
         row = {"agent": "random", "objects": earlier["objects"], "count": earlier["count"], **row}
         if ("random", row["objects"], row["nodes"]) not in measured:
             told.append(generator_row(row, "`calibration.json`"))
-    head = ["agent", "objects", "nodes", "scenes", "laid out", "stable", "paper", "hidden", "paper", "solvable", "distinct"]
+    head = [
+        "agent",
+        "objects",
+        "nodes",
+        "scenes",
+        "laid out",
+        "stable",
+        "paper",
+        "hidden",
+        "paper",
+        "solvable",
+        "distinct",
+    ]
     head += ["stacks", "balanced", "class bits", "fast judge wrong", "from"]
     trainings, shown = [], (("stable", 3), ("hidden", 1), ("stacks", 2), ("balanced", 2))
     for path in [*sorted(RESULTS.glob("sg_star_seed_*.json")), RESULTS / "sg_star_paper.json"]:
@@ -125,14 +179,29 @@ def generators() -> str:
         figures = [number(last[key], digits) for key, digits in shown]
         rate = last["step"] / last["seconds"]
         name = path.stem.removeprefix("sg_star_").replace("_", " ")
-        trainings.append([f"SG*, {name}", str(last["step"]), number(held["minutes"], 0), number(rate, 0), *figures])
+        trainings.append(
+            [
+                f"SG*, {name}",
+                str(last["step"]),
+                number(held["minutes"], 0),
+                number(rate, 0),
+                *figures,
+            ]
+        )
     for agent, name in (("sg", "SG, 15 nodes"), ("sg_14", "SG-14")):
         last = json.loads((RESULTS.parent / f"checkpoints/{agent}.json").read_text())["metrics"]
         figures = [number(last[key], digits) for key, digits in shown]
         rate = last["step"] / last["seconds"]
-        trainings.append([name, str(last["step"]), number(last["seconds"] / 60, 0), number(rate, 0), *figures])
-    pictures = picture("stacks", "How high stacks are, and of what objects scenes are, at 25 nodes") + sheets()
-    pictures += picture("trade_off", "What SG* hides, and how varied its scenes are, over the temperature")
+        trainings.append(
+            [name, str(last["step"]), number(last["seconds"] / 60, 0), number(rate, 0), *figures]
+        )
+    pictures = (
+        picture("stacks", "How high stacks are, and of what objects scenes are, at 25 nodes")
+        + sheets()
+    )
+    pictures += picture(
+        "trade_off", "What SG* hides, and how varied its scenes are, over the temperature"
+    )
     return f"""## Table I: scenes that hide things
 
 Drake settles and sees every scene. *Laid out*: of the graphs that an agent derives, those whose stacks are at most 0.5 m high and
@@ -159,8 +228,16 @@ them; docs/generation.md has the rates without.
 def of_seeds(rows: Sequence[dict[str, Any]]) -> dict[str, tuple[list[float], int]]:
     """Figures of SG* as it was trained with one seed or another, at 25 nodes, from the rows of Table I."""
     at_25 = [row for row in rows if row["nodes"] == 25 and row["temperature"] is None]
-    seeds = [row for row in at_25 if row["agent"] == "sg-star" or Path(row["agent"]).stem.startswith("sg_star_seed_")]
-    shown = (("stability_rate", "stable", 3), ("hidden_mean", "hidden", 2), ("balanced_share", "balanced", 2))
+    seeds = [
+        row
+        for row in at_25
+        if row["agent"] == "sg-star" or Path(row["agent"]).stem.startswith("sg_star_seed_")
+    ]
+    shown = (
+        ("stability_rate", "stable", 3),
+        ("hidden_mean", "hidden", 2),
+        ("balanced_share", "balanced", 2),
+    )
     return {name: ([row[key] for row in seeds], digits) for key, name, digits in shown}
 
 
@@ -181,13 +258,26 @@ def explorer_row(row: dict[str, Any]) -> list[str]:
     success, found = PAPER_EXPLORERS.get(row["set"], {}).get(row["agent"], (None, None))
     cells = [row["set"], Path(row["agent"]).stem, str(row["episodes"]), number(row["hidden"], 1)]
     for limit, in_paper in (("within_10", True), ("within_20", False)):
-        cells += [with_interval(row[limit], "success", "success_ci95"), *([number(success)] if in_paper else [])]
+        cells += [
+            with_interval(row[limit], "success", "success_ci95"),
+            *([number(success)] if in_paper else []),
+        ]
         cells += [number(row[limit]["found"], 1), *([number(found, 1)] if in_paper else [])]
     solvable = row["solvable"] or {}
-    cells += [number(solvable.get("within_20", {}).get("success")), number(row["within_20"]["found_of_hidden"])]
-    cells += [with_interval(row["within_20"], "collapsed", "collapsed_ci95"), number(row["moves_of_successes"], 1)]
+    cells += [
+        number(solvable.get("within_20", {}).get("success")),
+        number(row["within_20"]["found_of_hidden"]),
+    ]
+    cells += [
+        with_interval(row["within_20"], "collapsed", "collapsed_ci95"),
+        number(row["moves_of_successes"], 1),
+    ]
     for name in ("ceiling", "largest_clear"):
-        cells.append(number(row[f"moves_to_{name}"]) if row.get(f"both_with_{name}", 0) >= FEWEST_PAIRS else "")
+        cells.append(
+            number(row[f"moves_to_{name}"])
+            if row.get(f"both_with_{name}", 0) >= FEWEST_PAIRS
+            else ""
+        )
     return cells
 
 
@@ -201,12 +291,19 @@ def gap_row(fast: dict[str, Any], settled: dict[str, Any]) -> list[str]:
         ("within_20", "collapsed"),
     ):
         cells.append(f"{number(fast[limit][name])} / {number(settled[limit][name])}")
-    return [*cells, f"{number(fast['moves_of_successes'], 1)} / {number(settled['moves_of_successes'], 1)}"]
+    return [
+        *cells,
+        f"{number(fast['moves_of_successes'], 1)} / {number(settled['moves_of_successes'], 1)}",
+    ]
 
 
-def of_explorer_seeds(rows: Sequence[dict[str, Any]], agent: str) -> dict[str, tuple[list[float], int]]:
+def of_explorer_seeds(
+    rows: Sequence[dict[str, Any]], agent: str
+) -> dict[str, tuple[list[float], int]]:
     """Figures of an explorer as it was trained with one seed or another."""
-    seeds = [row for row in rows if Path(row["agent"]).stem.split("_seed_")[0].replace("_", "-") == agent]
+    seeds = [
+        row for row in rows if Path(row["agent"]).stem.split("_seed_")[0].replace("_", "-") == agent
+    ]
     return {
         "success in 10 moves": ([row["within_10"]["success"] for row in seeds], 3),
         "in 20": ([row["within_20"]["success"] for row in seeds], 3),
@@ -221,18 +318,34 @@ def explorers() -> str:
     told = [explorer_row(row) for row in sorted(rows, key=lambda row: str(row["set"]))]
     settled = {(row["set"], row["agent"], row["episodes"]): row for row in rows}
     judged_fast = read("explorers_fast.json").get("rows", [])
-    gaps = [gap_row(row, there) for row in judged_fast if (there := settled.get((row["set"], row["agent"], row["episodes"])))]
+    gaps = [
+        gap_row(row, there)
+        for row in judged_fast
+        if (there := settled.get((row["set"], row["agent"], row["episodes"])))
+    ]
     trainings = []
     for row in read("explorer_trainings.json").get("rows", []):
         last = row["history"][-1]
         cells = [row["agent"], str(last["step"]), number(row["minutes"], 0)]
         cells += [number(last[key], 3) for key in ("success", "found_share", "collapsed")]
         trainings.append([*cells, number(last["moves_of_successes"], 1)])
-    head = ["set", "agent", "episodes", "hidden", "success in 10", "paper", "found", "paper", "success in 20", "found"]
+    head = [
+        "set",
+        "agent",
+        "episodes",
+        "hidden",
+        "success in 10",
+        "paper",
+        "found",
+        "paper",
+        "success in 20",
+        "found",
+    ]
     head += ["of solvable", "of hidden", "collapsed", "moves", "to ceiling", "to LF-clear"]
     seeds = read("explorers_seeds.json").get("rows", [])
     spreads = "".join(
-        spread(name, of_explorer_seeds(seeds, agent)) for agent, name in (("student", "SE*"), ("student-dagger", "its clone"))
+        spread(name, of_explorer_seeds(seeds, agent))
+        for agent, name in (("student", "SE*"), ("student-dagger", "its clone"))
     )
     return f"""## Tables II and III: explorers
 
@@ -268,13 +381,38 @@ def closed_loop() -> str:
         for row in held["rows"]:
             cells = [row["scenes"], row["perception"], row["motion"], str(row["episodes"])]
             cells += [with_interval(row, "success", "success_ci95"), number(row["arm_can"])]
-            cells += [with_interval(row, "success_of_arm_can", "success_of_arm_can_ci95"), number(row["found_of_hidden"])]
-            cells += [number(row.get("list_recall")), number(row.get("list_precision")), number(row["moves_of_successes"], 1)]
+            cells += [
+                with_interval(row, "success_of_arm_can", "success_of_arm_can_ci95"),
+                number(row["found_of_hidden"]),
+            ]
+            cells += [
+                number(row.get("list_recall")),
+                number(row.get("list_precision")),
+                number(row["moves_of_successes"], 1),
+            ]
             failures = ", ".join(f"{count} {reason}" for reason, count in row["failed_of"].items())
             commits = ", ".join(row.get("commits", [held.get("commit")]))
             minutes = number(row["robot_minutes"], 1) if row["motion"] == "arm" else ""
-            told.append([*cells, minutes, number(row["wall_seconds"], 0), failures or "none", f"`{path.name}`, {commits}"])
-    head = ["set", "perception", "motion", "episodes", "success", "arm can", "success of these", "found of hidden", "list recall"]
+            told.append(
+                [
+                    *cells,
+                    minutes,
+                    number(row["wall_seconds"], 0),
+                    failures or "none",
+                    f"`{path.name}`, {commits}",
+                ]
+            )
+    head = [
+        "set",
+        "perception",
+        "motion",
+        "episodes",
+        "success",
+        "arm can",
+        "success of these",
+        "found of hidden",
+        "list recall",
+    ]
     head += ["list precision", "moves", "robot min", "wall s", "the others", "from"]
     return f"""## The closed loop
 
@@ -291,12 +429,26 @@ def detectors() -> str:
     for path in sorted(RESULTS.glob("detector_*.json")):
         held = json.loads(path.read_text())
         for name, row in held["rows"].items() if isinstance(held, dict) else ():
-            cells = [held["detector"], name, str(row["images"]), with_interval(row["in_view"], "recall", "ci95")]
+            cells = [
+                held["detector"],
+                name,
+                str(row["images"]),
+                with_interval(row["in_view"], "recall", "ci95"),
+            ]
             cells += [number(row["precision"]), number(row["class_accuracy_of_found"])]
             for key in ("translation_mm", "rotation_deg", "ms_per_frame"):
                 cells.append(" / ".join(number(value, 1) for value in row[key]))
             told.append([*cells, f"`{path.name}`, {held['commit']}"])
-    head = ["detector", "images of", "images", "recall, in view", "precision", "class right", "translation mm", "rotation deg"]
+    head = [
+        "detector",
+        "images of",
+        "images",
+        "recall, in view",
+        "precision",
+        "class right",
+        "translation mm",
+        "rotation deg",
+    ]
     return f"""## Learned perception
 
 Objects of which at least 30 % are seen; found is one that a detection of its class covers with an IoU of 0.5. Errors and ms per

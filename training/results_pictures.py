@@ -49,7 +49,9 @@ def episodes_of(name: str, agent: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()[1:]] if path.exists() else []
 
 
-def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]]], labels: Mapping[str, str]) -> None:
+def draw_curves(
+    path: Path, histories: Mapping[str, Sequence[Mapping[str, float]]], labels: Mapping[str, str]
+) -> None:
     """How trainings went, each a line, other seeds paler: a panel for every figure that has a label."""
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
     figure, panels = plt.subplots(1, len(labels), figsize=(18, 5.5), layout="constrained")
@@ -60,7 +62,13 @@ def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]
         colour = colours.setdefault(whose, f"C{len(colours)}")
         for panel, (name, label) in zip(panels, labels.items(), strict=True):
             steps, values = [row["step"] / 1000 for row in history], [row[name] for row in history]
-            panel.plot(steps, values, color=colour, alpha=1 if first else 0.4, label=whose if first else None)
+            panel.plot(
+                steps,
+                values,
+                color=colour,
+                alpha=1 if first else 0.4,
+                label=whose if first else None,
+            )
             panel.set(xlabel="steps / 1000", ylabel=label)
             panel.grid(alpha=0.4)
     panels[0].legend()
@@ -70,14 +78,20 @@ def draw_curves(path: Path, histories: Mapping[str, Sequence[Mapping[str, float]
 
 def draw_stacks(path: Path) -> None:
     """How high the stacks of each agent are, and of what classes its scenes are, at 25 nodes."""
-    rows = [row for row in read("table1.json")["rows"] if row["nodes"] == 25 and row["objects"] == "ycb7"]
+    rows = [
+        row
+        for row in read("table1.json")["rows"]
+        if row["nodes"] == 25 and row["objects"] == "ycb7"
+    ]
     rows = [row for row in rows if row["temperature"] is None and "/" not in row["agent"]]
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
     figure, (left, right) = plt.subplots(1, 2, figsize=(18, 6.5), layout="constrained")
     for k, row in enumerate(rows):
         share = [count / sum(row["stack_heights_5cm"]) for count in row["stack_heights_5cm"]]
         left.stairs(share, range(0, 5 * len(share) + 1, 5), label=row["agent"], linewidth=3)
-        places = [n + (k - (len(rows) - 1) / 2) * 0.8 / len(rows) for n in range(len(row["classes"]))]
+        places = [
+            n + (k - (len(rows) - 1) / 2) * 0.8 / len(rows) for n in range(len(row["classes"]))
+        ]
         shares = [count / sum(row["classes"].values()) for count in row["classes"].values()]
         right.bar(places, shares, 0.8 / len(rows), label=row["agent"])
     left.set(xlabel="height of a stack, cm", ylabel="share of the stacks")
@@ -94,10 +108,16 @@ def draw_stacks(path: Path) -> None:
 def draw_found(path: Path) -> None:
     """What was found over the moves, of what was hidden: a panel for each set, on the scenes that all agents have played."""
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
-    figure, panels = plt.subplots(2, 2, figsize=(18, 12), layout="constrained", sharex=True, sharey=True)
+    figure, panels = plt.subplots(
+        2, 2, figsize=(18, 12), layout="constrained", sharex=True, sharey=True
+    )
     for panel, name in zip(panels.flat, SETS, strict=True):
         draw_set(panel, name)
-    handles = {label: line for panel in panels.flat for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+    handles = {
+        label: line
+        for panel in panels.flat
+        for line, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=4)
     figure.savefig(path, dpi=80)
     plt.close(figure)
@@ -105,7 +125,9 @@ def draw_found(path: Path) -> None:
 
 def draw_set(panel: Axes, name: str) -> None:
     """A panel of `draw_found`."""
-    played = {agent: episodes for agent in AGENTS if len(episodes := episodes_of(name, agent)) >= FEWEST}
+    played = {
+        agent: episodes for agent in AGENTS if len(episodes := episodes_of(name, agent)) >= FEWEST
+    }
     count = min(len(episodes) for episodes in played.values())
     for agent, episodes in played.items():
         hidden, found = sum(e["hidden"] for e in episodes[:count]), np.zeros(MOVES + 1)
@@ -113,8 +135,18 @@ def draw_set(panel: Axes, name: str) -> None:
             after = [0, *e["found_after"]]
             found += np.pad(after, (0, MOVES + 1 - len(after)), mode="edge")
         label, colour = AGENTS[agent]
-        panel.plot(found / hidden, label=label, color=colour, linestyle="--" if agent == "full-knowledge" else "-")
-    panel.set(title=f"{SETS[name]}; {count} scenes", xlim=(0, MOVES), ylim=(0, 1.02), xticks=range(0, MOVES + 1, 5))
+        panel.plot(
+            found / hidden,
+            label=label,
+            color=colour,
+            linestyle="--" if agent == "full-knowledge" else "-",
+        )
+    panel.set(
+        title=f"{SETS[name]}; {count} scenes",
+        xlim=(0, MOVES),
+        ylim=(0, 1.02),
+        xticks=range(0, MOVES + 1, 5),
+    )
     panel.set(xlabel="moves", ylabel="found, of the hidden objects")
     panel.label_outer()
     panel.grid(alpha=0.4)
@@ -122,12 +154,21 @@ def draw_set(panel: Axes, name: str) -> None:
 
 def main() -> None:
     """Draws all of them."""
-    seeds = {f"seed {f.stem[-1]}": json.loads(f.read_text())["history"] for f in sorted(RESULTS.glob("sg_star_seed_*.json"))}
+    seeds = {
+        f"seed {f.stem[-1]}": json.loads(f.read_text())["history"]
+        for f in sorted(RESULTS.glob("sg_star_seed_*.json"))
+    }
     labels = {"score": "return of a scene", "hidden": "hidden objects", "stable": "stable, share"}
     draw_curves(IMAGES / "learning_curves.png", seeds, labels)
     explorers = {row["agent"]: row["history"] for row in read("explorer_trainings.json")["rows"]}
-    by_moves = {agent: history for agent, history in explorers.items() if history[-1]["step"] > 1000}  # clones count rounds
-    labels = {"success": "everything found, share", "moves_of_successes": "moves of successes", "collapsed": "collapsed, share"}
+    by_moves = {
+        agent: history for agent, history in explorers.items() if history[-1]["step"] > 1000
+    }  # clones count rounds
+    labels = {
+        "success": "everything found, share",
+        "moves_of_successes": "moves of successes",
+        "collapsed": "collapsed, share",
+    }
     draw_curves(IMAGES / "explorer_curves.png", by_moves, labels)
     draw_stacks(IMAGES / "stacks.png")
     draw_found(IMAGES / "explorers.png")

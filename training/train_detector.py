@@ -21,7 +21,11 @@ from drake_clutter.files import told_in_one_line
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
-from drake_clutter.perception.segmentation_learning import SegmentationConfig, SegmentationLearner, example
+from drake_clutter.perception.segmentation_learning import (
+    SegmentationConfig,
+    SegmentationLearner,
+    example,
+)
 from drake_clutter.seeding import item_rng
 from drake_clutter.validation import Between, Flag, config_class, load_typed
 
@@ -55,9 +59,17 @@ class TrainDetector:
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainDetector.")] = None,
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainDetector.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
 ) -> None:
@@ -65,14 +77,21 @@ def main(
     given = load_typed(TrainDetector(), config, settings or [], upgrade)
     torch.set_num_threads(threads)
     chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
-    classes = [c.name for c in load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(given.objects)]
+    classes = [
+        c.name
+        for c in load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(
+            given.objects
+        )
+    ]
     images = ImageSet(Path(given.images))
     learned = len(images) - given.held_out
     torch.manual_seed(given.seed)
     network = SegmentationNetwork(classes, given.looks_at_color)
     if given.warm_start:
         network.begin_with(SegmentationNetwork.load(Path(given.warm_start)))
-    learner = SegmentationLearner(network, images.__getitem__, learned, given.learning, camera, support, given.seed, chosen)
+    learner = SegmentationLearner(
+        network, images.__getitem__, learned, given.learning, camera, support, given.seed, chosen
+    )
     run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, support)
 
     def figures() -> dict[str, float]:
@@ -80,7 +99,9 @@ def main(
         network.eval()
         both, either, errors = np.zeros(len(classes)), np.zeros(len(classes)), list[float]()
         for k in range(learned, len(images)):
-            shown = example(images[k], classes, camera, window, item_rng(given.seed, 1, k), given.looks_at_color)
+            shown = example(
+                images[k], classes, camera, window, item_rng(given.seed, 1, k), given.looks_at_color
+            )
             with torch.inference_mode():
                 logits, votes = network(torch.from_numpy(shown.image)[None].to(chosen))
             kind = logits[0].argmax(dim=0).cpu().numpy()
@@ -89,14 +110,22 @@ def main(
                 both[c], either[c] = both[c] + (is_ & said).sum(), either[c] + (is_ | said).sum()
             error = np.linalg.norm(votes[0].cpu().numpy() - shown.to_middle, axis=0)[kind > 0]
             errors.append(float(np.nanmedian(error)) if np.isfinite(error).any() else np.nan)
-        return {"iou": float(np.mean(both / np.maximum(either, 1))), "median_vote_mm": 1000 * float(np.nanmean(errors))}
+        return {
+            "iou": float(np.mean(both / np.maximum(either, 1))),
+            "median_vote_mm": 1000 * float(np.nanmean(errors)),
+        }
 
     while learner.step < given.learning.steps:
         learner.advance()
         if learner.step == given.learning.steps or learner.step % given.evaluate_every == 0:
             run.report(figures(), learner.losses)
             run.save()
-    about = {"kind": DETECTOR, "classes": classes, "looks_at_color": given.looks_at_color, "images": learned}
+    about = {
+        "kind": DETECTOR,
+        "classes": classes,
+        "looks_at_color": given.looks_at_color,
+        "images": learned,
+    }
     run.finish(CHECKPOINT, network, about)
 
 

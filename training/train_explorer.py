@@ -41,9 +41,17 @@ class TrainExplorer(ExplorerTraining):
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainExplorer.")] = None,
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainExplorer.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
@@ -53,9 +61,13 @@ def main(
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
     kind = TEACHER if given.privileged else STUDENT
     if given.warm_start:
-        begun, numbers = load_explorer(load_checkpoint(Path(given.warm_start)), Path(given.warm_start), kind)
+        begun, numbers = load_explorer(
+            load_checkpoint(Path(given.warm_start)), Path(given.warm_start), kind
+        )
         if (numbers, len(begun.mark)) != (environment.numbers, given.learning.width):
-            raise InputError(f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same")
+            raise InputError(
+                f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same"
+            )
         learner.network.load_state_dict(begun.state_dict())
     files = [Path(file) for file in (given.scenes, given.warm_start) if file]
     run = TrainingRun(out, given, learner, given.learning.steps, files)

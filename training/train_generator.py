@@ -68,23 +68,39 @@ def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float
         "hidden": float(np.mean(hidden)) if hidden else 0.0,
         "distinct": len(forms) / max(1, len(made)),
         "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if made else 0.0,
-        "balanced": float(np.mean([graph.largest_stack_share() <= MOST_IN_A_STACK for graph in graphs])) if made else 0.0,
+        "balanced": float(
+            np.mean([graph.largest_stack_share() <= MOST_IN_A_STACK for graph in graphs])
+        )
+        if made
+        else 0.0,
         "rarest_class": min(used[name] for name in classes) / max(1, used.total()),
     }
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up.")],
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainGenerator.")] = None,
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's.")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainGenerator.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    threads: Annotated[int, typer.Option(min=1, max=PARTS, help="That work on an update; changes no result.")] = PARTS,
+    threads: Annotated[
+        int, typer.Option(min=1, max=PARTS, help="That work on an update; changes no result.")
+    ] = PARTS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
     given = load_typed(TrainGenerator(), config, settings or [], upgrade)
     chosen = device_of(device)
     one_thread_per_operation()
-    classes = load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(given.objects)
+    classes = load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(
+        given.objects
+    )
 
     def make_environment() -> ClutterGeneration:
         return ClutterGeneration(classes, given.task, given.world)
@@ -96,8 +112,16 @@ def main(
     run, losses = TrainingRun(out, given, learner, learning.steps), list[float]()
 
     def evaluate() -> None:
-        episodes = play(learner.network, make_environment, given.evaluation_scenes, learning.temperature, given.seed)
-        run.report(figures(episodes, example.grammar.classes), {"loss": float(np.mean(losses or [0.0]))})
+        episodes = play(
+            learner.network,
+            make_environment,
+            given.evaluation_scenes,
+            learning.temperature,
+            given.seed,
+        )
+        run.report(
+            figures(episodes, example.grammar.classes), {"loss": float(np.mean(losses or [0.0]))}
+        )
         losses.clear()
 
     while learner.step < learning.steps:

@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from drake_clutter.agents.exploration_episodes import Played, acting, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
-from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
+from drake_clutter.learning.checkpoint import (
+    learner_tensors,
+    load_tensors,
+    restore_learner,
+    save_tensors,
+)
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.validation import Between, NonNegative, config_class
@@ -58,7 +63,13 @@ class ActorCritic:
         losses: of the latest round.
     """
 
-    def __init__(self, environment: ClutterExploration, config: ActorCriticConfig, seed: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        environment: ClutterExploration,
+        config: ActorCriticConfig,
+        seed: int,
+        device: torch.device,
+    ) -> None:
         """Begins a training; the environment shows what the explorer is to see."""
         self.config, self._environment, self._seed = config, environment, seed
         torch.manual_seed(seed)
@@ -70,7 +81,12 @@ class ActorCritic:
     def advance(self) -> list[Played]:
         """One round; returns its episodes."""
         rng = item_rng(self._seed, 1, self._round)
-        played = play_episodes(self._environment, self.config.episodes, (self._seed, 2, self._round), acting(self.network, rng))
+        played = play_episodes(
+            self._environment,
+            self.config.episodes,
+            (self._seed, 2, self._round),
+            acting(self.network, rng),
+        )
         self.learn(played, rng)
         self.step += sum(len(episode.moves) for episode in played)
         self._round += 1
@@ -85,7 +101,9 @@ class ActorCritic:
         gain = torch.from_numpy(np.concatenate(advantages))
         aim = gain + torch.tensor([value for episode in played for _, value in episode.notes])
         gain = (gain - gain.mean()) / (gain.std(correction=0) + 1e-6)
-        observations = stacked_graphs([observation for episode in played for observation in episode.observations])
+        observations = stacked_graphs(
+            [observation for episode in played for observation in episode.observations]
+        )
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * max(0.02, 1 - self.step / config.steps)
         sums, updates = np.zeros(3), 0
@@ -98,7 +116,9 @@ class ActorCritic:
                 places = self.network.places(found, chosen[:, 0])
                 ratio = (log_probability(found, places, chosen) - before[part].to(device)).exp()
                 better = gain[part].to(device)
-                policy = -torch.minimum(ratio * better, ratio.clamp(1 - config.clip, 1 + config.clip) * better).mean()
+                policy = -torch.minimum(
+                    ratio * better, ratio.clamp(1 - config.clip, 1 + config.clip) * better
+                ).mean()
                 value = torch.nn.functional.smooth_l1_loss(found.value, aim[part].to(device))
                 entropy = _entropy(found.pick) + _entropy(places)
                 loss = policy + config.value * value - config.entropy * entropy
@@ -108,7 +128,9 @@ class ActorCritic:
                 self._optimizer.step()
                 sums += [policy.item(), value.item(), entropy.item()]
                 updates += 1
-        self.losses = dict(zip(("policy", "value", "entropy"), (sums / updates).tolist(), strict=True))
+        self.losses = dict(
+            zip(("policy", "value", "entropy"), (sums / updates).tolist(), strict=True)
+        )
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""

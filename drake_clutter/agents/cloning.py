@@ -14,8 +14,19 @@ import torch
 from numpy.typing import NDArray
 
 from drake_clutter.agents.exploration_episodes import Played, play_episodes
-from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, log_probability, stacked_graphs
-from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
+from drake_clutter.agents.explorer_network import (
+    ExplorerNetwork,
+    decide,
+    log_probability,
+    stacked_graphs,
+)
+from drake_clutter.learning.checkpoint import (
+    learner_tensors,
+    load_tensors,
+    part_of,
+    restore_learner,
+    save_tensors,
+)
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation
@@ -53,10 +64,20 @@ class Cloning:
     """
 
     def __init__(
-        self, environment: ClutterExploration, teacher: ExplorerNetwork, config: CloningConfig, seed: int, device: torch.device
+        self,
+        environment: ClutterExploration,
+        teacher: ExplorerNetwork,
+        config: CloningConfig,
+        seed: int,
+        device: torch.device,
     ) -> None:
         """Begins a training; the environment shows K_t."""
-        self.config, self._environment, self._teacher, self._seed = config, environment, teacher, seed
+        self.config, self._environment, self._teacher, self._seed = (
+            config,
+            environment,
+            teacher,
+            seed,
+        )
         torch.manual_seed(seed)
         self.network = ExplorerNetwork(len(environment.numbers), config.width).to(device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
@@ -74,13 +95,24 @@ class Cloning:
             environments: Sequence[ClutterExploration], observations: Sequence[GraphObservation]
         ) -> tuple[NDArray[np.int64], list[Any]]:
             wanted = self.wanted(environments)
-            played = decide(self.network, stacked_graphs(observations), rng)[0] if student_plays else wanted
+            played = (
+                decide(self.network, stacked_graphs(observations), rng)[0]
+                if student_plays
+                else wanted
+            )
             return played, list(wanted)
 
-        played = play_episodes(self._environment, self.config.episodes, (self._seed, 2, self.step), act)
-        states = stacked_graphs([observation for episode in played for observation in episode.observations])
+        played = play_episodes(
+            self._environment, self.config.episodes, (self._seed, 2, self.step), act
+        )
+        states = stacked_graphs(
+            [observation for episode in played for observation in episode.observations]
+        )
         moves = np.array([move for episode in played for move in episode.notes])
-        self._states = {name: np.concatenate([self._states[name], new]) if self._states else new for name, new in states.items()}
+        self._states = {
+            name: np.concatenate([self._states[name], new]) if self._states else new
+            for name, new in states.items()
+        }
         self._moves = np.concatenate([self._moves, moves])
         self._learn(rng)
         self.step += 1
@@ -88,12 +120,16 @@ class Cloning:
 
     def wanted(self, environments: Sequence[ClutterExploration]) -> NDArray[np.int64]:
         """(B, 2) what the teacher would do, as nodes of the student's graphs."""
-        moves = decide(self._teacher, stacked_graphs([e.observe(privileged=True) for e in environments]), None)[0]
+        moves = decide(
+            self._teacher, stacked_graphs([e.observe(privileged=True) for e in environments]), None
+        )[0]
         found = np.zeros_like(moves)
         for row, environment in enumerate(environments):
             known = environment.objects
             names = environment.task.scene.names
-            found[row] = [known.index(names[node - 1]) + 1 if node else 0 for node in moves[row].tolist()]
+            found[row] = [
+                known.index(names[node - 1]) + 1 if node else 0 for node in moves[row].tolist()
+            ]
         return found
 
     def _learn(self, rng: np.random.Generator) -> None:

@@ -71,7 +71,14 @@ class EpisodeResult:
 class EpisodePlayer:
     """Plays episodes at a fidelity; a worker for the runner."""
 
-    def __init__(self, config: ClutterConfig, catalogue_folder: Path | None, max_moves: int, seed: int, fidelity: str) -> None:
+    def __init__(
+        self,
+        config: ClutterConfig,
+        catalogue_folder: Path | None,
+        max_moves: int,
+        seed: int,
+        fidelity: str,
+    ) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
         # In this process: an object class is known by its identity.
         self._catalogue = load_catalogue(catalogue_folder)
@@ -112,7 +119,10 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
         results: of one agent, on scenes that hide something.
         limits: of moves, at most those that were allowed.
     """
-    row: dict[str, Any] = {"episodes": len(results), "hidden": float(np.mean([r.hidden for r in results]))}
+    row: dict[str, Any] = {
+        "episodes": len(results),
+        "hidden": float(np.mean([r.hidden for r in results])),
+    }
     for limit in limits:
         won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
         found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
@@ -130,5 +140,7 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
     won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
     row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
     row["moves_of_successes_ci95"] = mean_interval(won_moves)
-    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, sum(r.moves for r in results))
+    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(
+        1, sum(r.moves for r in results)
+    )
     return row

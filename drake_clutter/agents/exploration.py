@@ -138,6 +138,8 @@ def make_explorers(name: str, config: ClutterConfig, classes: Collection[str] = 
         allowed = ", ".join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])
         raise InputError(f"--agent {name}; allowed are {allowed}, or a .safetensors file")
     path = checkpoint_path(name, TRAINED)
-    from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch, which the others do without
+    from drake_clutter.agents.learned_explorer import (
+        LearnedExplorers,
+    )  # takes PyTorch, which the others do without
 
     return LearnedExplorers(path, config.exploration, classes)

@@ -14,7 +14,9 @@ from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.exploration_graph import GraphObservation
 
-Act = Callable[[Sequence[ClutterExploration], Sequence[GraphObservation]], tuple[NDArray[np.int64], list[Any]]]
+Act = Callable[
+    [Sequence[ClutterExploration], Sequence[GraphObservation]], tuple[NDArray[np.int64], list[Any]]
+]
 """From environments and what they show: (B, 2) moves, and what is to be noted with each."""
 
 
@@ -38,7 +40,11 @@ class Played:
 
 
 def play_episodes(
-    environment: ClutterExploration, count: int, seed: Sequence[int], act: Act, side_by_side: int = 32
+    environment: ClutterExploration,
+    count: int,
+    seed: Sequence[int],
+    act: Act,
+    side_by_side: int = 32,
 ) -> list[Played]:
     """Plays episodes; the same for the same path of seeds.
 
@@ -59,7 +65,10 @@ def play_episodes(
             running[number] = twin, observation
         if not running:
             return played
-        moves, notes = act([twin for twin, _ in running.values()], [observation for _, observation in running.values()])
+        moves, notes = act(
+            [twin for twin, _ in running.values()],
+            [observation for _, observation in running.values()],
+        )
         for number, move, note in zip(list(running), moves, notes, strict=True):
             twin, before = running[number]
             episode = played[number]
@@ -70,14 +79,20 @@ def play_episodes(
             episode.notes.append(note)
             running[number] = twin, observation
             if over or out_of_moves:
-                episode.end, episode.hidden, episode.found = info["end"], len(twin.task.hidden_at_start), len(twin.task.found)
+                episode.end, episode.hidden, episode.found = (
+                    info["end"],
+                    len(twin.task.hidden_at_start),
+                    len(twin.task.found),
+                )
                 del running[number]
 
 
 def acting(network: ExplorerNetwork, rng: np.random.Generator | None) -> Act:
     """A network's moves, drawn, or without a generator the most likely; noted are log-probability and value."""
 
-    def act(_: Sequence[ClutterExploration], observations: Sequence[GraphObservation]) -> tuple[NDArray[np.int64], list[Any]]:
+    def act(
+        _: Sequence[ClutterExploration], observations: Sequence[GraphObservation]
+    ) -> tuple[NDArray[np.int64], list[Any]]:
         moves, chance, value = decide(network, stacked_graphs(observations), rng)[:3]
         return moves, list(zip(chance.tolist(), value.tolist(), strict=True))
 

@@ -30,7 +30,10 @@ def stacked_graphs(observations: Sequence[GraphObservation]) -> GraphObservation
         "glob": (len(GLOBALS),),
         "allowed": (nodes, nodes),
     }
-    batch = {name: np.zeros((len(observations), *shape), observations[0][name].dtype) for name, shape in shapes.items()}
+    batch = {
+        name: np.zeros((len(observations), *shape), observations[0][name].dtype)
+        for name, shape in shapes.items()
+    }
     for k, observation in enumerate(observations):
         for name in shapes:
             corner = tuple(slice(size) for size in observation[name].shape)
@@ -63,7 +66,9 @@ class ExplorerNetwork(nn.Module):
             width: of the embeddings.
         """
         super().__init__()
-        self.network = GraphNetwork(node_kinds, len(FEATURES), 2 * len(EDGE_KINDS), len(GLOBALS), width)
+        self.network = GraphNetwork(
+            node_kinds, len(FEATURES), 2 * len(EDGE_KINDS), len(GLOBALS), width
+        )
         self.pick = nn.Linear(width, 1)
         self.mark = nn.Parameter(torch.zeros(width))
         self.after_pick = MessagePassing(width, 3, 2)
@@ -80,16 +85,18 @@ class ExplorerNetwork(nn.Module):
         feature = torch.from_numpy(observation["feature"][graph, number]).to(weight)
         links = Links(*(torch.from_numpy(array).to(weight.device) for array in (graph, *joined)))
         glob = torch.from_numpy(observation["glob"]).to(weight)
-        return GraphBatch(torch.from_numpy(kind).to(weight.device), feature, links, glob), torch.from_numpy(number).to(
-            weight.device
-        )
+        return GraphBatch(
+            torch.from_numpy(kind).to(weight.device), feature, links, glob
+        ), torch.from_numpy(number).to(weight.device)
 
     def forward(self, observation: Mapping[str, NDArray[Any]]) -> Evaluated:
         """What to pick, and what is to be expected."""
         batch, number = self.batch(observation)
         node, glob = self.network(batch)
         allowed = torch.from_numpy(observation["allowed"]).to(node.device) > 0
-        pick = _log_softmax(self.pick(node).squeeze(1), batch.links.graph, number, allowed.any(dim=2))
+        pick = _log_softmax(
+            self.pick(node).squeeze(1), batch.links.graph, number, allowed.any(dim=2)
+        )
         return Evaluated(pick, self.value(glob).squeeze(1), (node, glob, batch, number, allowed))
 
     def places(self, found: Evaluated, picked: Tensor) -> Tensor:
@@ -99,7 +106,9 @@ class ExplorerNetwork(nn.Module):
         edge = leaky_relu(self.network.edge.weight)
         node, _ = self.after_pick(node + marked, glob, edge, batch.links)
         rows = torch.arange(len(glob), device=node.device)
-        return _log_softmax(self.place(node).squeeze(1), batch.links.graph, number, allowed[rows, picked])
+        return _log_softmax(
+            self.place(node).squeeze(1), batch.links.graph, number, allowed[rows, picked]
+        )
 
 
 def _log_softmax(score: Tensor, graph: Tensor, number: Tensor, allowed: Tensor) -> Tensor:
@@ -108,14 +117,20 @@ def _log_softmax(score: Tensor, graph: Tensor, number: Tensor, allowed: Tensor) 
     return padded.masked_fill(~allowed, -torch.inf).log_softmax(dim=1)
 
 
-def chosen(log_probabilities: NDArray[np.float32], rng: np.random.Generator | None) -> NDArray[np.int64]:
+def chosen(
+    log_probabilities: NDArray[np.float32], rng: np.random.Generator | None
+) -> NDArray[np.int64]:
     """(B,) drawn from (B, N) log-probabilities, or without a generator the most likely."""
-    noise = 0.0 if rng is None else rng.gumbel(size=log_probabilities.shape)  # the largest with Gumbel noise is such a draw
+    noise = (
+        0.0 if rng is None else rng.gumbel(size=log_probabilities.shape)
+    )  # the largest with Gumbel noise is such a draw
     return np.asarray((log_probabilities + noise).argmax(axis=1))
 
 
 def decide(
-    network: ExplorerNetwork, observation: Mapping[str, NDArray[Any]], rng: np.random.Generator | None
+    network: ExplorerNetwork,
+    observation: Mapping[str, NDArray[Any]],
+    rng: np.random.Generator | None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Moves for a batch, drawn, or without a generator the most likely.
 
@@ -129,7 +144,12 @@ def decide(
         places = network.places(found, torch.from_numpy(x).to(found.pick.device)).cpu().numpy()
     y = chosen(places, rng)
     rows = np.arange(len(x))
-    return np.column_stack([x, y]), picks[rows, x] + places[rows, y], found.value.cpu().numpy(), np.exp(picks)
+    return (
+        np.column_stack([x, y]),
+        picks[rows, x] + places[rows, y],
+        found.value.cpu().numpy(),
+        np.exp(picks),
+    )
 
 
 def log_probability(found: Evaluated, places: Tensor, moves: Tensor) -> Tensor:

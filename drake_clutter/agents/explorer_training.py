@@ -40,7 +40,9 @@ class ExplorerTraining:
     def environment(self, *, privileged: bool = False) -> ClutterExploration:
         """Where it learns; `privileged`: it sees everything, or K_t."""
         return ClutterExploration(
-            load_scene_set(Path(self.scenes), load_catalogue(Path(self.catalogue) if self.catalogue else None)),
+            load_scene_set(
+                Path(self.scenes), load_catalogue(Path(self.catalogue) if self.catalogue else None)
+            ),
             privileged=privileged,
             fidelity=backends(self.fidelity, self.world),
             config=self.world,
@@ -48,6 +50,12 @@ class ExplorerTraining:
             most_objects=self.most_objects,
         )
 
-    def evaluation(self, environment: ClutterExploration, network: ExplorerNetwork) -> dict[str, float]:
+    def evaluation(
+        self, environment: ClutterExploration, network: ExplorerNetwork
+    ) -> dict[str, float]:
         """How a network does, on the same episodes every time."""
-        return figures(play_episodes(environment, self.evaluation_episodes, (self.seed, 3), acting(network, None)))
+        return figures(
+            play_episodes(
+                environment, self.evaluation_episodes, (self.seed, 3), acting(network, None)
+            )
+        )

@@ -11,7 +11,13 @@ import numpy as np
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar, canonical_form, uniform_choice
+from drake_clutter.grammar import (
+    Derivation,
+    NodeBudget,
+    SceneGrammar,
+    canonical_form,
+    uniform_choice,
+)
 from drake_clutter.learning.shipped import checkpoint_path, weights_of
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
@@ -33,7 +39,9 @@ LAYOUT_TRIES = 1000
 class GenerationAgent(Protocol):
     """Derives terminal graphs."""
 
-    def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
+    def derive(
+        self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
+    ) -> Derivation:
         """A terminal graph within the budget."""
 
 
@@ -48,7 +56,9 @@ TRAINED = {
 class RandomGenerator:
     """RG: uniform over the feasible rules, the first match of the rule that is drawn (SPEC section 3)."""
 
-    def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
+    def derive(
+        self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
+    ) -> Derivation:
         """See `GenerationAgent.derive`."""
         return grammar.derive(budget, uniform_choice(rng))
 
@@ -66,7 +76,9 @@ class HillClimber:
         self._config = config
         self._judge = FastJudge(config, margin=GenerationTask().margin)
 
-    def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
+    def derive(
+        self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
+    ) -> Derivation:
         """See `GenerationAgent.derive`."""
         task = GenerationTask(nodes=budget.nodes)
         best, best_worth = None, -np.inf
@@ -84,7 +96,9 @@ class HillClimber:
         return best
 
 
-def make_generation_agent(name: str, config: ClutterConfig, temperature: float | None = None) -> GenerationAgent:
+def make_generation_agent(
+    name: str, config: ClutterConfig, temperature: float | None = None
+) -> GenerationAgent:
     """A generation agent: `random`, `hill-climbing`, one of `TRAINED`, or the checkpoint in a file.
 
     Args:
@@ -97,15 +111,21 @@ def make_generation_agent(name: str, config: ClutterConfig, temperature: float |
     """
     learned = name in TRAINED or name.endswith(".safetensors")
     if temperature is not None and not (learned and temperature > 0):
-        raise InputError(f"--temperature {temperature:g} for {name}; allowed is a positive one, for a trained agent")
+        raise InputError(
+            f"--temperature {temperature:g} for {name}; allowed is a positive one, for a trained agent"
+        )
     if name == "random":
         return RandomGenerator()
     if name == "hill-climbing":
         return HillClimber(config)
     if not learned:
-        raise InputError(f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file")
+        raise InputError(
+            f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file"
+        )
     path = checkpoint_path(name, TRAINED)
-    from drake_clutter.agents.learned_generator import LearnedGenerator  # takes PyTorch, which the others do without
+    from drake_clutter.agents.learned_generator import (
+        LearnedGenerator,
+    )  # takes PyTorch, which the others do without
 
     return LearnedGenerator(path, config, temperature)
 
@@ -175,7 +195,9 @@ class SceneGenerator:
         verdict = self._judge.judge(scene, rng)
         solvable = None
         if verdict.stable:
-            solvable = self._search.solve(scene.at(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False).answer
+            solvable = self._search.solve(
+                scene.at(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False
+            ).answer
         return GeneratedScene(scene, verdict, failures, solvable)
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
@@ -183,15 +205,21 @@ class SceneGenerator:
         failures: Counter[str] = Counter()
         for _ in range(LAYOUT_TRIES):
             derivation = self._agent.derive(self._grammar, self._budget, rng)
-            scene = lay_out(derivation, self._grammar.classes, self._job.config, rng, self._job.seed)
+            scene = lay_out(
+                derivation, self._grammar.classes, self._job.config, rng, self._job.seed
+            )
             if not isinstance(scene, LayoutFailure):
                 return scene, failures
             failures[scene.reason.value] += 1
-        raise RuntimeError(f"{LAYOUT_TRIES} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}")
+        raise RuntimeError(
+            f"{LAYOUT_TRIES} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}"
+        )
 
 
 def summarise(
-    job: GenerationJob, scenes: Iterable[tuple[Scene, Verdict]], solvable: Sequence[Solvability | None] | None = None
+    job: GenerationJob,
+    scenes: Iterable[tuple[Scene, Verdict]],
+    solvable: Sequence[Solvability | None] | None = None,
 ) -> dict[str, Any]:
     """The figures of a batch: stability over all scenes, hidden and solvable over the stable ones (SPEC section 6).
 

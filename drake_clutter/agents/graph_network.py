@@ -41,8 +41,12 @@ class MessagePassing(nn.Module):
         super().__init__()
 
         def linear(outputs: int, inputs: int, bias: bool = True) -> list[nn.Parameter]:
-            each = [[*nn.Linear(inputs, outputs, bias).parameters()] for _ in range(layers)]  # as PyTorch begins
-            return [nn.Parameter(torch.stack(weights).detach()) for weights in zip(*each, strict=True)]
+            each = [
+                [*nn.Linear(inputs, outputs, bias).parameters()] for _ in range(layers)
+            ]  # as PyTorch begins
+            return [
+                nn.Parameter(torch.stack(weights).detach()) for weights in zip(*each, strict=True)
+            ]
 
         self.sender, self.sender_bias = linear(width, width)
         (self.edge,) = linear(width, edge_width, bias=False)
@@ -58,7 +62,9 @@ class MessagePassing(nn.Module):
         """Its parameters."""
         return LayerWeights(*(getattr(self, name) for name in LayerWeights._fields))
 
-    def forward(self, node: Tensor, glob: Tensor, edge: Tensor, links: Links) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, node: Tensor, glob: Tensor, edge: Tensor, links: Links
+    ) -> tuple[Tensor, Tensor]:
         """Embeddings of nodes (M, H) and of graphs (B, H) after the last layer; edge: (kinds of edges, H_edge)."""
         return message_passing(node, glob, edge, links, self.weights)
 
@@ -115,10 +121,17 @@ class RuleValues(nn.Module):
         weight = self.value.weight
         kinds, edges = observation["node_kind"], (observation["edge"], observation["edge_kind"])
         graph, number, kind, *joined = pack(kinds, *edges, self._edge_kinds)
-        feature = np.concatenate([observation["node_flags"][graph, number], observation["position"][graph, number]], axis=1)
-        features = (torch.from_numpy(array).to(weight) for array in (feature, observation["remaining"]))
+        feature = np.concatenate(
+            [observation["node_flags"][graph, number], observation["position"][graph, number]],
+            axis=1,
+        )
+        features = (
+            torch.from_numpy(array).to(weight) for array in (feature, observation["remaining"])
+        )
         links = Links(*(torch.from_numpy(array).to(weight.device) for array in (graph, *joined)))
-        return GraphBatch(torch.from_numpy(kind).to(weight.device), next(features), links, next(features))
+        return GraphBatch(
+            torch.from_numpy(kind).to(weight.device), next(features), links, next(features)
+        )
 
     def forward(self, observation: Mapping[str, NDArray[Any]]) -> Tensor:
         """(B, rules)."""
@@ -126,6 +139,8 @@ class RuleValues(nn.Module):
         node, glob = self.network(batch)
         row, mark = batch.feature[:, 1 : 1 + MARKS].nonzero(as_tuple=True)
         marked = node.new_zeros(len(glob) * MARKS, node.shape[1])
-        marked = marked.index_copy(0, batch.links.graph[row] * MARKS + mark, node[row]).view(len(glob), -1)
+        marked = marked.index_copy(0, batch.links.graph[row] * MARKS + mark, node[row]).view(
+            len(glob), -1
+        )
         values: Tensor = self.value(leaky_relu(self.joined(torch.cat([glob, marked], dim=1))))
         return values

@@ -26,10 +26,17 @@ TEACHER, STUDENT = "teacher", "student"
 
 def about_explorer(numbers: dict[str, int], width: int) -> dict[str, Any]:
     """What the inputs of an `ExplorerNetwork` stand for, for its checkpoint."""
-    return {"node_kinds": list(numbers), "features": list(FEATURES), "edge_kinds": list(EDGE_KINDS), "width": width}
+    return {
+        "node_kinds": list(numbers),
+        "features": list(FEATURES),
+        "edge_kinds": list(EDGE_KINDS),
+        "width": width,
+    }
 
 
-def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -> tuple[ExplorerNetwork, dict[str, int]]:
+def load_explorer(
+    checkpoint: Checkpoint, path: Path, kind: str | None = None
+) -> tuple[ExplorerNetwork, dict[str, int]]:
     """The network of a checkpoint, and the numbers of the kinds of nodes.
 
     Raises:
@@ -38,7 +45,9 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
     about = checkpoint.about
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
     if about.get("kind") not in allowed:
-        raise InputError(f"{path}: is a checkpoint of a {about.get('kind')}; allowed is one of a {' or '.join(allowed)}")
+        raise InputError(
+            f"{path}: is a checkpoint of a {about.get('kind')}; allowed is one of a {' or '.join(allowed)}"
+        )
     network = about.get("network", {})
     if "node_kinds" not in network or "width" not in network:
         raise InputError(
@@ -46,7 +55,9 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
         )
     numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
     if network != about_explorer(numbers, network["width"]):
-        raise InputError(f"{path}: was trained on other features; allowed is a checkpoint of this version")
+        raise InputError(
+            f"{path}: was trained on other features; allowed is a checkpoint of this version"
+        )
     made = ExplorerNetwork(len(numbers), network["width"])
     try:
         made.load_state_dict(checkpoint.weights)
@@ -60,7 +71,9 @@ def load_explorer(checkpoint: Checkpoint, path: Path, kind: str | None = None) -
 def _refuse_unknown(classes: Collection[str], numbers: Collection[str], path: Path) -> None:
     unknown = sorted(set(classes) - set(numbers))
     if unknown:
-        raise InputError(f"--agent {path}: was not trained with {', '.join(unknown)}; train one with your objects")
+        raise InputError(
+            f"--agent {path}: was not trained with {', '.join(unknown)}; train one with your objects"
+        )
 
 
 class LearnedExplorer:
@@ -109,7 +122,11 @@ class LearnedExplorer:
         while allowed.any():
             moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
             # As the network had it first: what has no room and is passed over stays among them.
-            chances = chances or {name: float(picks[0, k]) for k, name in enumerate(names, start=1) if allowed[k].any()}
+            chances = chances or {
+                name: float(picks[0, k])
+                for k, name in enumerate(names, start=1)
+                if allowed[k].any()
+            }
             x, y = moves[0].tolist()
             for place in (0, y):
                 move = Move(names[x - 1], names[place - 1] if place else TRAY)
@@ -126,7 +143,9 @@ class LearnedExplorers:
         privileged: whether it knows everything.
     """
 
-    def __init__(self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()) -> None:
+    def __init__(
+        self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()
+    ) -> None:
         """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
 
         Args:

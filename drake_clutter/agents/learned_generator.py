@@ -21,7 +21,9 @@ def about_values(grammar: SceneGrammar, width: int) -> dict[str, Any]:
     vocabulary = GraphVocabulary.of(grammar)
     return {
         "node_kinds": list(vocabulary.node_kinds),
-        "edge_kinds": [kind if isinstance(kind, str) else kind.name.lower() for kind in vocabulary.edge_kinds],
+        "edge_kinds": [
+            kind if isinstance(kind, str) else kind.name.lower() for kind in vocabulary.edge_kinds
+        ],
         "rules": [rule.name for rule in grammar.rules],
         "width": width,
     }
@@ -35,7 +37,9 @@ def load_values(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleValues:
     """
     about = checkpoint.about["network"]
     mine = about_values(grammar, about["width"])
-    network = RuleValues(len(mine["node_kinds"]), len(mine["edge_kinds"]), len(mine["rules"]), about["width"])
+    network = RuleValues(
+        len(mine["node_kinds"]), len(mine["edge_kinds"]), len(mine["rules"]), about["width"]
+    )
     state, theirs, ours = network.state_dict(), _named_axes(about), _named_axes(mine)
     for name, weights in checkpoint.weights.items():
         if name not in ours:
@@ -43,7 +47,9 @@ def load_values(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleValues:
             continue
         axis, names = ours[name]
         shared = [kind for kind in names if kind in theirs[name][1]]
-        taken = weights.index_select(axis, torch.tensor([theirs[name][1].index(kind) for kind in shared]))
+        taken = weights.index_select(
+            axis, torch.tensor([theirs[name][1].index(kind) for kind in shared])
+        )
         state[name].index_copy_(axis, torch.tensor([names.index(kind) for kind in shared]), taken)
     network.load_state_dict(state)
     return network
@@ -76,27 +82,37 @@ class LearnedGenerator:
         """
         self._path, self._config, self._checkpoint = path, config, load_checkpoint(path)
         if self._checkpoint.about.get("kind") != "generator":
-            raise InputError(f"{path}: is a checkpoint of another kind; allowed is one of training/train_generator.py")
+            raise InputError(
+                f"{path}: is a checkpoint of another kind; allowed is one of training/train_generator.py"
+            )
         about = self._checkpoint.about
         self._temperature = about["temperature"] if temperature is None else temperature
         self._judge = FastJudge(config, margin=about["config"]["task"]["margin"])
         self._network: RuleValues | None = None
 
-    def derive(self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator) -> Derivation:
+    def derive(
+        self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
+    ) -> Derivation:
         """See `GenerationAgent.derive`. Stacks that do not stand stay in the graph: nothing is drawn again.
 
         Raises:
             InputError: the grammar has object classes that the agent has not learned.
         """
         if self._network is None:
-            unknown = sorted(set(grammar.classes) - set(self._checkpoint.about["network"]["node_kinds"]))
+            unknown = sorted(
+                set(grammar.classes) - set(self._checkpoint.about["network"]["node_kinds"])
+            )
             if unknown:
-                raise InputError(f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects")
+                raise InputError(
+                    f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects"
+                )
             self._network = load_values(self._checkpoint, grammar).eval()
         task = GenerationTask(nodes=budget.nodes, must_come_apart=False)
         partial = PartialScene(grammar, task, self._config, self._judge)
         while not partial.finished:
             with torch.no_grad():
                 values = self._network(stacked([partial.observe()])).numpy()
-            partial.apply(int(softmax_choice(values, partial.mask[None], self._temperature, rng)[0]))
+            partial.apply(
+                int(softmax_choice(values, partial.mask[None], self._temperature, rng)[0])
+            )
         return Derivation(partial.graph, tuple(partial.rules))

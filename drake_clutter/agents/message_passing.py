@@ -79,7 +79,9 @@ class Links(NamedTuple):
     kind: Any
 
 
-def message_passing(node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights) -> tuple[Tensor, Tensor]:
+def message_passing(
+    node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights
+) -> tuple[Tensor, Tensor]:
     """Layer after layer: messages FC(sender, edge), their maximum by receiver, 0 where there is none, update FC(node, global,
     maximum) + skip; then the global node, FC(nodes pooled by attention, global) + skip. FC: a linear layer and LeakyReLU.
 
@@ -95,17 +97,28 @@ def message_passing(node: Tensor, glob: Tensor, edge: Tensor, links: Links, weig
     return composed(node, glob, edge, links, weights)
 
 
-def composed(node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights) -> tuple[Tensor, Tensor]:
+def composed(
+    node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights
+) -> tuple[Tensor, Tensor]:
     """See `message_passing`; equal messages share the gradient."""
     for layer in map(LayerWeights._make, zip(*weights, strict=True)):
         sent = node @ layer.sender.t() + layer.sender_bias
         message = leaky_relu(sent[links.sender] + (edge @ layer.edge.t())[links.kind], SLOPE)
         receiver = links.receiver[:, None].expand_as(message)
-        most = torch.zeros_like(sent).scatter_reduce(0, receiver, message, "amax", include_self=False)
-        update = node @ layer.node.t() + layer.node_bias + most @ layer.maximum.t() + (glob @ layer.glob.t())[links.graph]
+        most = torch.zeros_like(sent).scatter_reduce(
+            0, receiver, message, "amax", include_self=False
+        )
+        update = (
+            node @ layer.node.t()
+            + layer.node_bias
+            + most @ layer.maximum.t()
+            + (glob @ layer.glob.t())[links.graph]
+        )
         node = leaky_relu(update, SLOPE) + node
         logit = (node @ layer.attention.t() + layer.attention_bias).squeeze(1)
-        largest = logit.new_full((len(glob),), -torch.inf).scatter_reduce(0, links.graph, logit.detach(), "amax")
+        largest = logit.new_full((len(glob),), -torch.inf).scatter_reduce(
+            0, links.graph, logit.detach(), "amax"
+        )
         share = (logit - largest[links.graph]).exp()[:, None]
         total = share.new_zeros(len(glob), 1).index_add(0, links.graph, share)
         pooled = torch.zeros_like(glob).index_add(0, links.graph, share * node) / total
@@ -159,13 +172,30 @@ def _pooled(node, logit, graph, pooled, weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _layer(k, node, glob, edge, links, w, kept, out, out_glob):  # type: ignore[no-untyped-def]
-    slope, most, update, update_glob, pooled = _slope(node), kept.most[k], kept.update[k], kept.update_glob[k], kept.pooled[k]
+    slope, most, update, update_glob, pooled = (
+        _slope(node),
+        kept.most[k],
+        kept.update[k],
+        kept.update_glob[k],
+        kept.pooled[k],
+    )
     sent, from_edge = np.dot(node, w.sender[k].T) + w.sender_bias[k], np.dot(edge, w.edge[k].T)
     _maximum(sent, from_edge, links.sender, links.receiver, links.kind, most, kept.winner[k])
-    from_node, from_most, from_glob = np.dot(node, w.node[k].T), np.dot(most, w.maximum[k].T), np.dot(glob, w.glob[k].T)
+    from_node, from_most, from_glob = (
+        np.dot(node, w.node[k].T),
+        np.dot(most, w.maximum[k].T),
+        np.dot(glob, w.glob[k].T),
+    )
     bias = w.node_bias[k]
     for m in range(len(node)):
-        a, b, c, d, e, f = from_node[m], from_most[m], from_glob[links.graph[m]], node[m], update[m], out[m]
+        a, b, c, d, e, f = (
+            from_node[m],
+            from_most[m],
+            from_glob[links.graph[m]],
+            node[m],
+            update[m],
+            out[m],
+        )
         for h in range(node.shape[1]):
             value = a[h] + bias[h] + b[h] + c[h]
             e[h] = value
@@ -194,7 +224,13 @@ def _columns(array):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, out, to_w):  # type: ignore[no-untyped-def]
     """What is called `to_x` is the gradient of x."""
-    width, slope, most, winner, pooled = node.shape[1], _slope(node), kept.most[k], kept.winner[k], kept.pooled[k]
+    width, slope, most, winner, pooled = (
+        node.shape[1],
+        _slope(node),
+        kept.most[k],
+        kept.winner[k],
+        kept.pooled[k],
+    )
     to_update_glob = np.where(kept.update_glob[k] > 0, to_out_glob, to_out_glob * slope)
     to_pooled = np.dot(to_update_glob, w.pooled[k])
     to_node, to_logit = np.empty_like(node), np.empty((len(node), 1), node.dtype)
@@ -207,7 +243,13 @@ def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, ou
             to_share += a[h] * (b[h] - c[h])
         logit = share * to_share
         to_logit[m, 0] = logit
-        b, c, d, e, f = to_out[m], to_node[m], to_update[m], kept.update[k, m], from_glob[links.graph[m]]
+        b, c, d, e, f = (
+            to_out[m],
+            to_node[m],
+            to_update[m],
+            kept.update[k, m],
+            from_glob[links.graph[m]],
+        )
         for h in range(width):
             value = b[h] + share * a[h] + logit * of_attention[h]
             c[h] = value  # by the skip connection
@@ -243,20 +285,32 @@ def _gradient(to_node, to_glob, nodes, globs, edge, links, weights, kept, to_wei
     to_edge = np.zeros_like(edge)
     for k in range(len(nodes) - 2, -1, -1):
         before = nodes[k], globs[k], edge, links, weights, kept
-        to_node, to_glob, more = _layer_gradient(k, to_node, to_glob, *before, nodes[k + 1], to_weights)
+        to_node, to_glob, more = _layer_gradient(
+            k, to_node, to_glob, *before, nodes[k + 1], to_weights
+        )
         to_edge += more
     return to_node, to_glob, to_edge
 
 
 class _MessagePassing(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, node: Tensor, glob: Tensor, edge: Tensor, *links_and_weights: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, node: Tensor, glob: Tensor, edge: Tensor, *links_and_weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
         arrays = [tensor.detach().numpy() for tensor in links_and_weights]
-        links, weights = Links(*arrays[: len(Links._fields)]), LayerWeights(*arrays[len(Links._fields) :])
+        links, weights = (
+            Links(*arrays[: len(Links._fields)]),
+            LayerWeights(*arrays[len(Links._fields) :]),
+        )
         layers, edges = len(weights.sender), edge.detach().numpy()
         of_nodes, of_graphs = (layers, *node.shape), (layers, *glob.shape)
         shapes = (of_nodes, of_nodes, of_nodes, of_nodes[:2], of_graphs, of_graphs)
-        kept = _Kept(*(np.empty(shape, np.int32 if k == 1 else edges.dtype) for k, shape in enumerate(shapes)))
+        kept = _Kept(
+            *(
+                np.empty(shape, np.int32 if k == 1 else edges.dtype)
+                for k, shape in enumerate(shapes)
+            )
+        )
         nodes, globs = (np.empty((layers + 1, *array.shape), edges.dtype) for array in (node, glob))
         nodes[0], globs[0] = node.detach().numpy(), glob.detach().numpy()
         ctx.arrays = nodes, globs, edges, links, weights, kept
@@ -266,8 +320,16 @@ class _MessagePassing(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, to_node: Tensor, to_glob: Tensor) -> tuple[Tensor | None, ...]:
         to_weights = LayerWeights(*(np.empty_like(weight) for weight in ctx.arrays[4]))
-        given = (to_node.contiguous().numpy(), to_glob.contiguous().numpy(), *ctx.arrays, to_weights)
-        inputs, of_weights = ([torch.from_numpy(array) for array in arrays] for arrays in (_gradient(*given), to_weights))
+        given = (
+            to_node.contiguous().numpy(),
+            to_glob.contiguous().numpy(),
+            *ctx.arrays,
+            to_weights,
+        )
+        inputs, of_weights = (
+            [torch.from_numpy(array) for array in arrays]
+            for arrays in (_gradient(*given), to_weights)
+        )
         return *inputs, None, None, None, None, *of_weights
 
 
@@ -290,8 +352,16 @@ def pack(node_kind, edge, edge_kind, edge_kinds):  # type: ignore[no-untyped-def
             nodes += node_kind[b, n] > 0
         for e in range(edge.shape[1]):
             edges += edge_kind[b, e] > 0
-    graph, number, kind = np.empty(nodes, np.int64), np.empty(nodes, np.int64), np.empty(nodes, np.int64)
-    sender, receiver, both = np.empty(2 * edges, np.int64), np.empty(2 * edges, np.int64), np.empty(2 * edges, np.int64)
+    graph, number, kind = (
+        np.empty(nodes, np.int64),
+        np.empty(nodes, np.int64),
+        np.empty(nodes, np.int64),
+    )
+    sender, receiver, both = (
+        np.empty(2 * edges, np.int64),
+        np.empty(2 * edges, np.int64),
+        np.empty(2 * edges, np.int64),
+    )
     m, z = 0, 0
     for b in range(len(node_kind)):
         first = m
@@ -303,6 +373,10 @@ def pack(node_kind, edge, edge_kind, edge_kinds):  # type: ignore[no-untyped-def
             if edge_kind[b, e] > 0:
                 parent, child = first + edge[b, e, 0], first + edge[b, e, 1]
                 sender[z], receiver[z], both[z] = parent, child, edge_kind[b, e] - 1
-                sender[z + 1], receiver[z + 1], both[z + 1] = child, parent, edge_kind[b, e] - 1 + edge_kinds
+                sender[z + 1], receiver[z + 1], both[z + 1] = (
+                    child,
+                    parent,
+                    edge_kind[b, e] - 1 + edge_kinds,
+                )
                 z += 2
     return graph, number, kind, sender, receiver, both

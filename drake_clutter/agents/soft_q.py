@@ -19,7 +19,13 @@ from torch import Tensor
 
 from drake_clutter.agents.graph_network import RuleValues
 from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, part_of, restore_learner, save_tensors
+from drake_clutter.learning.checkpoint import (
+    learner_tensors,
+    load_tensors,
+    part_of,
+    restore_learner,
+    save_tensors,
+)
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
 from drake_clutter.validation import Between, NonNegative, config_class
@@ -77,7 +83,10 @@ def stacked(observations: Sequence[GraphObservation]) -> dict[str, NDArray[Any]]
 
 
 def softmax_choice(
-    values: NDArray[np.float32], mask: NDArray[np.bool_], temperature: float, rng: np.random.Generator
+    values: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    temperature: float,
+    rng: np.random.Generator,
 ) -> NDArray[np.int64]:
     """(B,) a feasible action for each row, drawn with probabilities softmax(values / temperature); values, mask: (B, actions)."""
     noise = rng.gumbel(size=values.shape)  # the largest of values with Gumbel noise is such a draw
@@ -85,7 +94,10 @@ def softmax_choice(
 
 
 def chances(
-    values: NDArray[np.float32], mask: NDArray[np.bool_], actions: NDArray[np.int64], temperature: float
+    values: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    actions: NDArray[np.int64],
+    temperature: float,
 ) -> NDArray[np.float32]:
     """(B,) the probability with which `softmax_choice` takes each action."""
     exponent = np.where(mask, values / temperature, -np.inf)
@@ -96,7 +108,9 @@ def chances(
 def soft_value(values: Tensor, mask: Tensor, temperature: float) -> Tensor:
     """(B,) V = temperature * log mean exp(Q / temperature) over the feasible actions; 0 where there are none."""
     exponent = (values / temperature).masked_fill(~mask, -torch.inf)
-    return torch.where(mask.any(dim=1), temperature * (exponent.logsumexp(dim=1) - mask.sum(dim=1).log()), 0.0)
+    return torch.where(
+        mask.any(dim=1), temperature * (exponent.logsumexp(dim=1) - mask.sum(dim=1).log()), 0.0
+    )
 
 
 def play(
@@ -112,13 +126,18 @@ def play(
     rng, episodes = item_rng(seed, 2), list[Episode]()
     while len(episodes) < count:
         # So many at a time, and none in the place of one that ends: short episodes are not to be more frequent.
-        running = {k: environment.reset(seed=int(rng.integers(2**31))) for k, environment in enumerate(environments)}
+        running = {
+            k: environment.reset(seed=int(rng.integers(2**31)))
+            for k, environment in enumerate(environments)
+        }
         scores, ended = [0.0] * len(environments), dict[int, Episode]()
         while running:
             observations = stacked([observation for observation, _ in running.values()])
             masks = np.array([info["action_mask"] for _, info in running.values()]).astype(bool)
             with torch.no_grad():
-                actions = softmax_choice(network(observations).cpu().numpy(), masks, temperature, rng)
+                actions = softmax_choice(
+                    network(observations).cpu().numpy(), masks, temperature, rng
+                )
             for k, action in zip(list(running), actions.tolist(), strict=True):
                 observation, reward, over, _, info = environments[k].step(action)
                 scores[k] += float(reward)
@@ -139,7 +158,9 @@ class Replay:
         times: that were ever added.
     """
 
-    def __init__(self, capacity: int, environments: int, observation: GraphObservation, actions: int) -> None:
+    def __init__(
+        self, capacity: int, environments: int, observation: GraphObservation, actions: int
+    ) -> None:
         """Room for that many steps, of all environments together."""
 
         def room(like: NDArray[Any]) -> NDArray[Any]:
@@ -162,7 +183,9 @@ class Replay:
             self.arrays[name][self.times % len(self.arrays[name])] = array
         self.times += 1
 
-    def draw(self, segments: int, length: int, rng: np.random.Generator) -> dict[str, NDArray[Any]] | None:
+    def draw(
+        self, segments: int, length: int, rng: np.random.Generator
+    ) -> dict[str, NDArray[Any]] | None:
         """Steps of one environment after another, (segments, length + 1, ...), uniformly; None as long as there are too few."""
         capacity, environments = self.arrays["action"].shape
         held = min(self.times, capacity)
@@ -235,14 +258,25 @@ class SoftQLearner:
         """
         least = config.environments * (config.segment + 1)
         if config.replay < least:
-            raise InputError(f"learning.replay: {config.replay}; allowed is {least} (environments * (segment + 1)) or more")
+            raise InputError(
+                f"learning.replay: {config.replay}; allowed is {least} (environments * (segment + 1)) or more"
+            )
         self.config, self.seed, self.device = config, seed, device
-        self._environments: list[ClutterGeneration] = [make_environment() for _ in range(config.environments)]
-        vocabulary, rules = self._environments[0].vocabulary, len(self._environments[0].grammar.rules)
+        self._environments: list[ClutterGeneration] = [
+            make_environment() for _ in range(config.environments)
+        ]
+        vocabulary, rules = (
+            self._environments[0].vocabulary,
+            len(self._environments[0].grammar.rules),
+        )
         torch.manual_seed(seed)
-        self.network = RuleValues(len(vocabulary.node_kinds), len(vocabulary.edge_kinds), rules, config.width).to(device)
+        self.network = RuleValues(
+            len(vocabulary.node_kinds), len(vocabulary.edge_kinds), rules, config.width
+        ).to(device)
         self._target = deepcopy(self.network).requires_grad_(False)
-        self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate, fused=True)
+        self._optimizer = torch.optim.Adam(
+            self.network.parameters(), config.learning_rate, fused=True
+        )
         self._workers = ThreadPoolExecutor(threads)
         self._rng = item_rng(seed, 0)
         self.step, self.losses = 0, list[float]()
@@ -250,7 +284,9 @@ class SoftQLearner:
         self._observations: list[GraphObservation] = []
         self._masks: list[NDArray[np.bool_]] = []
         for number, environment in enumerate(self._environments):
-            observation, info = environment.reset(seed=int(item_rng(seed, 1, number).integers(2**31)))
+            observation, info = environment.reset(
+                seed=int(item_rng(seed, 1, number).integers(2**31))
+            )
             self._observations.append(observation)
             self._masks.append(info["action_mask"].astype(bool))
         self._replay = Replay(config.replay, config.environments, self._observations[0], rules)
@@ -262,7 +298,9 @@ class SoftQLearner:
             InputError: it is of another width.
         """
         if network.value.in_features != self.network.value.in_features:
-            raise InputError(f"learning.width: {self.config.width}; allowed is that of the warm start")
+            raise InputError(
+                f"learning.width: {self.config.width}; allowed is that of the warm start"
+            )
         self.network.load_state_dict(network.state_dict())
         self._target.load_state_dict(network.state_dict())
 
@@ -294,7 +332,11 @@ class SoftQLearner:
             self._observations[k], self._masks[k] = observation, info["action_mask"].astype(bool)
         self._replay.add(**step, reward=rewards, over=overs)
         updates_before, self.step = self._updates_due(), self.step + len(self._environments)
-        self.losses = [loss for _ in range(self._updates_due() - updates_before) if (loss := self._update()) is not None]
+        self.losses = [
+            loss
+            for _ in range(self._updates_due() - updates_before)
+            if (loss := self._update()) is not None
+        ]
         return ended
 
     def _updates_due(self) -> int:
@@ -316,16 +358,31 @@ class SoftQLearner:
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
         self._optimizer.step()
         with torch.no_grad():
-            torch._foreach_lerp_([*self._target.parameters()], [*self.network.parameters()], config.target_rate)
+            torch._foreach_lerp_(
+                [*self._target.parameters()], [*self.network.parameters()], config.target_rate
+            )
         return float(sum(losses)) / (segments * config.segment)
 
     def _loss(self, drawn: dict[str, NDArray[Any]]) -> tuple[float, tuple[Tensor, ...]]:
         """Summed over some segments, and its gradients."""
         names = ("mask", "action", "chance", "reward", "over")
-        mask, action, chance, reward, over = (torch.from_numpy(drawn[name]).to(self.device) for name in names)
+        mask, action, chance, reward, over = (
+            torch.from_numpy(drawn[name]).to(self.device) for name in names
+        )
         with torch.no_grad():
-            values = self._target({name: drawn[name].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}).view(mask.shape)
-            aim = aims(values, mask, action, chance, reward, over, self.config.temperature, self.config.trace).flatten()
+            values = self._target(
+                {name: drawn[name].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}
+            ).view(mask.shape)
+            aim = aims(
+                values,
+                mask,
+                action,
+                chance,
+                reward,
+                over,
+                self.config.temperature,
+                self.config.trace,
+            ).flatten()
         before = {name: drawn[name][:, :-1].reshape(-1, *drawn[name].shape[2:]) for name in KEPT}
         chosen = self.network(before).gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
         loss = torch.nn.functional.smooth_l1_loss(chosen, aim, reduction="sum")
@@ -336,14 +393,19 @@ class SoftQLearner:
         tensors = learner_tensors(self.network, self._optimizer)
         tensors |= {f"target.{name}": value for name, value in self._target.state_dict().items()}
         tensors |= {
-            f"replay.{name}": torch.from_numpy(array[: self._replay.times]) for name, array in self._replay.arrays.items()
+            f"replay.{name}": torch.from_numpy(array[: self._replay.times])
+            for name, array in self._replay.arrays.items()
         }
         state = {
             "step": self.step,
             "remembered": self._replay.times,
             "rng": self._rng.bit_generator.state,
             "environments": [
-                {"rules": environment.partial.rules, "score": score, "rng": environment.np_random.bit_generator.state}
+                {
+                    "rules": environment.partial.rules,
+                    "score": score,
+                    "rng": environment.np_random.bit_generator.state,
+                }
                 for environment, score in zip(self._environments, self._scores, strict=True)
             ],
         }
@@ -358,9 +420,15 @@ class SoftQLearner:
             self._replay.arrays[name][: len(value)] = value.numpy()
         self._replay.times, self.step = state["remembered"], state["step"]
         self._rng.bit_generator.state = state["rng"]
-        for k, (environment, saved) in enumerate(zip(self._environments, state["environments"], strict=True)):
+        for k, (environment, saved) in enumerate(
+            zip(self._environments, state["environments"], strict=True)
+        ):
             observation, info = environment.reset()
             for rule in saved["rules"]:
                 observation, _, _, _, info = environment.step(environment.grammar.index[rule])
             environment.np_random.bit_generator.state = saved["rng"]
-            self._scores[k], self._observations[k], self._masks[k] = saved["score"], observation, info["action_mask"].astype(bool)
+            self._scores[k], self._observations[k], self._masks[k] = (
+                saved["score"],
+                observation,
+                info["action_mask"].astype(bool),
+            )

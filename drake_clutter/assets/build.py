@@ -26,7 +26,14 @@ _BUILT = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
 # that always stands 16 do: the same verdicts as 32 on 20 stacks of cans, in about half the time.
 _LYING_HINT, _STANDING_HINT = 0.2, 0.4
 # Few pieces rather than close ones, since every piece costs simulation time: CoACD's own defaults give the example's mug 48.
-_COACD = {"threshold": 0.06, "mcts_iterations": 20, "mcts_nodes": 10, "mcts_max_depth": 2, "resolution": 1000, "seed": 1}
+_COACD = {
+    "threshold": 0.06,
+    "mcts_iterations": 20,
+    "mcts_nodes": 10,
+    "mcts_max_depth": 2,
+    "resolution": 1000,
+    "seed": 1,
+}
 _CONVEX_VOLUME_RATIO = 0.999
 
 _PACKAGE = """<?xml version="1.0"?>
@@ -89,7 +96,10 @@ def _inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inert
     x, y, z = object_class.size
     if mesh is not None:
         density = mass / mesh.volume
-        return _Inertial(np.asarray(mesh.center_mass, float), np.asarray(mesh.moment_inertia, float) * density / mesh.density)
+        return _Inertial(
+            np.asarray(mesh.center_mass, float),
+            np.asarray(mesh.moment_inertia, float) * density / mesh.density,
+        )
     if object_class.shape is Shape.BOX:
         moments = mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
     else:
@@ -109,7 +119,10 @@ def _convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD)
     low, high = mesh.bounds
     # Clipped: what stacks on an object relies on its pieces ending where its bounding box does.
-    return [trimesh.Trimesh(np.clip(vertices, low, high), faces).convex_hull for vertices, faces in pieces]
+    return [
+        trimesh.Trimesh(np.clip(vertices, low, high), faces).convex_hull
+        for vertices, faces in pieces
+    ]
 
 
 def _obj_text(mesh: trimesh.Trimesh) -> str:
@@ -136,10 +149,15 @@ def _collisions(object_class: ObjectClass, pieces: int) -> str:
         radius = x / 2
         geometry = f"<cylinder><radius>{radius!r}</radius><length>{z!r}</length></cylinder>"
         return _collision(
-            "cylinder", geometry, radius * (_STANDING_HINT if object_class.only_rest is Rest.UPRIGHT else _LYING_HINT)
+            "cylinder",
+            geometry,
+            radius * (_STANDING_HINT if object_class.only_rest is Rest.UPRIGHT else _LYING_HINT),
         )
     names = [f"convex_{index:03d}" for index in range(pieces)]
-    return "".join(_collision(name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z)) for name in names)
+    return "".join(
+        _collision(name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z))
+        for name in names
+    )
 
 
 def _asset_files(object_class: ObjectClass) -> dict[str, str]:
@@ -163,7 +181,11 @@ def _asset_files(object_class: ObjectClass) -> dict[str, str]:
         com=" ".join(repr(float(value)) for value in inertial.com),
         mass=object_class.mass,
         collisions=_collisions(object_class, len(pieces)),
-        **{f"i{'xyz'[i]}{'xyz'[j]}": float(inertial.inertia[i, j]) for i in range(3) for j in range(i, 3)},
+        **{
+            f"i{'xyz'[i]}{'xyz'[j]}": float(inertial.inertia[i, j])
+            for i in range(3)
+            for j in range(i, 3)
+        },
     )
     return files
 
@@ -184,10 +206,14 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
     target = folder / object_class.name
     if target.exists():
         strangers = (
-            [entry.name for entry in target.iterdir() if not _BUILT.fullmatch(entry.name)] if target.is_dir() else [target.name]
+            [entry.name for entry in target.iterdir() if not _BUILT.fullmatch(entry.name)]
+            if target.is_dir()
+            else [target.name]
         )
         if strangers:
-            raise InputError(f"{target}: holds {sorted(strangers)[0]}; allowed is a folder that only `assets build` fills")
+            raise InputError(
+                f"{target}: holds {sorted(strangers)[0]}; allowed is a folder that only `assets build` fills"
+            )
     files = _asset_files(object_class)
     staged = folder / f".{object_class.name}.{secrets.token_hex(4)}"
     staged.mkdir(parents=True)
@@ -215,14 +241,24 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
         InputError: a broken catalogue, a class that it does not hold, or a folder that may not be written.
     """
     folder = folder.resolve()
-    own = {name: entry for name, entry in load_catalogue(folder).classes.items() if entry.folder.parent == folder}
+    own = {
+        name: entry
+        for name, entry in load_catalogue(folder).classes.items()
+        if entry.folder.parent == folder
+    }
     unknown = sorted(set(names or ()) - set(own))
     if unknown:
-        raise InputError(f"{folder / CATALOGUE_FILE}: classes: no {unknown[0]}; allowed are {', '.join(own)}")
+        raise InputError(
+            f"{folder / CATALOGUE_FILE}: classes: no {unknown[0]}; allowed are {', '.join(own)}"
+        )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")
-    built = [build_class(entry, folder) for name, entry in own.items() if names is None or name in names]
+    built = [
+        build_class(entry, folder) for name, entry in own.items() if names is None or name in names
+    ]
     package = _SHIPPED_PACKAGE if folder == shipped_path("sdf_assets") else folder.name
     description = "Object classes of drake_clutter: one folder per class."
-    write_text(folder / "package.xml", _PACKAGE.format(name=escape(package), description=description))
+    write_text(
+        folder / "package.xml", _PACKAGE.format(name=escape(package), description=description)
+    )
     return built

@@ -17,7 +17,9 @@ def proximity_properties(resolution_hint: float, *, compliant: bool) -> str:
     """
     kind = "compliant" if compliant else "rigid"
     modulus = (
-        f"\n          <drake:hydroelastic_modulus>{HYDROELASTIC_MODULUS:g}</drake:hydroelastic_modulus>" if compliant else ""
+        f"\n          <drake:hydroelastic_modulus>{HYDROELASTIC_MODULUS:g}</drake:hydroelastic_modulus>"
+        if compliant
+        else ""
     )
     return f"""        <drake:proximity_properties>
           <drake:{kind}_hydroelastic/>{modulus}

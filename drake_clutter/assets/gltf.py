@@ -63,9 +63,16 @@ def box_surface(size: tuple[float, float, float], regions: dict[str, Region]) ->
     for face, (right, up) in _FACES.items():
         u0, v0, u1, v1 = regions[face]
         normal = np.cross(right, up)
-        corners = np.array([normal + i * np.array(right) + j * np.array(up) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        corners = np.array(
+            [
+                normal + i * np.array(right) + j * np.array(up)
+                for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+            ]
+        )
         uv = np.array([[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
-        parts.append(Surface(corners * half, np.tile(normal, (4, 1)), uv, np.array([[0, 1, 2], [0, 2, 3]])))
+        parts.append(
+            Surface(corners * half, np.tile(normal, (4, 1)), uv, np.array([[0, 1, 2], [0, 2, 3]]))
+        )
     return _joined(parts)
 
 
@@ -85,16 +92,22 @@ def cylinder_surface(size: tuple[float, float, float], regions: dict[str, Region
     uv = np.vstack([np.column_stack([u, np.full(len(u), v)]) for v in (v1, v0)])
     low = np.arange(_SEGMENTS)
     high = low + len(ring)
-    quads = np.vstack([np.column_stack([low, low + 1, high + 1]), np.column_stack([low, high + 1, high])])
+    quads = np.vstack(
+        [np.column_stack([low, low + 1, high + 1]), np.column_stack([low, high + 1, high])]
+    )
     parts = [Surface(np.vstack(upright) * half, np.vstack([normals, normals]), uv, quads)]
     for face in ("top", "bottom"):
         right, up = (np.array(axis) for axis in _FACES[face])
         u0, v0, u1, v1 = regions[face]
         disc = np.vstack([[0, 0], ring[:-1]])
         points = np.cross(right, up) + disc[:, :1] * right + disc[:, 1:] * up
-        uv = np.column_stack([u0 + (u1 - u0) * (1 + disc[:, 0]) / 2, v1 + (v0 - v1) * (1 + disc[:, 1]) / 2])
+        uv = np.column_stack(
+            [u0 + (u1 - u0) * (1 + disc[:, 0]) / 2, v1 + (v0 - v1) * (1 + disc[:, 1]) / 2]
+        )
         fan = np.array([[0, 1 + i, 1 + (i + 1) % _SEGMENTS] for i in range(_SEGMENTS)])
-        parts.append(Surface(points * half, np.tile(np.cross(right, up), (len(points), 1)), uv, fan))
+        parts.append(
+            Surface(points * half, np.tile(np.cross(right, up), (len(points), 1)), uv, fan)
+        )
     return _joined(parts)
 
 
@@ -106,7 +119,9 @@ def mesh_surface(mesh: trimesh.Trimesh, region: Region) -> Surface:
     u0, v0, u1, v1 = region
     v = v1 + (v0 - v1) * (points[:, 2] - low) / (high - low)
     uv = np.column_stack([np.full(len(points), (u0 + u1) / 2), v])
-    return Surface(points, np.asarray(shaded.vertex_normals, float), uv, np.asarray(shaded.faces, np.int64))
+    return Surface(
+        points, np.asarray(shaded.vertex_normals, float), uv, np.asarray(shaded.faces, np.int64)
+    )
 
 
 def _data_uri(kind: str, data: bytes) -> str:
@@ -115,7 +130,9 @@ def _data_uri(kind: str, data: bytes) -> str:
 
 def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
     """The surface with its PNG texture as the text of one glTF file that refers to no other file."""
-    y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF's up is y, and Drake turns it back to z
+    y_up = np.array(
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    )  # glTF's up is y, and Drake turns it back to z
     arrays: list[tuple[NDArray[Any], str, int]] = [
         ((surface.points @ y_up.T).astype("<f4"), "VEC3", 34962),
         ((surface.normals @ y_up.T).astype("<f4"), "VEC3", 34962),
@@ -125,8 +142,15 @@ def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
     views, accessors, buffer = [], [], b""
     for index, (array, kind, target) in enumerate(arrays):
         data = array.tobytes()
-        views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": target})
-        accessor = {"bufferView": index, "componentType": 5125 if kind == "SCALAR" else 5126, "count": len(array), "type": kind}
+        views.append(
+            {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": target}
+        )
+        accessor = {
+            "bufferView": index,
+            "componentType": 5125 if kind == "SCALAR" else 5126,
+            "count": len(array),
+            "type": kind,
+        }
         if index == 0:
             accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
         accessors.append(accessor)
@@ -136,9 +160,25 @@ def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
+                        "indices": 3,
+                        "material": 0,
+                    }
+                ]
+            }
+        ],
         "materials": [
-            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 0.8}}
+            {
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": 0.8,
+                }
+            }
         ],
         "textures": [{"sampler": 0, "source": 0}],
         # Linear, without mipmaps: with them, Mesa's software renderer never returns from a face that is seen exactly edge-on.
@@ -146,6 +186,8 @@ def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
         "images": [{"uri": _data_uri("image/png", texture_png)}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"uri": _data_uri("application/octet-stream", buffer), "byteLength": len(buffer)}],
+        "buffers": [
+            {"uri": _data_uri("application/octet-stream", buffer), "byteLength": len(buffer)}
+        ],
     }
     return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"

@@ -44,7 +44,9 @@ class Pen:
 
     def line(self, points: Sequence[Point], fill: str, width: float) -> None:
         """An open line of the given width."""
-        self.draw.line(self._pixels(points), fill=fill, width=max(1, round(width * self.radius)), joint="curve")
+        self.draw.line(
+            self._pixels(points), fill=fill, width=max(1, round(width * self.radius)), joint="curve"
+        )
 
 
 def _dots(pen: Pen) -> None:
@@ -53,7 +55,11 @@ def _dots(pen: Pen) -> None:
 
 def _cracker(pen: Pen) -> None:
     notched = [(-0.72 + 0.18 * i, -0.72 + 0.05 * (i % 2)) for i in range(9)]
-    outline = [(x * c - y * s, x * s + y * c) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1)) for x, y in notched[:-1]]
+    outline = [
+        (x * c - y * s, x * s + y * c)
+        for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))
+        for x, y in notched[:-1]
+    ]
     pen.polygon([(1.08 * x, 1.08 * y) for x, y in outline], "#8a5320")
     pen.polygon(outline, "#e3a857")
     pen.oval(0, 0, 0.5, 0.5, "#ecb96d")
@@ -88,7 +94,10 @@ def _jelly(pen: Pen) -> None:
     for t in scallops:
         pen.oval(-0.72 * math.cos(t), 0.6, 0.16, 0.14, "#ff3d78")
     for x in (-0.36, 0.0, 0.36):
-        pen.polygon([(x * 1.55 - 0.06, 0.6), (x - 0.04, -0.45), (x + 0.04, -0.45), (x * 1.55 + 0.06, 0.6)], "#d81f5c")
+        pen.polygon(
+            [(x * 1.55 - 0.06, 0.6), (x - 0.04, -0.45), (x + 0.04, -0.45), (x * 1.55 + 0.06, 0.6)],
+            "#d81f5c",
+        )
     pen.oval(0, -0.5, 0.55, 0.16, "#ff86ad")
     pen.oval(-0.2, -0.54, 0.16, 0.05, "#ffffff")
 
@@ -107,16 +116,28 @@ def _tomato(pen: Pen) -> None:
         t = math.radians(72 * turn - 90)
         tip = (0.5 * math.cos(t), -0.45 + 0.3 * math.sin(t))
         pen.polygon(
-            [(-0.1 * math.sin(t), -0.45 + 0.1 * math.cos(t)), tip, (0.1 * math.sin(t), -0.45 - 0.1 * math.cos(t))], "#2f7d32"
+            [
+                (-0.1 * math.sin(t), -0.45 + 0.1 * math.cos(t)),
+                tip,
+                (0.1 * math.sin(t), -0.45 - 0.1 * math.cos(t)),
+            ],
+            "#2f7d32",
         )
     pen.line([(0, -0.45), (0.08, -0.85)], "#2f7d32", 0.12)
 
 
 def _flake(pen: Pen) -> None:
     turns = [2 * math.pi * i / 9 for i in range(9)]
-    edge = [(r * math.cos(t), 0.8 * r * math.sin(t)) for t in turns for r in (pen.rng.uniform(0.75, 1.0),)]
+    edge = [
+        (r * math.cos(t), 0.8 * r * math.sin(t))
+        for t in turns
+        for r in (pen.rng.uniform(0.75, 1.0),)
+    ]
     pen.polygon(edge, "#a85a12")
-    pen.polygon([(0.86 * x - 0.03, 0.86 * y - 0.04) for x, y in edge], pen.rng.choice(["#f6b73c", "#efa42e", "#f9c65a"]))
+    pen.polygon(
+        [(0.86 * x - 0.03, 0.86 * y - 0.04) for x, y in edge],
+        pen.rng.choice(["#f6b73c", "#efa42e", "#f9c65a"]),
+    )
     pen.oval(-0.1, -0.1, 0.32, 0.2, "#fbd988")
 
 
@@ -143,13 +164,20 @@ def _oat(pen: Pen) -> None:
 
 def _spaghetti(pen: Pen) -> None:
     for i in range(-13, 14):
-        low, high = 0.075 * i + pen.rng.uniform(-0.06, 0.06), 0.075 * i + pen.rng.uniform(-0.06, 0.06)
-        pen.line([(low, -1.2), (high, 1.2)], pen.rng.choice(["#c98f2b", "#e2b04a", "#b67a1c"]), 0.05)
+        low, high = (
+            0.075 * i + pen.rng.uniform(-0.06, 0.06),
+            0.075 * i + pen.rng.uniform(-0.06, 0.06),
+        )
+        pen.line(
+            [(low, -1.2), (high, 1.2)], pen.rng.choice(["#c98f2b", "#e2b04a", "#b67a1c"]), 0.05
+        )
 
 
 def _lasagna_slice(pen: Pen) -> None:
     pen.oval(0, 0.72, 1.0, 0.16, "#ffffff")
-    for i, colour in enumerate(["#f4cf73", "#c8321f", "#fff3cf", "#f4cf73", "#c8321f", "#fff3cf", "#f4cf73"]):
+    for i, colour in enumerate(
+        ["#f4cf73", "#c8321f", "#fff3cf", "#f4cf73", "#c8321f", "#fff3cf", "#f4cf73"]
+    ):
         y = 0.62 - 0.16 * i
         wave = [(-0.8 + 0.1 * k, y + (0.04 if k % 2 else -0.04)) for k in range(17)]
         pen.polygon([*wave, *((x, below - 0.2) for x, below in reversed(wave))], colour)
@@ -224,7 +252,9 @@ def strew(draw: ImageDraw.ImageDraw, size: tuple[int, int], motif: Motif, accent
     columns, rows = (max(1, math.ceil(side / (1.75 * radius) - 0.5)) for side in size)
     rng = random.Random(0)
     places = [
-        (i + (0.5 if motif.turned and j % 2 else 0), j) for j in range(rows + motif.turned) for i in range(columns + motif.turned)
+        (i + (0.5 if motif.turned and j % 2 else 0), j)
+        for j in range(rows + motif.turned)
+        for i in range(columns + motif.turned)
     ]
     if motif.turned:
         rng.shuffle(places)  # pieces overlap in no order

@@ -52,7 +52,12 @@ class _Panel:
 
     @staticmethod
     def blank(width_mm: float, height_mm: float, unit: float, colour: str) -> "_Panel":
-        return _Panel(Image.new("RGB", (max(1, round(width_mm * unit)), max(1, round(height_mm * unit))), colour), unit)
+        return _Panel(
+            Image.new(
+                "RGB", (max(1, round(width_mm * unit)), max(1, round(height_mm * unit))), colour
+            ),
+            unit,
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -61,23 +66,44 @@ class _Panel:
     def rectangle(self, left: float, top: float, right: float, bottom: float, fill: str) -> None:
         """Sides as shares of the panel's width and height."""
         w, h = self.size
-        ImageDraw.Draw(self.image).rectangle((left * w, top * h, right * w - 1, bottom * h - 1), fill=fill)
+        ImageDraw.Draw(self.image).rectangle(
+            (left * w, top * h, right * w - 1, bottom * h - 1), fill=fill
+        )
 
-    def motif(self, name: str, accent: str, left: float, top: float, right: float, bottom: float) -> None:
+    def motif(
+        self, name: str, accent: str, left: float, top: float, right: float, bottom: float
+    ) -> None:
         w, h = self.size
-        area = Image.new("RGB", (max(1, round((right - left) * w)), max(1, round((bottom - top) * h))))
+        area = Image.new(
+            "RGB", (max(1, round((right - left) * w)), max(1, round((bottom - top) * h)))
+        )
         strew(ImageDraw.Draw(area), area.size, MOTIFS[name], accent)
         self.image.paste(area, (round(left * w), round(top * h)))
 
-    def text(self, words: str, colour: str, left: float, top: float, right: float, bottom: float, *, turn: bool = True) -> None:
+    def text(
+        self,
+        words: str,
+        colour: str,
+        left: float,
+        top: float,
+        right: float,
+        bottom: float,
+        *,
+        turn: bool = True,
+    ) -> None:
         """As large as fits: in one line or one word a line, and turned to read upwards where that is larger."""
         w, h = self.size
         box = ((right - left) * w, (bottom - top) * h)
         choices = [
-            (lines, turned) for lines in {words, words.replace(" ", "\n")} for turned in ((False, True) if turn else (False,))
+            (lines, turned)
+            for lines in {words, words.replace(" ", "\n")}
+            for turned in ((False, True) if turn else (False,))
         ]
         size, lines, turned = max(
-            ((_font_size(lines, box[::-1] if turned else box), lines, turned) for lines, turned in sorted(choices))
+            (
+                (_font_size(lines, box[::-1] if turned else box), lines, turned)
+                for lines, turned in sorted(choices)
+            )
         )
         if size < 4:
             return
@@ -89,7 +115,9 @@ class _Panel:
 
 @lru_cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size)
+    return ImageFont.truetype(
+        str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
+    )
 
 
 @lru_cache
@@ -107,7 +135,9 @@ def _font_size(lines: str, box: tuple[float, float]) -> int:
 def _text_mask(lines: str, size: int) -> Image.Image:
     left, top, right, bottom = _extent(lines, size)
     mask = Image.new("L", (max(1, math.ceil(right - left)), max(1, math.ceil(bottom - top))))
-    ImageDraw.Draw(mask).multiline_text((-left, -top), lines, fill=255, font=_font(size), align="center", spacing=size * 0.1)
+    ImageDraw.Draw(mask).multiline_text(
+        (-left, -top), lines, fill=255, font=_font(size), align="center", spacing=size * 0.1
+    )
     return mask
 
 
@@ -121,7 +151,9 @@ def _nutrition_panel(width: int, height: int) -> Image.Image:
     draw.rectangle((w * 0.06, h * 0.18, w * 0.94, h * 0.205), fill=_INK)
     for row in range(8):
         y = h * (0.25 + 0.09 * row)
-        draw.rectangle((w * 0.08, y, w * (0.35 + 0.05 * (row * 3 % 5)), y + h * 0.03), fill="#6d6d6d")
+        draw.rectangle(
+            (w * 0.08, y, w * (0.35 + 0.05 * (row * 3 % 5)), y + h * 0.03), fill="#6d6d6d"
+        )
         draw.rectangle((w * 0.8, y, w * 0.92, y + h * 0.03), fill="#6d6d6d")
     return table
 
@@ -135,7 +167,9 @@ def _barcode(width: int, height: int) -> Image.Image:
         bar = 1 + (index * 7 + index // 3) % 3
         if x + bar * step > w * 0.92:
             break
-        draw.rectangle((x, h * 0.1, x + bar * step * 0.9, h * (0.9 if index % 14 < 2 else 0.78)), fill=_INK)
+        draw.rectangle(
+            (x, h * 0.1, x + bar * step * 0.9, h * (0.9 if index % 14 < 2 else 0.78)), fill=_INK
+        )
         x += (bar + 1) * step
     return code
 
@@ -185,7 +219,15 @@ def _wrapper(panel: _Panel, label: Label, title: str, mass: float) -> None:
     panel.rectangle(0, 0.47, 1, 0.5, label.accent)
     for half in (0.0, 0.5):
         panel.text(title, label.accent, half + 0.12, 0.08, half + 0.38, 0.46)
-        panel.text(f"NET WT {1000 * mass:.0f} g", label.accent, half + 0.14, 0.94, half + 0.36, 0.975, turn=False)
+        panel.text(
+            f"NET WT {1000 * mass:.0f} g",
+            label.accent,
+            half + 0.14,
+            0.94,
+            half + 0.36,
+            0.975,
+            turn=False,
+        )
     table = _nutrition_panel(round(0.11 * w), min(round(0.5 * h), round(0.2 * w)))
     panel.image.paste(table, (round(0.445 * w), round(0.5 * h - table.height / 2)))
     code = _barcode(round(0.11 * w), round(0.08 * w))
@@ -214,7 +256,12 @@ def _metal_end(panel: _Panel) -> None:
 def _plastic_lid(panel: _Panel, label: Label, title: str) -> None:
     draw = ImageDraw.Draw(panel.image)
     w = panel.size[0]
-    for share, colour in ((1.0, label.base), (0.86, label.accent), (0.82, label.base), (0.80, label.accent)):
+    for share, colour in (
+        (1.0, label.base),
+        (0.86, label.accent),
+        (0.82, label.base),
+        (0.80, label.accent),
+    ):
         edge = w * (1 - share) / 2
         draw.ellipse((edge, edge, w - edge, w - edge), fill=colour)
     panel.text(title, label.base, 0.2, 0.3, 0.8, 0.7, turn=False)
@@ -265,11 +312,15 @@ def _checked_label(object_class: ObjectClass) -> tuple[Label, str]:
     where = f"{object_class.folder.parent / CATALOGUE_FILE}: classes.{object_class.name}.label"
     for field in ("base", "accent"):
         if not re.fullmatch(r"#[0-9a-fA-F]{6}", getattr(label, field)):
-            raise InputError(f'{where}.{field}: {getattr(label, field)!r}; allowed is a colour such as "#c8102e"')
+            raise InputError(
+                f'{where}.{field}: {getattr(label, field)!r}; allowed is a colour such as "#c8102e"'
+            )
     if label.motif not in MOTIFS:
         raise InputError(f"{where}.motif: {label.motif!r}; allowed are {', '.join(MOTIFS)}")
     if len(label.title) > _TITLE_LENGTH:
-        raise InputError(f"{where}.title: {label.title!r}; allowed are at most {_TITLE_LENGTH} characters")
+        raise InputError(
+            f"{where}.title: {label.title!r}; allowed are at most {_TITLE_LENGTH} characters"
+        )
     return label, label.title.strip() or object_class.name.replace("_", " ")
 
 
@@ -297,7 +348,9 @@ def draw_texture(object_class: ObjectClass) -> Texture:
         rows = [["top"], ["front", "right", "left"]]
         same = {"back": "front", "bottom": "top"}
     elif object_class.shape is Shape.CYLINDER:
-        panels = (_marker_panels if label.motif == "marker" else _can_panels)(object_class, title, unit)
+        panels = (_marker_panels if label.motif == "marker" else _can_panels)(
+            object_class, title, unit
+        )
         rows, same = [["top", "bottom"], ["side"]], {}
     else:
         panels = _mesh_panels(object_class, unit)
@@ -315,7 +368,12 @@ def draw_texture(object_class: ObjectClass) -> Texture:
             # Half a pixel of the final picture in from the edge, or the neighbour's colour bleeds in.
             inset = _OVERSAMPLING / 2
             edges = (x + inset, y + inset, x + image.width - inset, y + image.height - inset)
-            regions[name] = (edges[0] / width, edges[1] / height, edges[2] / width, edges[3] / height)
+            regions[name] = (
+                edges[0] / width,
+                edges[1] / height,
+                edges[2] / width,
+                edges[3] / height,
+            )
             x += image.width
         y += panels[row[0]].size[1]
     regions |= {copy: regions[original] for copy, original in same.items()}

@@ -67,7 +67,9 @@ class Camera(Model):
             altitude: Height above the floor [m].
             **fields: Other fields.
         """
-        return Camera(pose=PoseSpec(translation=(0.0, 0.0, altitude), rpy_deg=(180.0, 0.0, 0.0)), **fields)
+        return Camera(
+            pose=PoseSpec(translation=(0.0, 0.0, altitude), rpy_deg=(180.0, 0.0, 0.0)), **fields
+        )
 
     @property
     def X_TC(self) -> RigidTransform:
@@ -114,7 +116,9 @@ class Camera(Model):
     def project_with_depth(self, p_T: Floats) -> tuple[Floats, Floats]:
         """Return what `project` and `depth` do."""
         p_C = self.to_camera(p_T)
-        return np.asarray(self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point)), p_C[:, 2]
+        return np.asarray(
+            self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point)
+        ), p_C[:, 2]
 
     def backproject(self, pixels: NDArray[Any], depth: NDArray[Any]) -> NDArray[Any]:
         """Return the points at pixels and depths, in the images' type.
@@ -130,7 +134,9 @@ class Camera(Model):
         x = (pixels[..., 0] - u0) * depth / self.focal_length
         y = (pixels[..., 1] - v0) * depth / self.focal_length
         R_TC, p_TC = self.X_TC.rotation().matrix().tolist(), self.X_TC.translation().tolist()
-        return np.stack([_along(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)], axis=-1)
+        return np.stack(
+            [_along(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)], axis=-1
+        )
 
     def rays(self, pixels: NDArray[Any]) -> Floats:
         """Return directions in C through pixels (..., 2) [px], with z = 1. Shape (..., 3)."""
@@ -158,7 +164,9 @@ class Camera(Model):
             None if a part of it is not before the camera.
         """
         half = max(support.half_size)
-        corners = np.array([[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, height)])
+        corners = np.array(
+            [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, height)]
+        )
         if (self.depth(corners) < NEAREST).any():
             return None
         pixels = self.project(corners)
@@ -174,7 +182,9 @@ class Camera(Model):
         if self.X_TC.translation()[2] <= 0 or not len(p_T):
             return False
         pixels = self.project(p_T)
-        return bool(((pixels >= -0.5) & (pixels < [self.width - 0.5, self.height - 0.5])).all(axis=1).any())
+        return bool(
+            ((pixels >= -0.5) & (pixels < [self.width - 0.5, self.height - 0.5])).all(axis=1).any()
+        )
 
 
 def _along(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -182,7 +192,9 @@ def _along(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[
 
     What counts for nothing is left out, also where it is infinite.
     """
-    terms = [factor * component for factor, component in zip(row, components, strict=True) if factor]
+    terms = [
+        factor * component for factor, component in zip(row, components, strict=True) if factor
+    ]
     return np.asarray(sum(terms[1:], terms[0]))
 
 
@@ -194,7 +206,12 @@ def _X_CT(camera: Camera) -> Floats:
 @lru_cache(maxsize=64)
 def _pinhole(camera: Camera) -> Pinhole:
     x, y, z = camera.X_TC.translation().tolist()
-    return Pinhole(camera.focal_length, *camera.principal_point, tuple(_X_CT(camera).ravel().tolist()), (x, y, z))
+    return Pinhole(
+        camera.focal_length,
+        *camera.principal_point,
+        tuple(_X_CT(camera).ravel().tolist()),
+        (x, y, z),
+    )
 
 
 @lru_cache(maxsize=16)

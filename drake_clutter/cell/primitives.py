@@ -39,7 +39,11 @@ def sdf_geometry(kind: str, name: str, rod: Rod, shape: str) -> str:
     start, end = np.array(rod.start), np.array(rod.end)
     length = math.dist(start, end)
     turn, _ = Rotation.align_vectors((end - start)[None], np.array([[0.0, 0.0, 1.0]]))
-    material = f"\n        <material><diffuse>{rod.colour}</diffuse></material>" if kind == "visual" and rod.colour else ""
+    material = (
+        f"\n        <material><diffuse>{rod.colour}</diffuse></material>"
+        if kind == "visual" and rod.colour
+        else ""
+    )
     return f"""
       <{kind} name="{name}">
         {sdf_pose((start + end) / 2, turn)}
@@ -55,7 +59,9 @@ def sdf_inertial(mass: float, p_LCm: Floats, spine: Rod) -> str:
     along, across = mass * spine.radius**2 / 2, mass * (3 * spine.radius**2 + length**2) / 12
     tensor = across * np.eye(3) + (along - across) * np.outer(axis, axis)
     parts = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    entries = "".join(f"<i{'xyz'[i]}{'xyz'[j]}>{tensor[i, j]:.6g}</i{'xyz'[i]}{'xyz'[j]}>" for i, j in parts)
+    entries = "".join(
+        f"<i{'xyz'[i]}{'xyz'[j]}>{tensor[i, j]:.6g}</i{'xyz'[i]}{'xyz'[j]}>" for i, j in parts
+    )
     return f"""
       <inertial>
         <pose>{" ".join(f"{value:.6g}" for value in p_LCm)} 0 0 0</pose>
@@ -65,11 +71,19 @@ def sdf_inertial(mass: float, p_LCm: Floats, spine: Rod) -> str:
 
 
 def sdf_link(
-    name: str, pose: str, mass: float, p_LCm: Floats, outline: tuple[Rod, ...], looks: tuple[Rod, ...], shape: str = "capsule"
+    name: str,
+    pose: str,
+    mass: float,
+    p_LCm: Floats,
+    outline: tuple[Rod, ...],
+    looks: tuple[Rod, ...],
+    shape: str = "capsule",
 ) -> str:
     """A link; its outline consists of capsules or cylinders, the inertia is that of its longest visible part."""
     spine = max(looks, key=lambda rod: math.dist(rod.start, rod.end))
-    shapes = [sdf_geometry("collision", f"outline_{k}", rod, shape) for k, rod in enumerate(outline)]
+    shapes = [
+        sdf_geometry("collision", f"outline_{k}", rod, shape) for k, rod in enumerate(outline)
+    ]
     shapes += [sdf_geometry("visual", f"part_{k}", rod, "cylinder") for k, rod in enumerate(looks)]
     return f"""
     <link name="{name}">{pose}{sdf_inertial(mass, p_LCm, spine)}{"".join(shapes)}

@@ -11,7 +11,9 @@ def sdf_text(path: Path, *, visuals: bool) -> str:
 
     Drake parses the text in a millisecond or two, the file it came from in sixty.
     """
-    ElementTree.register_namespace("drake", "drake.mit.edu")  # else the prefix is renamed, and Drake no longer knows it
+    ElementTree.register_namespace(
+        "drake", "drake.mit.edu"
+    )  # else the prefix is renamed, and Drake no longer knows it
     root = ElementTree.parse(path).getroot()
     for link in () if visuals else root.iter("link"):
         for visual in link.findall("visual"):

@@ -39,13 +39,17 @@ def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
         "-y": ((x, thickness, height), (0, -(y + thickness) / 2, middle)),
     }
     floor = ("floor", (x, y, support.floor_thickness), (0.0, 0.0, -support.floor_thickness / 2))
-    return [floor, *((_WALL_NAMES[side], *walls[side]) for side in _WALL_NAMES if side in support.walls)]
+    return [
+        floor,
+        *((_WALL_NAMES[side], *walls[side]) for side in _WALL_NAMES if side in support.walls),
+    ]
 
 
 def support_sdf(support: Support) -> str:
     """Return the SDF model of a support."""
     boxes = [
-        _box(name, size, p_TG, _FLOOR_COLOR if name == "floor" else _WALL_COLOR) for name, size, p_TG in support_boxes(support)
+        _box(name, size, p_TG, _FLOOR_COLOR if name == "floor" else _WALL_COLOR)
+        for name, size, p_TG in support_boxes(support)
     ]
     return f"""<?xml version="1.0"?>
 <!-- Written by drake_clutter.cell.support_sdf. Frame T: origin at the centre of the floor's upper surface, z up. -->

@@ -57,14 +57,20 @@ class WorkCell(Model):
 
     @field_validator("cameras")
     @classmethod
-    def _first_sees_support(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
+    def _first_sees_support(
+        cls, cameras: dict[str, Camera], info: ValidationInfo
+    ) -> dict[str, Camera]:
         if unfit := [name for name in cameras if not name.isidentifier()]:
             raise refused(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
         if taken := [name for name in cameras if name in _RESERVED and name != "camera"]:
-            raise refused(f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED)}")
+            raise refused(
+                f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED)}"
+            )
         name, camera = next(iter(cameras.items()))
         if "support" in info.data and not camera.sees(info.data["support"]):
-            raise refused(f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image")
+            raise refused(
+                f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image"
+            )
         return cameras
 
     @property
@@ -113,7 +119,11 @@ class WorkCell(Model):
 
     def __eq__(self, other: object) -> bool:
         """Whether all is the same, the order of the cameras included."""
-        return super().__eq__(other) and isinstance(other, WorkCell) and [*self.cameras] == [*other.cameras]
+        return (
+            super().__eq__(other)
+            and isinstance(other, WorkCell)
+            and [*self.cameras] == [*other.cameras]
+        )
 
     def __hash__(self) -> int:
         """Hash of the whole content, so that what is derived from a cell can be kept."""

@@ -22,7 +22,21 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (generate, explore, evaluate, move, solve, run, demo, feasibility, replay, view, render, export, doctor):
+for command in (
+    generate,
+    explore,
+    evaluate,
+    move,
+    solve,
+    run,
+    demo,
+    feasibility,
+    replay,
+    view,
+    render,
+    export,
+    doctor,
+):
     app.command()(command)
 app.add_typer(assets_app, name="assets")
 

@@ -18,7 +18,9 @@ def assets() -> None:
 @assets_app.command("build")
 def build(
     folder: Annotated[Path, typer.Argument(help="An asset folder: it holds catalogue.yaml.")],
-    only: Annotated[list[str] | None, typer.Option("--class", help="Build this class alone; may be repeated.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--class", help="Build this class alone; may be repeated.")
+    ] = None,
 ) -> None:
     """Build SDF models, collision pieces and textures of a catalogue's classes."""
     from drake_clutter.assets import build_assets

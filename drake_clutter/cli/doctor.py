@@ -21,7 +21,9 @@ def doctor(as_json: JsonOption = False) -> None:
         table = Table("", "check", "found", "how to mend it")
         for check in found:
             remedy = "" if check.ok else plain(check.remedy)
-            table.add_row("[green]ok" if check.ok else "[red]no", check.name, plain(check.detail), remedy)
+            table.add_row(
+                "[green]ok" if check.ok else "[red]no", check.name, plain(check.detail), remedy
+            )
         out_console.print(table)
     if not all(check.ok for check in found):
         raise typer.Exit(1)

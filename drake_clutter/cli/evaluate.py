@@ -28,9 +28,15 @@ from drake_clutter.files import InputError
 
 
 def evaluate(
-    place: Annotated[str | None, typer.Argument(metavar="SCENES", help="The same as --scenes.", show_default=False)] = None,
+    place: Annotated[
+        str | None,
+        typer.Argument(metavar="SCENES", help="The same as --scenes.", show_default=False),
+    ] = None,
     scenes: Annotated[
-        str | None, typer.Option(help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged.")
+        str | None,
+        typer.Option(
+            help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged."
+        ),
     ] = None,
     agents: Annotated[
         list[str] | None,
@@ -42,10 +48,15 @@ def evaluate(
             show_default="those without learning",
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON to write, with the rows and every episode.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="JSON to write, with the rows and every episode."),
+    ] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
-    count: Annotated[int | None, typer.Option(min=1, help="Evaluate only the first N scenes.")] = None,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Evaluate only the first N scenes.")
+    ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     ray: RayOption = None,
@@ -74,14 +85,24 @@ def evaluate(
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return progress_bar("episodes", results, 0, total)
 
-    rows = command.evaluate(played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray)
+    rows = command.evaluate(
+        played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray
+    )
     if as_json:
         print(json.dumps(rows, indent=2))
         return
-    shown = [{"agent": row["agent"]} | cells for row in rows for cells in in_words(row, command.limits(limit))]
+    shown = [
+        {"agent": row["agent"]} | cells
+        for row in rows
+        for cells in in_words(row, command.limits(limit))
+    ]
     title = f"{named}: {rows[0]['episodes']} scenes, {rows[0]['hidden']:.1f} objects hidden"
     table = Table(
-        *shown[0], title=title, box=SIMPLE, padding=(0, 1, 0, 0), caption="in: so many moves; moves: of those who found all"
+        *shown[0],
+        title=title,
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+        caption="in: so many moves; moves: of those who found all",
     )
     for cells in shown:
         table.add_row(*cells.values())

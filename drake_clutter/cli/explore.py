@@ -38,6 +38,16 @@ def explore(
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
     output_directory(out)
     limit = max_moves or world.exploration.max_moves
-    task = command.explore(command.at_rest(file.scene, world, seed), agent, fidelity.value, limit, seed, world, report_step)
+    task = command.explore(
+        command.at_rest(file.scene, world, seed),
+        agent,
+        fidelity.value,
+        limit,
+        seed,
+        world,
+        report_step,
+    )
     title = f"{agent} explores {scene.name}"
-    show_episode(command.write_episode(out, task, title, agent, fidelity.value, seed, world), as_json, out)
+    show_episode(
+        command.write_episode(out, task, title, agent, fidelity.value, seed, world), as_json, out
+    )

@@ -22,7 +22,10 @@ class Format(Enum):
 def export(
     scene: SceneArgument,
     out: OutOption,
-    format: Annotated[Format, typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer.")],
+    format: Annotated[
+        Format,
+        typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer."),
+    ],
     laid_out: LaidOutOption = False,
     catalogue: CatalogueOption = None,
 ) -> None:
@@ -33,4 +36,6 @@ def export(
 
     file = load_scene(scene, load_catalogue(catalogue))
     output_directory(out)
-    out_console.print(f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}")
+    out_console.print(
+        f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}"
+    )

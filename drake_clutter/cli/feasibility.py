@@ -6,7 +6,14 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_clutter.cli.options import CatalogueOption, ConfigOption, JsonOption, SeedOption, SetOption, WorkersOption
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    ConfigOption,
+    JsonOption,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+)
 from drake_clutter.cli.output import progress_bar, show
 from drake_clutter.cli.world import load_scene_and_world, load_world, refuse_support
 from drake_clutter.files import InputError
@@ -25,21 +32,42 @@ def _numbers(option: str, text: str) -> list[float]:
 
 
 def feasibility(
-    scenes: Annotated[list[Path], typer.Argument(metavar="SCENES...", help="Scene files, or folders of them.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; one of the same study is taken up.")],
+    scenes: Annotated[
+        list[Path], typer.Argument(metavar="SCENES...", help="Scene files, or folders of them.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Folder for the results; one of the same study is taken up.",
+        ),
+    ],
     cell: Annotated[
-        list[Path] | None, typer.Option("--cell", metavar="FILE", help="Work cell to study; may be repeated.")
+        list[Path] | None,
+        typer.Option("--cell", metavar="FILE", help="Work cell to study; may be repeated."),
     ] = None,
     settings: SetOption = None,
-    base: Annotated[list[str] | None, typer.Option(metavar=PLACE, help="Place of the arm's base in T; may be repeated.")] = None,
+    base: Annotated[
+        list[str] | None,
+        typer.Option(metavar=PLACE, help="Place of the arm's base in T; may be repeated."),
+    ] = None,
     tray: Annotated[
-        list[str] | None, typer.Option(metavar=PLACE, help="Instead: the tray's place, seen from the base; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            metavar=PLACE, help="Instead: the tray's place, seen from the base; may be repeated."
+        ),
     ] = None,
     arm: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="YAML with single fields of the cell; may be repeated.")
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="YAML with single fields of the cell; may be repeated."),
     ] = None,
     targets: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML list of {name, translation, quaternion}: cup poses to ask about.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="YAML list of {name, translation, quaternion}: cup poses to ask about.",
+        ),
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
@@ -55,7 +83,10 @@ def feasibility(
     _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
     command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])
     support = world.cell.support
-    cells = {path.stem: load_world(config, path, settings).cell.with_support(support) for path in cell or []}
+    cells = {
+        path.stem: load_world(config, path, settings).cell.with_support(support)
+        for path in cell or []
+    }
     setups = command.setups(
         [_numbers("--base", text) for text in base or []],
         [_numbers("--tray", text) for text in tray or []],

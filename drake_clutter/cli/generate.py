@@ -24,9 +24,13 @@ from drake_clutter.cli.world import load_world
 
 def generate(
     out: OutOption,
-    agent: Annotated[str, typer.Option(help="random, hill-climbing, or the file of a checkpoint that you trained.")] = "random",
+    agent: Annotated[
+        str,
+        typer.Option(help="random, hill-climbing, or the file of a checkpoint that you trained."),
+    ] = "random",
     temperature: Annotated[
-        float | None, typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds.")
+        float | None,
+        typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds."),
     ] = None,
     objects: ObjectsOption = "ycb7",
     nodes: NodesOption = 25,
@@ -44,7 +48,9 @@ def generate(
     from drake_clutter.agents.generation import GenerationJob
     from drake_clutter.commands import generate as command
 
-    job = GenerationJob(agent, objects, catalogue, nodes, seed, load_world(config, cell, settings), temperature)
+    job = GenerationJob(
+        agent, objects, catalogue, nodes, seed, load_world(config, cell, settings), temperature
+    )
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return progress_bar("scenes", made, done, total)

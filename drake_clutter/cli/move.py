@@ -26,11 +26,20 @@ def move(
     scene: SceneArgument,
     out: OutOption,
     pick: Annotated[str | None, typer.Option(help="Name of the object to pick.")] = None,
-    place: Annotated[str | None, typer.Option(help="Name of the object to put it on, or tray.")] = None,
-    moves: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}.")] = None,
+    place: Annotated[
+        str | None, typer.Option(help="Name of the object to put it on, or tray.")
+    ] = None,
+    moves: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}."),
+    ] = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
     plan_only: Annotated[
-        bool, typer.Option("--plan-only", help="With --fidelity arm: write how the arm would move (plan.json), move nothing.")
+        bool,
+        typer.Option(
+            "--plan-only",
+            help="With --fidelity arm: write how the arm would move (plan.json), move nothing.",
+        ),
     ] = False,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
@@ -57,5 +66,7 @@ def move(
         show({"plans": plans} if as_json else plans_in_words(plans), as_json, f"{out}")
         return
     task = command.carry_out(start, chosen, seed, world, report_step, fidelity.value)
-    fields = command.write_episode(out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world)
+    fields = command.write_episode(
+        out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world
+    )
     show_episode(fields, as_json, out)

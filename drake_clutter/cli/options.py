@@ -16,15 +16,30 @@ class Fidelity(Enum):
 
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A scene file.")]
-OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; new or empty.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Folder for the results; new or empty.")
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same result.")]
-HtmlOption = Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write a page instead of showing it live.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
+HtmlOption = Annotated[
+    Path | None,
+    typer.Option("--html", metavar="FILE", help="Write a page instead of showing it live."),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON on standard output.")
+]
 CatalogueOption = Annotated[
-    Path | None, typer.Option("--catalogue", metavar="DIR", help="An asset folder with object classes of your own.")
+    Path | None,
+    typer.Option(
+        "--catalogue", metavar="DIR", help="An asset folder with object classes of your own."
+    ),
 ]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="YAML with the config's fields that differ from the defaults.")
+    Path | None,
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="YAML with the config's fields that differ from the defaults.",
+    ),
 ]
 CellOption = Annotated[
     Path | None,
@@ -42,9 +57,12 @@ SetOption = Annotated[
         help="A field of the cell or config, such as robot.base.z=0.4 or settle.max_time=3; may be repeated.",
     ),
 ]
-ObjectsOption = Annotated[str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")]
+ObjectsOption = Annotated[
+    str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")
+]
 MaxMovesOption = Annotated[
-    int | None, typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given.")
+    int | None,
+    typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given."),
 ]
 ExplorerOption = Annotated[
     str,
@@ -54,9 +72,16 @@ ExplorerOption = Annotated[
         "teacher (trained); or the file of a checkpoint that you trained.",
     ),
 ]
-WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")
+]
 RayOption = Annotated[
-    str | None, typer.Option("--ray", metavar="ADDRESS", help="Put the workers on this Ray cluster, e.g. auto, instead of here.")
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Put the workers on this Ray cluster, e.g. auto, instead of here.",
+    ),
 ]
 FidelityOption = Annotated[
     Fidelity,
@@ -65,5 +90,9 @@ FidelityOption = Annotated[
         "fast: by equilibrium, Drake in doubt."
     ),
 ]
-NodesOption = Annotated[int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")]
-LaidOutOption = Annotated[bool, typer.Option("--laid-out", help="Take the objects as laid out, not as settled.")]
+NodesOption = Annotated[
+    int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")
+]
+LaidOutOption = Annotated[
+    bool, typer.Option("--laid-out", help="Take the objects as laid out, not as settled.")
+]

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from drake_clutter.files import InputError
@@ -60,7 +67,10 @@ def show_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
     if as_json:
         show(fields, True, "")
         return
-    shown = {key: fields[key] for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")}
+    shown = {
+        key: fields[key]
+        for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")
+    }
     show(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
 
 
@@ -70,12 +80,20 @@ def progress_bar(what: str, items: Iterable[Any], done: int, total: int) -> Iter
     While they are made, standard output goes to standard error: Ray writes its messages there, and --json's result has to
     stay alone.
     """
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with redirect_stdout(sys.stderr), Progress(*columns, console=err_console) as bar:
         yield from bar.track(items, total=total, completed=done)
 
 
-def watch(name: Path, scene: "Scene", frames: Sequence["Frame"], cell: "WorkCell", html: Path | None) -> None:
+def watch(
+    name: Path, scene: "Scene", frames: Sequence["Frame"], cell: "WorkCell", html: Path | None
+) -> None:
     """Show frames in the browser until it is interrupted, or write them to one HTML file."""
     from drake_clutter.reports.recording import serve, write_recording
 
@@ -83,7 +101,9 @@ def watch(name: Path, scene: "Scene", frames: Sequence["Frame"], cell: "WorkCell
         try:
             write_recording(html, scene, frames, cell)
         except OSError as error:
-            raise InputError(f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write") from error
+            raise InputError(
+                f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write"
+            ) from error
         out_console.print(f"wrote {html}")
         return
     meshcat = serve(scene, frames, cell)

@@ -1,6 +1,13 @@
 """`drake-clutter render`."""
 
-from drake_clutter.cli.options import CatalogueOption, CellOption, ConfigOption, OutOption, SceneArgument, SetOption
+from drake_clutter.cli.options import (
+    CatalogueOption,
+    CellOption,
+    ConfigOption,
+    OutOption,
+    SceneArgument,
+    SetOption,
+)
 from drake_clutter.cli.output import show
 from drake_clutter.cli.world import load_scene_and_world
 from drake_clutter.files import output_directory

@@ -11,7 +11,12 @@ from drake_clutter.files import InputError
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(metavar="FILE.h5", help="Recorded motions, as `--fidelity arm` writes them.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE.h5", help="Recorded motions, as `--fidelity arm` writes them."
+        ),
+    ],
     html: HtmlOption = None,
     catalogue: CatalogueOption = None,
 ) -> None:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_clutter.cli.options import CellOption, JsonOption, NodesOption, OutOption, SeedOption, SetOption
+from drake_clutter.cli.options import (
+    CellOption,
+    JsonOption,
+    NodesOption,
+    OutOption,
+    SeedOption,
+    SetOption,
+)
 from drake_clutter.cli.output import report_step, show_episode
 from drake_clutter.cli.world import check_cell, in_world, refuse_support
 from drake_clutter.files import output_directory
@@ -23,7 +30,9 @@ def _in_scenario(setting: str) -> str:
     return f"world.{name}" if name.split("=")[0].split(".")[0] in _WORLD_FIELDS else name
 
 
-def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str] | None) -> "Scenario":
+def _load_scenario(
+    file: Path | None, cell: Path | None, settings: Sequence[str] | None
+) -> "Scenario":
     """Return a scenario; its cell is that of --cell, else of its scene file, under the fields that are named."""
     from drake_clutter.catalogue import load_catalogue
     from drake_clutter.cell.work_cell import load_cell
@@ -38,7 +47,9 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
     if named.scene:
         refuse_support(names)
         catalogue = load_catalogue(Path(named.catalogue) if named.catalogue else None)
-        base = replace(base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell))
+        base = replace(
+            base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell)
+        )
     scenario = load_typed(base, file, convert=upgrade)
     if cell is not None:
         given = load_cell(cell)
@@ -51,11 +62,17 @@ def _load_scenario(file: Path | None, cell: Path | None, settings: Sequence[str]
 
 
 def run(
-    scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with fields of Scenario.")] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of Scenario.")
+    ] = None,
     cell: CellOption = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="A field of Scenario, of its world or cell; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="FIELD=VALUE",
+            help="A field of Scenario, of its world or cell; may be repeated.",
+        ),
     ] = None,
     out: OutOption = Path("out/run"),
     as_json: JsonOption = False,
@@ -79,6 +96,8 @@ def demo(
     """SG* makes a scene, and the arm searches it until everything is found; write a page to watch."""
     from drake_clutter.commands import run as command
 
-    given = replace(_load_scenario(None, cell, settings), seed=seed, nodes=nodes, perception="depth")
+    given = replace(
+        _load_scenario(None, cell, settings), seed=seed, nodes=nodes, perception="depth"
+    )
     output_directory(out)
     show_episode(command.demo(given, out, report_step), as_json, out)

@@ -22,7 +22,9 @@ from drake_clutter.files import output_directory
 def solve(
     scene: SceneArgument,
     out: OutOption,
-    budget: Annotated[int, typer.Option(min=1, help="Moves that the search may try before it gives up.")] = 5000,
+    budget: Annotated[
+        int, typer.Option(min=1, help="Moves that the search may try before it gives up.")
+    ] = 5000,
     seed: SeedOption = 0,
     catalogue: CatalogueOption = None,
     config: ConfigOption = None,
@@ -35,5 +37,7 @@ def solve(
 
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
     output_directory(out)
-    fields = solve.solve(explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step)
+    fields = solve.solve(
+        explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step
+    )
     show(fields, as_json, f"{out}")

@@ -5,7 +5,10 @@ from drake_clutter.cli.output import watch
 
 
 def view(
-    scene: SceneArgument, html: HtmlOption = None, laid_out: LaidOutOption = False, catalogue: CatalogueOption = None
+    scene: SceneArgument,
+    html: HtmlOption = None,
+    laid_out: LaidOutOption = False,
+    catalogue: CatalogueOption = None,
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
     from drake_clutter.catalogue import load_catalogue

@@ -50,8 +50,13 @@ def refuse_support(settings: Sequence[str] | None) -> None:
         InputError: There is one.
     """
     for setting in settings or ():
-        if in_world(setting).startswith(("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")):
-            raise refusal(f"--set {setting}", "the objects stand on their scene's support; allowed are other fields")
+        if in_world(setting).startswith(
+            ("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")
+        ):
+            raise refusal(
+                f"--set {setting}",
+                "the objects stand on their scene's support; allowed are other fields",
+            )
 
 
 def load_world(
@@ -75,13 +80,19 @@ def load_world(
     default = ClutterConfig() if of_scenes is None else ClutterConfig(cell=of_scenes)
     base = default if cell is None else replace(default, cell=load_cell(cell))
     world = load_typed(base, config, convert=upgrade)
-    world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    world = load_typed(
+        world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade
+    )
     check_cell(world.cell, default.cell, cell or config)
     return world
 
 
 def load_scene_and_world(
-    scene: Path, catalogue: Path | None, config: Path | None, cell: Path | None, settings: Sequence[str] | None
+    scene: Path,
+    catalogue: Path | None,
+    config: Path | None,
+    cell: Path | None,
+    settings: Sequence[str] | None,
 ) -> tuple["SceneFile", "ClutterConfig"]:
     """Return a scene file and the world for it.
 
@@ -97,6 +108,8 @@ def load_scene_and_world(
     file = load_scene(scene, load_catalogue(catalogue))
     of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
     world = load_typed(replace(ClutterConfig(), cell=of_scene), config, convert=upgrade)
-    world = load_typed(world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade)
+    world = load_typed(
+        world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade
+    )
     check_cell(world.cell, file.cell, cell or config)
     return replace(file, scene=replace(file.scene, support=world.cell.support)), world

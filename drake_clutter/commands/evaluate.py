@@ -6,7 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.agents.evaluation import Episode, EpisodePlayer, EpisodeResult, summarise_episodes
+from drake_clutter.agents.evaluation import (
+    Episode,
+    EpisodePlayer,
+    EpisodeResult,
+    summarise_episodes,
+)
 from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell
@@ -56,14 +61,22 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
     """
     catalogue, scenes = load_catalogue(catalogue_folder), Path(named)
     if not scenes.exists():
-        sets = {path.stem: path for path in shipped_path("training/scenes").glob("*.json") if not path.stem.startswith("train_")}
+        sets = {
+            path.stem: path
+            for path in shipped_path("training/scenes").glob("*.json")
+            if not path.stem.startswith("train_")
+        }
         if named not in sets:
-            raise InputError(f"--scenes {named}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}")
+            raise InputError(
+                f"--scenes {named}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}"
+            )
         scenes = sets[named]
     if scenes.is_file():
         held = load_scene_set(scenes, catalogue)
         classes = frozenset(c.name for c in held.classes)
-        return [PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))]
+        return [
+            PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))
+        ]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
@@ -76,7 +89,9 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
             names = frozenset(o.object_class.name for o in file.scene.objects)
             found.append(PlayableScene(path, None, names, file.cell))
     if not found:
-        raise InputError(f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes")
+        raise InputError(
+            f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes"
+        )
     return found
 
 
@@ -115,24 +130,44 @@ def evaluate(
         InputError: an agent that there is not or that does not know the objects, no place for `out`, or nothing is hidden.
     """
     if out is not None and (out.is_dir() or not out.parent.is_dir()):
-        raise InputError(f"--out {out}: is a folder, or in none; allowed is a file in a folder that exists")
-    agents, classes = list(dict.fromkeys(agents)), frozenset[str]().union(*(scene.classes for scene in scenes))
+        raise InputError(
+            f"--out {out}: is a folder, or in none; allowed is a file in a folder that exists"
+        )
+    agents, classes = (
+        list(dict.fromkeys(agents)),
+        frozenset[str]().union(*(scene.classes for scene in scenes)),
+    )
     for agent in agents:
         make_explorers(agent, config, classes)  # says what is wrong before anything is played
-    episodes = [Episode(scene.file, scene.number, agent, index) for agent in agents for index, scene in enumerate(scenes)]
+    episodes = [
+        Episode(scene.file, scene.number, agent, index)
+        for agent in agents
+        for index, scene in enumerate(scenes)
+    ]
     make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = [result for result in progress(played, len(episodes)) if result.hidden]
     if not results:
-        raise InputError(f"--scenes: none of {len(scenes)} hides anything from the camera of --config; give scenes that do")
+        raise InputError(
+            f"--scenes: none of {len(scenes)} hides anything from the camera of --config; give scenes that do"
+        )
     rows = [
-        {"agent": agent} | summarise_episodes([result for result in results if result.agent == agent], limits(max_moves))
+        {"agent": agent}
+        | summarise_episodes(
+            [result for result in results if result.agent == agent], limits(max_moves)
+        )
         for agent in agents
     ]
     if out is None:
         return rows
     files = sorted({scene.file for scene in scenes})
-    fields = {"max_moves": max_moves, "seed": seed, "fidelity": fidelity, "config": to_plain(config), "rows": rows}
+    fields = {
+        "max_moves": max_moves,
+        "seed": seed,
+        "fidelity": fidelity,
+        "config": to_plain(config),
+        "rows": rows,
+    }
     fields |= {"commit": git_commit(), "scenes": {str(file): sha256_of(file) for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

@@ -38,12 +38,20 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     """
     verdict = DrakeJudge(config).judge(scene, item_rng(seed))
     if verdict.instability is not None:
-        raise InputError(f"the scene is not stable: {verdict.instability}; allowed is one that stays as it is when it settles")
+        raise InputError(
+            f"the scene is not stable: {verdict.instability}; allowed is one that stays as it is when it settles"
+        )
     return scene.at(verdict.settled)
 
 
 def explore(
-    scene: Scene, agent_name: str, fidelity: str, max_moves: int, seed: int, config: ClutterConfig, report: Report
+    scene: Scene,
+    agent_name: str,
+    fidelity: str,
+    max_moves: int,
+    seed: int,
+    config: ClutterConfig,
+    report: Report,
 ) -> ExplorationTask:
     """Plays an episode on a scene at rest.
 
@@ -63,14 +71,28 @@ def explore(
 
 def _check_names(moves: Sequence[Move], number: int, in_view: Sequence[str], scene: Scene) -> None:
     move = moves[number]
-    for role, name, allowed in (("pick", move.pick, in_view), ("place", move.place, [TRAY, *in_view])):
+    for role, name, allowed in (
+        ("pick", move.pick, in_view),
+        ("place", move.place, [TRAY, *in_view]),
+    ):
         if name not in allowed or (role == "place" and name == move.pick):
-            known = "is not in view, or the object itself" if name in (*scene.names, TRAY) else "is not in the scene"
-            raise InputError(f"move {number + 1}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}")
+            known = (
+                "is not in view, or the object itself"
+                if name in (*scene.names, TRAY)
+                else "is not in the scene"
+            )
+            raise InputError(
+                f"move {number + 1}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}"
+            )
 
 
 def carry_out(
-    scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, report: Report, fidelity: str = "settle"
+    scene: Scene,
+    moves: Sequence[Move],
+    seed: int,
+    config: ClutterConfig,
+    report: Report,
+    fidelity: str = "settle",
 ) -> ExplorationTask:
     """Carries a list of moves out, on a scene at rest, until one makes it collapse.
 
@@ -99,13 +121,19 @@ def carry_out(
     )
 
 
-def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path) -> list[dict[str, Any]]:
+def plan_only(
+    scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path
+) -> list[dict[str, Any]]:
     """Plans how the arm would carry out each move in a scene at rest, as it is; writes `plan.json`, and returns what it holds.
 
     Raises:
         InputError: as `carry_out`.
     """
-    look, rng, executor = LabelDetector(config.cell.camera).look(scene), item_rng(seed), ArmExecutor(config)
+    look, rng, executor = (
+        LabelDetector(config.cell.camera).look(scene),
+        item_rng(seed),
+        ArmExecutor(config),
+    )
     plans = list[dict[str, Any]]()
     for number, move in enumerate(moves):
         _check_names(moves, number, [d.name for d in look.observation.detections], scene)
@@ -119,7 +147,10 @@ def plan_only(scene: Scene, moves: Sequence[Move], seed: int, config: ClutterCon
             )
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
-    write_json(out / "plan.json", {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans})
+    write_json(
+        out / "plan.json",
+        {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans},
+    )
     return plans
 
 
@@ -195,7 +226,12 @@ def write_episode(
     save_scene(out / "after.yaml", task.scene, cell)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields, cell)
     if fidelity == "arm":
-        write_trajectories(out / "trajectory.h5", task.start, [(step.move, step.outcome) for step in task.steps], cell)
+        write_trajectories(
+            out / "trajectory.h5",
+            task.start,
+            [(step.move, step.outcome) for step in task.steps],
+            cell,
+        )
     fields["cell"] = to_plain(cell)
     write_json(out / "episode.json", fields)
     return fields

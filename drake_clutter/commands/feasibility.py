@@ -29,7 +29,16 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
-from drake_clutter.validation import Finite, Model, Text, Vector3, allowed, load_typed, to_plain, validate
+from drake_clutter.validation import (
+    Finite,
+    Model,
+    Text,
+    Vector3,
+    allowed,
+    load_typed,
+    to_plain,
+    validate,
+)
 from drake_clutter.workers.mapping import map_ordered
 from drake_clutter.yaml_text import read_yaml
 
@@ -38,7 +47,10 @@ HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
 """m, of the reachability map."""
 TIME_LIMIT = 5.0
 """s, for each move."""
-BASE_X, BASE_Y = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(), np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
+BASE_X, BASE_Y = (
+    np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(),
+    np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist(),
+)
 """m, of the bases that are compared, on one side of the tray: the other sides of a square one are like it."""
 
 
@@ -76,7 +88,9 @@ class FeasibilityJob:
             "targets": [asdict(target) for target in self.targets],
             "seed": self.seed,
             "world": to_plain(self.world),
-            "catalogue_folder": str(self.catalogue_folder.resolve()) if self.catalogue_folder else None,
+            "catalogue_folder": str(self.catalogue_folder.resolve())
+            if self.catalogue_folder
+            else None,
         }
 
 
@@ -90,7 +104,9 @@ def scene_files(given: Sequence[Path]) -> tuple[Path, ...]:
     for path in given:
         files = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
         if not files:
-            raise InputError(f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote")
+            raise InputError(
+                f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote"
+            )
         found += files
     check_names("scenes", found)
     return tuple(found)
@@ -103,11 +119,16 @@ def check_names(what: str, files: Sequence[Path]) -> None:
         InputError: The name.
     """
     if twice := [name for name, count in Counter(path.stem for path in files).items() if count > 1]:
-        raise InputError(f"{what}: {twice[0]} is there twice; allowed are files with names of their own")
+        raise InputError(
+            f"{what}: {twice[0]} is there twice; allowed are files with names of their own"
+        )
 
 
 def setups(
-    bases: Sequence[list[float]], trays: Sequence[list[float]], files: Sequence[Path], default: WorkCell
+    bases: Sequence[list[float]],
+    trays: Sequence[list[float]],
+    files: Sequence[Path],
+    default: WorkCell,
 ) -> dict[str, WorkCell]:
     """Return cells by name: the files', and the default one with other bases; the default one if nothing is given.
 
@@ -201,7 +222,12 @@ class Worker:
         if part.base_x is not None:
             places = [(part.base_x, y) for y in BASE_Y]
             scores = zip(places, base_scores(cell, places), strict=True)
-            return {"bases": [{"x": x, "y": y, "share": share, "manipulability": best} for (x, y), (share, best) in scores]}
+            return {
+                "bases": [
+                    {"x": x, "y": y, "share": share, "manipulability": best}
+                    for (x, y), (share, best) in scores
+                ]
+            }
         if part.scene is None:
             return self._reach(cell)
         return self._moves(part.setup, part.scene)
@@ -245,7 +271,12 @@ class Worker:
         study = self._studies[setup]
         rows = study.moves(path.stem, number, scene)
         noise = study.noise(path.stem, number, scene, rows)
-        return {"scene": path.stem, "unstable": False, "moves": [asdict(r) for r in rows], "noise": [asdict(r) for r in noise]}
+        return {
+            "scene": path.stem,
+            "unstable": False,
+            "moves": [asdict(r) for r in rows],
+            "noise": [asdict(r) for r in noise],
+        }
 
 
 def scene_at_rest(path: Path, job: FeasibilityJob) -> Scene | None:
@@ -256,7 +287,10 @@ def scene_at_rest(path: Path, job: FeasibilityJob) -> Scene | None:
 
 
 def feasibility(
-    job: FeasibilityJob, out: Path, workers: int, progress: Callable[[Iterable[Any], int, int], Iterable[Any]]
+    job: FeasibilityJob,
+    out: Path,
+    workers: int,
+    progress: Callable[[Iterable[Any], int, int], Iterable[Any]],
 ) -> dict[str, Any]:
     """Does what of the study is not done yet; writes its tables (CSV), summary.json and report.html; returns the summary.
 
@@ -274,13 +308,17 @@ def feasibility(
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
         if json.dumps(earlier) != json.dumps(job.fields()):  # the order of cameras counts, too
-            raise InputError(f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder")
+            raise InputError(
+                f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder"
+            )
     else:
         output_directory(out)
         write_json(out / JOB_FILE, job.fields())
     (out / PARTS).mkdir(exist_ok=True)
     parts = [Part(setup, number) for setup in job.setups for number in range(len(job.scenes))]
-    parts += [Part(setup) for setup in job.setups] + [Part(next(iter(job.setups)), None, x) for x in BASE_X]
+    parts += [Part(setup) for setup in job.setups] + [
+        Part(next(iter(job.setups)), None, x) for x in BASE_X
+    ]
     left = [part for part in parts if not (out / PARTS / part.file).exists()]
     done = map_ordered(partial(Worker, job), left, workers=workers)
     for part, found in zip(left, progress(done, len(parts) - len(left), len(parts)), strict=True):
@@ -299,25 +337,50 @@ def _without_nan(value: Any) -> Any:
 
 
 def _written(job: FeasibilityJob, out: Path, results: dict[Part, Any]) -> dict[str, Any]:
-    moves = [row for part, found in results.items() if part.scene is not None for row in found["moves"]]
-    noise = [row for part, found in results.items() if part.scene is not None for row in found["noise"]]
-    reach = {part.setup: found for part, found in results.items() if part.scene is None and part.base_x is None}
-    bases = [row for part, found in results.items() if part.base_x is not None for row in found["bases"]]
-    targets = [{"setup": setup, **target} for setup, found in reach.items() for target in found["targets"]]
+    moves = [
+        row for part, found in results.items() if part.scene is not None for row in found["moves"]
+    ]
+    noise = [
+        row for part, found in results.items() if part.scene is not None for row in found["noise"]
+    ]
+    reach = {
+        part.setup: found
+        for part, found in results.items()
+        if part.scene is None and part.base_x is None
+    }
+    bases = [
+        row for part, found in results.items() if part.base_x is not None for row in found["bases"]
+    ]
+    targets = [
+        {"setup": setup, **target} for setup, found in reach.items() for target in found["targets"]
+    ]
     cells = [
-        {"setup": setup, "height": z, "x": x, "y": y, **{name: f[name][k][i][j] for name in ("share", "manipulability")}}
+        {
+            "setup": setup,
+            "height": z,
+            "x": x,
+            "y": y,
+            **{name: f[name][k][i][j] for name in ("share", "manipulability")},
+        }
         for setup, f in reach.items()
         for k, z in enumerate(f["heights"])
         for i, x in enumerate(f["x"])
         for j, y in enumerate(f["y"])
     ]
-    tables = {"moves": (moves, MoveRow), "noise": (noise, NoiseRow), "reach": (cells, None), "bases": (bases, None)}
+    tables = {
+        "moves": (moves, MoveRow),
+        "noise": (noise, NoiseRow),
+        "reach": (cells, None),
+        "bases": (bases, None),
+    }
     for name, (rows, kind) in (tables | {"targets": (targets, None)}).items():
         columns = [field.name for field in fields(kind)] if kind else list(rows[0]) if rows else []
         if columns:
             _write_csv(out / f"{name}.csv", columns, rows)
     summary = summarise(job, moves, noise)
-    summary["unstable_scenes"] = sorted({f["scene"] for p, f in results.items() if p.scene is not None and f["unstable"]})
+    summary["unstable_scenes"] = sorted(
+        {f["scene"] for p, f in results.items() if p.scene is not None and f["unstable"]}
+    )
     best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
     summary["best_base"] = best
     write_json(out / "summary.json", summary)
@@ -328,7 +391,9 @@ def _written(job: FeasibilityJob, out: Path, results: dict[Part, Any]) -> dict[s
         assert scene is not None, "only moves of stable scenes are shown"
         return scene
 
-    write_report(out / REPORT, job.setups, moves, noise, reach, bases, targets, summary, scene_of, job.world)
+    write_report(
+        out / REPORT, job.setups, moves, noise, reach, bases, targets, summary, scene_of, job.world
+    )
     return summary
 
 
@@ -344,7 +409,9 @@ GROUPS: dict[str, Callable[[dict[str, Any]], str]] = {
     "object_class": lambda row: row["object_class"],
     "rest": lambda row: row["rest"],
     "objects_below": lambda row: str(row["below"]),
-    "top_height_cm": lambda row: f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}",
+    "top_height_cm": lambda row: (
+        f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}"
+    ),
     "pick_from_cm": lambda row: f"x {_twenty(row['pick_x'])}, y {_twenty(row['pick_y'])}",
 }
 """What the moves of a summary are grouped by; places in the tray's frame, heights above its floor."""
@@ -356,13 +423,17 @@ def _twenty(place: float) -> str:
     return f"{low} to {low + 20}"
 
 
-def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise(
+    job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
     """By setup: shares, reasons, what was planned of each of `GROUPS`; and which moves only one of two can do."""
     setups = {}
     for setup in job.setups:
         rows = [row for row in moves if row["setup"] == setup]
         planned = [row for row in rows if row["result"] == PLANNED]
-        quantiles = np.quantile([row["planning_s"] for row in rows if row["planning_s"] > 0] or [0.0], [0.5, 0.95, 0.99]).tolist()
+        quantiles = np.quantile(
+            [row["planning_s"] for row in rows if row["planning_s"] > 0] or [0.0], [0.5, 0.95, 0.99]
+        ).tolist()
         setups[setup] = {
             "moves": len(rows),
             "planned": len(planned),
@@ -376,20 +447,30 @@ def summarise(job: FeasibilityJob, moves: Sequence[dict[str, Any]], noise: Seque
                 }
                 for group, name in GROUPS.items()
             },
-            "motion_s_median": float(np.median([row["motion_s"] for row in planned])) if planned else None,
+            "motion_s_median": float(np.median([row["motion_s"] for row in planned]))
+            if planned
+            else None,
             "planning_s": dict(zip(("p50", "p95", "p99"), quantiles, strict=True)),
             "holds_with_error": {
                 f"{1000 * error:g} mm": [
-                    sum(n["result"] == "holds" for n in noise if n["setup"] == setup and n["error"] == error),
+                    sum(
+                        n["result"] == "holds"
+                        for n in noise
+                        if n["setup"] == setup and n["error"] == error
+                    ),
                     sum(1 for n in noise if n["setup"] == setup and n["error"] == error),
                 ]
                 for error in sorted({n["error"] for n in noise})
             },
         }
-    done = {(r["setup"], r["scene"], r["pick"], r["place"]) for r in moves if r["result"] == PLANNED}
+    done = {
+        (r["setup"], r["scene"], r["pick"], r["place"]) for r in moves if r["result"] == PLANNED
+    }
     names, keys = list(job.setups), {(r["scene"], r["pick"], r["place"]) for r in moves}
     paired = {
-        f"{first} and not {second}": sum((first, *key) in done and (second, *key) not in done for key in keys)
+        f"{first} and not {second}": sum(
+            (first, *key) in done and (second, *key) not in done for key in keys
+        )
         for first in names
         for second in names
         if first != second

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.agents.generation import GeneratedScene, GenerationJob, SceneGenerator, make_generation_agent, summarise
+from drake_clutter.agents.generation import (
+    GeneratedScene,
+    GenerationJob,
+    SceneGenerator,
+    make_generation_agent,
+    summarise,
+)
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.files import InputError, output_directory, write_json
 from drake_clutter.grammar import NodeBudget
@@ -71,7 +77,9 @@ def generate(
     catalogue = load_catalogue(job.catalogue_folder)
     for object_class in catalogue.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written
-    output_directory(out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES}))
+    output_directory(
+        out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES})
+    )
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
         if json.dumps(earlier) != json.dumps(job.fields):  # the order of cameras counts, too
@@ -85,19 +93,29 @@ def generate(
     paths = [out / SCENES / f"{index:04d}.yaml" for index in range(count)]
     # Scenes are written in order, so what is there is a beginning.
     done = next((index for index, path in enumerate(paths) if not path.exists()), count)
-    earlier_run = json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
-    seconds, failures = float(earlier_run.get("seconds", 0.0)), Counter(earlier_run.get("layout_failures", {}))
+    earlier_run = (
+        json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
+    )
+    seconds, failures = (
+        float(earlier_run.get("seconds", 0.0)),
+        Counter(earlier_run.get("layout_failures", {})),
+    )
     solvable: list[str | None] = earlier_run.get("solvable", [])[:done]
     done = len(solvable)  # one less than the scenes, if the run was stopped between the two files
 
     start = time.monotonic()
-    made: Iterable[GeneratedScene] = map_ordered(_Factory(job), range(done, count), workers=workers, ray_address=ray_address)
+    made: Iterable[GeneratedScene] = map_ordered(
+        _Factory(job), range(done, count), workers=workers, ray_address=ray_address
+    )
     for index, result in enumerate(progress(made, done, count), start=done):
         failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, job.config.cell, result.verdict)
         solvable.append(result.solvable.value if result.solvable else None)
         spent = seconds + time.monotonic() - start
-        write_json(out / PROGRESS_FILE, {"seconds": spent, "layout_failures": dict(failures), "solvable": solvable})
+        write_json(
+            out / PROGRESS_FILE,
+            {"seconds": spent, "layout_failures": dict(failures), "solvable": solvable},
+        )
     seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
 
     files = [load_scene(path, catalogue) for path in paths]
@@ -111,7 +129,9 @@ def generate(
         "config": to_plain(job.config),
     }
     write_json(out / SUMMARY_FILE, summary)
-    write_contact_sheet(out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])])
+    write_contact_sheet(
+        out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])]
+    )
     return summary
 
 
@@ -123,5 +143,13 @@ def _thumbnail(index: int, scene: Scene, verdict: Verdict) -> tuple[NDArray[np.u
     global _camera
     _camera = _camera or PictureCamera()
     if verdict.instability is None:
-        return _camera.overhead(scene.at(verdict.settled)), f"{index:04d}  hidden {len(verdict.hidden)}", True
-    return _camera.overhead(scene), f"{index:04d}  {verdict.instability.reason.value}: {verdict.instability.object}", False
+        return (
+            _camera.overhead(scene.at(verdict.settled)),
+            f"{index:04d}  hidden {len(verdict.hidden)}",
+            True,
+        )
+    return (
+        _camera.overhead(scene),
+        f"{index:04d}  {verdict.instability.reason.value}: {verdict.instability.object}",
+        False,
+    )

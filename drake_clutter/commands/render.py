@@ -25,7 +25,10 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
         The visible share of each object, of the camera that an explorer sees through.
     """
     cameras = config.cell.cameras
-    shares = [_render(scene, camera, out, f"{name}_" if len(cameras) > 1 else "") for name, camera in cameras.items()]
+    shares = [
+        _render(scene, camera, out, f"{name}_" if len(cameras) > 1 else "")
+        for name, camera in cameras.items()
+    ]
     Image.fromarray(PictureCamera().oblique(scene)).save(out / "picture.png")
     return shares[0]
 
@@ -40,5 +43,8 @@ def _render(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, f
     Image.fromarray(depth.astype(np.uint16)).save(out / f"{prefix}depth.png")
     Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
     hidden = list(camera.hidden(shares))
-    write_json(out / f"{prefix}visible.json", {"visible_share": shares, "hidden": hidden, "names": list(scene.names)})
+    write_json(
+        out / f"{prefix}visible.json",
+        {"visible_share": shares, "hidden": hidden, "names": list(scene.names)},
+    )
     return shares

@@ -24,7 +24,9 @@ SCENE_TRIES = 50
 """Scenes that a generator may make until one is stable and hides something."""
 
 
-def scene_of(scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] = lambda _: True) -> tuple[Scene, int]:
+def scene_of(
+    scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] = lambda _: True
+) -> tuple[Scene, int]:
     """The scenario's scene at rest, and the index under which the generator made it; from `first` on, the first that suits.
 
     Raises:
@@ -34,14 +36,25 @@ def scene_of(scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] 
     if scenario.scene:
         file = load_scene(Path(scenario.scene), load_catalogue(catalogue))
         judged = file.verdict is not None and file.verdict.stable
-        return (file.settled_scene if judged else at_rest(file.scene, scenario.world, scenario.seed)), 0
-    job = GenerationJob(scenario.generator, scenario.objects, catalogue, scenario.nodes, scenario.seed, scenario.world)
+        return (
+            file.settled_scene if judged else at_rest(file.scene, scenario.world, scenario.seed)
+        ), 0
+    job = GenerationJob(
+        scenario.generator,
+        scenario.objects,
+        catalogue,
+        scenario.nodes,
+        scenario.seed,
+        scenario.world,
+    )
     generate = SceneGenerator(job)
     for index in range(first, first + SCENE_TRIES):
         made = generate(index)
         if made.verdict.hidden and suits(scene := made.scene.at(made.verdict.settled)):
             return scene, index
-    raise InputError(f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable, hides something and suits")
+    raise InputError(
+        f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable, hides something and suits"
+    )
 
 
 def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
@@ -59,19 +72,29 @@ def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationT
     return task, loop.timing
 
 
-def write(out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int) -> dict[str, Any]:
+def write(
+    out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int
+) -> dict[str, Any]:
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.start, scenario.world.cell)
     told: dict[str, Any] = {"timing": asdict(timing), **more}
-    return write_episode(out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told)
+    return write_episode(
+        out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told
+    )
 
 
 def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
     """Plays a scenario; see `write`."""
     scene, _ = scene_of(scenario)
     task, timing = play(scenario, scene, report)
-    return write(out, scenario, task, timing, f"{scenario.agent} and the arm search {Path(scenario.scene).name or 'a scene'}")
+    return write(
+        out,
+        scenario,
+        task,
+        timing,
+        f"{scenario.agent} and the arm search {Path(scenario.scene).name or 'a scene'}",
+    )
 
 
 def demo(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
@@ -86,5 +109,10 @@ def demo(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
         if task.end is EpisodeEnd.ALL_FOUND:
             break
     return write(
-        out, scenario, task, timing, f"SG* hides, the arm searches: seed {scenario.seed}, scene {index}", scenes_tried=tried
+        out,
+        scenario,
+        task,
+        timing,
+        f"SG* hides, the arm searches: seed {scenario.seed}, scene {index}",
+        scenes_tried=tried,
     )

@@ -12,7 +12,15 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.yaml_text import yaml_text
 
 
-def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: ClutterConfig, report: Report) -> dict[str, Any]:
+def solve(
+    scene: Scene,
+    name: str,
+    out: Path,
+    seed: int,
+    budget: int,
+    config: ClutterConfig,
+    report: Report,
+) -> dict[str, Any]:
     """Searches, carries a plan out at fidelity `settle`, and writes `solution.json`; with a plan also `moves.yaml` and a page.
 
     Args:
@@ -48,6 +56,8 @@ def solve(scene: Scene, name: str, out: Path, seed: int, budget: int, config: Cl
         write_text(out / "moves.yaml", yaml_text(moves))
         task = carry_out(scene, solution.plan, seed, config, report)
         fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
-        write_episode(out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed, config)
+        write_episode(
+            out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed, config
+        )
     write_json(out / "solution.json", fields)
     return fields

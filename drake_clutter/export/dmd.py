@@ -32,7 +32,9 @@ def write_dmd(scene: Scene, folder: Path) -> Path:
         target = folder / object_class.name
         target.mkdir()
         for file in object_class.folder.iterdir():
-            shutil.copyfile(file, target / file.name)  # not copytree: an installed package's modes may be read-only
+            shutil.copyfile(
+                file, target / file.name
+            )  # not copytree: an installed package's modes may be read-only
     (folder / "tray.sdf").write_text(support_sdf(scene.support), encoding="utf-8")
     (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
     directives = [

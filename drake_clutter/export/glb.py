@@ -22,7 +22,9 @@ def _add_tray(picture: trimesh.Scene, support: Support) -> None:
     for tray_box in tray_boxes(support):
         box = trimesh.creation.box(tray_box.size)
         # glTF takes for metal whatever does not say otherwise.
-        material = trimesh.visual.material.PBRMaterial(baseColorFactor=tray_box.colour, metallicFactor=0.0, roughnessFactor=0.8)
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorFactor=tray_box.colour, metallicFactor=0.0, roughnessFactor=0.8
+        )
         box.visual = trimesh.visual.TextureVisuals(material=material)
         name = f"{TRAY}/{tray_box.name}"
         picture.geometry[name] = box

@@ -7,7 +7,14 @@ from xml.etree.ElementTree import Element, SubElement
 from drake_clutter.assets.contact import FRICTION
 from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.cell.support import Support
-from drake_clutter.export.parts import class_inertial, classes_of, text_of, tray_boxes, write_class_meshes, write_xml
+from drake_clutter.export.parts import (
+    class_inertial,
+    classes_of,
+    text_of,
+    tray_boxes,
+    write_class_meshes,
+    write_xml,
+)
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 
 
@@ -34,18 +41,41 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
 def _add_tray(worldbody: Element, support: Support) -> None:
     tray = SubElement(worldbody, "body", name=TRAY)
     for box in tray_boxes(support):
-        geometry = {"type": "box", "size": text_of(box.size / 2), "pos": text_of(box.p_TG), "rgba": text_of(box.colour)}
+        geometry = {
+            "type": "box",
+            "size": text_of(box.size / 2),
+            "pos": text_of(box.p_TG),
+            "rgba": text_of(box.colour),
+        }
         # Seen as well as touched, so it is in the group of the visuals.
-        SubElement(tray, "geom", {"class": "collision", "name": f"{TRAY}/{box.name}", "group": "2"} | geometry)
+        SubElement(
+            tray,
+            "geom",
+            {"class": "collision", "name": f"{TRAY}/{box.name}", "group": "2"} | geometry,
+        )
 
 
 def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[str]) -> None:
     object_class, X_TO = scene_object.object_class, scene_object.X_TO
     inertial = class_inertial(object_class)
-    body = SubElement(worldbody, "body", name=scene_object.name, pos=text_of(X_TO.translation), quat=text_of(X_TO.quaternion))
+    body = SubElement(
+        worldbody,
+        "body",
+        name=scene_object.name,
+        pos=text_of(X_TO.translation),
+        quat=text_of(X_TO.quaternion),
+    )
     SubElement(body, "freejoint", name=scene_object.name)
-    SubElement(body, "inertial", pos=text_of(inertial.com), mass=repr(inertial.mass), fullinertia=text_of(inertial.inertia))
-    SubElement(body, "geom", {"class": "visual", "mesh": object_class.name, "material": object_class.name})
+    SubElement(
+        body,
+        "inertial",
+        pos=text_of(inertial.com),
+        mass=repr(inertial.mass),
+        fullinertia=text_of(inertial.inertia),
+    )
+    SubElement(
+        body, "geom", {"class": "visual", "mesh": object_class.name, "material": object_class.name}
+    )
     x, y, z = object_class.size
     if object_class.shape is Shape.BOX:
         geometries = [{"type": "box", "size": text_of([x / 2, y / 2, z / 2])}]
@@ -63,7 +93,9 @@ def write_mjcf(scene: Scene, folder: Path) -> Path:
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     _add_defaults(root)
     asset = SubElement(root, "asset")
-    pieces: Mapping[str, Sequence[str]] = {entry.name: write_class_meshes(entry, folder) for entry in classes_of(scene)}
+    pieces: Mapping[str, Sequence[str]] = {
+        entry.name: write_class_meshes(entry, folder) for entry in classes_of(scene)
+    }
     for object_class in classes_of(scene):
         _add_assets(asset, object_class, pieces[object_class.name])
     worldbody = SubElement(root, "worldbody")

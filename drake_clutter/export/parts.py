@@ -59,7 +59,9 @@ class TrayBox:
 
 def classes_of(scene: Scene) -> list[ObjectClass]:
     """The classes in a scene, each once, by name."""
-    return sorted({scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name)
+    return sorted(
+        {scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name
+    )
 
 
 def text_of(numbers: Iterable[float]) -> str:
@@ -77,7 +79,10 @@ def class_inertial(object_class: ObjectClass) -> Inertial:
     """The mass properties in the class's built model."""
     inertial = ElementTree.parse(object_class.model_path).find("model/link/inertial")
     assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
-    moments = (float(inertial.findtext(f"inertia/{entry}", "nan")) for entry in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    moments = (
+        float(inertial.findtext(f"inertia/{entry}", "nan"))
+        for entry in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    )
     com = (float(value) for value in inertial.findtext("pose", "").split()[:3])
     return Inertial(float(inertial.findtext("mass", "nan")), tuple(com), tuple(moments))
 
@@ -114,9 +119,13 @@ def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:
     visual = class_visual(object_class)
     # Full white, or simulators that multiply the texture by the material's colour show it dark.
     visual.visual.material = trimesh.visual.material.SimpleMaterial(
-        image=visual.visual.material.baseColorTexture.convert("RGB"), diffuse=[255] * 4, name="label"
+        image=visual.visual.material.baseColorTexture.convert("RGB"),
+        diffuse=[255] * 4,
+        name="label",
     )
-    text, files = trimesh.exchange.obj.export_obj(visual, include_normals=True, return_texture=True, mtl_name="visual.mtl")
+    text, files = trimesh.exchange.obj.export_obj(
+        visual, include_normals=True, return_texture=True, mtl_name="visual.mtl"
+    )
     for name, data in files.items():
         (target / name).write_bytes(data)
     (target / "visual.obj").write_text(text, encoding="utf-8")

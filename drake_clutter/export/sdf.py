@@ -42,7 +42,9 @@ def _pose_text(pose: Pose) -> str:
 
 def write_sdf(scene: Scene, folder: Path) -> Path:
     """Writes `scene.sdf`, a world in which every object is a model of its own, and a folder of meshes per class."""
-    ElementTree.register_namespace("drake", _DRAKE)  # else the prefix is renamed, and Drake no longer knows it
+    ElementTree.register_namespace(
+        "drake", _DRAKE
+    )  # else the prefix is renamed, and Drake no longer knows it
     for object_class in classes_of(scene):
         write_class_meshes(object_class, folder)
     root = ElementTree.Element("sdf", version="1.10")

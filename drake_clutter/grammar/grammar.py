@@ -28,7 +28,9 @@ class NodeBudget:
 
     def __post_init__(self) -> None:
         if self.nodes < SMALLEST_BUDGET:
-            raise InputError(f"nodes: {self.nodes}; allowed is {SMALLEST_BUDGET} (tray, one object, end) or more")
+            raise InputError(
+                f"nodes: {self.nodes}; allowed is {SMALLEST_BUDGET} (tray, one object, end) or more"
+            )
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,10 @@ class SceneGrammar:
         self.rules = rule_sheet(classes)
         self.index = {rule.name: index for index, rule in enumerate(self.rules)}
         self.patterns = list({id(rule.left): rule.left for rule in self.rules}.values())
-        self.pattern = [next(k for k, left in enumerate(self.patterns) if left is rule.left) for rule in self.rules]
+        self.pattern = [
+            next(k for k, left in enumerate(self.patterns) if left is rule.left)
+            for rule in self.rules
+        ]
         self._growth = np.array([rule.growth for rule in self.rules])
         self._open_slots_added = np.array([rule.open_slots_added for rule in self.rules])
 
@@ -139,7 +144,9 @@ class SceneGrammar:
             graph = self.apply(graph, self.rules[self.index[name]])
         return graph
 
-    def derive(self, budget: NodeBudget, choose: Callable[[ClutterGraph, NDArray[np.bool_]], int]) -> Derivation:
+    def derive(
+        self, budget: NodeBudget, choose: Callable[[ClutterGraph, NDArray[np.bool_]], int]
+    ) -> Derivation:
         """Applies rules from the start graph on, until none is feasible.
 
         Args:
@@ -163,7 +170,10 @@ def uniform_choice(rng: np.random.Generator) -> Callable[[ClutterGraph, NDArray[
 
 def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Match | None:
     """The match whose root is the first possible of the given nodes. Children are tried in order, with backtracking."""
-    nodes, edges = graph.nx._node, graph.nx._adj  # as networkx's own loops do: its views cost more than the matching
+    nodes, edges = (
+        graph.nx._node,
+        graph.nx._adj,
+    )  # as networkx's own loops do: its views cost more than the matching
     root_name, root_kinds = next(iter(left.nodes.items()))
 
     def extend(match: Match, pattern_edges: tuple[tuple[str, str], ...]) -> Match | None:

@@ -38,7 +38,9 @@ class ClutterGraph:
         self.nx.add_node(self.TRAY_NODE, kind=TRAY)
 
     @classmethod
-    def from_parts(cls, nodes: Mapping[int, str], edges: Mapping[tuple[int, int], EdgeKind]) -> "ClutterGraph":
+    def from_parts(
+        cls, nodes: Mapping[int, str], edges: Mapping[tuple[int, int], EdgeKind]
+    ) -> "ClutterGraph":
         """A graph of the given kinds.
 
         Raises:
@@ -55,7 +57,9 @@ class ClutterGraph:
                 raise ValueError(f"edges: {parent} -> {child} joins a node that is not there")
             graph.nx.add_edge(parent, child, kind=edge_kind)
         if len(graph.breadth_first()) != len(nodes) or not nx.is_directed_acyclic_graph(graph.nx):
-            raise ValueError("edges: allowed is an acyclic graph in which the tray leads to every node")
+            raise ValueError(
+                "edges: allowed is an acyclic graph in which the tray leads to every node"
+            )
         if any(graph.kind(node) == END and graph.children(node) for node in nodes):
             raise ValueError("edges: nothing may stand on an end")
         return graph
@@ -112,7 +116,9 @@ class ClutterGraph:
         found = []
         for bottom in self.stacks():
             members = set(bottom).union(*(nx.descendants(self.nx, node) for node in bottom))
-            found.append([node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS])
+            found.append(
+                [node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS]
+            )
         return found
 
     def largest_stack_share(self) -> float:
@@ -122,13 +128,18 @@ class ClutterGraph:
 
     def objects(self) -> Iterator[tuple[int, str]]:
         """(node, class) of every object node, in order of creation."""
-        return ((node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS)
+        return (
+            (node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS
+        )
 
     @property
     def is_terminal(self) -> bool:
         """Whether every attribute is terminal, so that the graph can become a scene."""
-        return not any(kind in NON_TERMINAL_KINDS for _, kind in self.nx.nodes(data="kind")) and not any(
-            kind == PRIMITIVE and self.kind(child) != END for _, child, kind in self.nx.edges(data="kind")
+        return not any(
+            kind in NON_TERMINAL_KINDS for _, kind in self.nx.nodes(data="kind")
+        ) and not any(
+            kind == PRIMITIVE and self.kind(child) != END
+            for _, child, kind in self.nx.edges(data="kind")
         )
 
 

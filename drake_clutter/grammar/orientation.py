@@ -41,7 +41,11 @@ class Orientation(Enum):
 def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
     """Indices of O's axes that lie along the tray's x, and point up."""
     # A mesh is made to stand on its z, whatever sticks out of it.
-    by_extent = range(3) if object_class.shape is Shape.MESH else np.argsort(object_class.size, kind="stable")
+    by_extent = (
+        range(3)
+        if object_class.shape is Shape.MESH
+        else np.argsort(object_class.size, kind="stable")
+    )
     short, middle, long = (int(axis) for axis in by_extent)
     rest = object_class.only_rest or rest
     return {Rest.FLAT: (long, short), Rest.SIDE: (long, middle), Rest.UPRIGHT: (middle, long)}[rest]
@@ -71,7 +75,9 @@ def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[i
         axis = R_TO[:, 2]
         described = np.outer(axis, axis)  # the axis up to its sign
     elif object_class.shape is Shape.BOX:
-        described = R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T  # the box's moments name it
+        described = (
+            R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T
+        )  # the box's moments name it
     else:
         described = R_TO
     return tuple(int(value) for value in np.round(described * 1e6).ravel())

@@ -8,12 +8,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drake_clutter.catalogue import ObjectClass, PairArrangement
-from drake_clutter.grammar.graph import DUMMY, END, OBJECT_SLOT, OPEN_SLOT, PRIMITIVE, TRAY, EdgeKind
+from drake_clutter.grammar.graph import (
+    DUMMY,
+    END,
+    OBJECT_SLOT,
+    OPEN_SLOT,
+    PRIMITIVE,
+    TRAY,
+    EdgeKind,
+)
 from drake_clutter.grammar.orientation import Orientation
 
 KEEP = "keep"
 
-PAIR_ORIENTATION = {PairArrangement.LYING: Orientation.FLAT_0, PairArrangement.STANDING: Orientation.UPRIGHT_0}
+PAIR_ORIENTATION = {
+    PairArrangement.LYING: Orientation.FLAT_0,
+    PairArrangement.STANDING: Orientation.UPRIGHT_0,
+}
 """The predefined orientation of a pair; it tells the two arrangements of a class apart."""
 
 
@@ -70,14 +81,22 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
     terminal_parents = names | {TRAY, DUMMY}
     tray = Pattern({"tray": frozenset({TRAY})}, (), rewritten="tray")
     slot_below_open = Pattern(
-        {"slot": frozenset({OBJECT_SLOT}), "top": frozenset({OPEN_SLOT})}, (("slot", "top"),), rewritten="top"
+        {"slot": frozenset({OBJECT_SLOT}), "top": frozenset({OPEN_SLOT})},
+        (("slot", "top"),),
+        rewritten="top",
     )
     slot = Pattern(
-        {"parent": terminal_parents, "slot": frozenset({OBJECT_SLOT}), "child": frozenset({OBJECT_SLOT, END})},
+        {
+            "parent": terminal_parents,
+            "slot": frozenset({OBJECT_SLOT}),
+            "child": frozenset({OBJECT_SLOT, END}),
+        },
         (("parent", "slot"), ("slot", "child")),
         rewritten="slot",
     )
-    unoriented = Pattern({"parent": terminal_parents, "child": names}, (("parent", "child"),), rewritten="child")
+    unoriented = Pattern(
+        {"parent": terminal_parents, "child": names}, (("parent", "child"),), rewritten="child"
+    )
 
     rules = [
         ProductionRule(
@@ -92,7 +111,9 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
             {"slot": KEEP, "top": OBJECT_SLOT, "new_top": OPEN_SLOT},
             {("slot", "top"): PRIMITIVE, ("top", "new_top"): PRIMITIVE},
         ),
-        ProductionRule("end", slot_below_open, {"slot": KEEP, "top": END}, {("slot", "top"): PRIMITIVE}),
+        ProductionRule(
+            "end", slot_below_open, {"slot": KEEP, "top": END}, {("slot", "top"): PRIMITIVE}
+        ),
     ]
     for object_class in classes:
         name = object_class.name
@@ -122,7 +143,10 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
             )
     rules += [
         ProductionRule(
-            f"orient_{orientation.name.lower()}", unoriented, {"parent": KEEP, "child": KEEP}, {("parent", "child"): orientation}
+            f"orient_{orientation.name.lower()}",
+            unoriented,
+            {"parent": KEEP, "child": KEEP},
+            {("parent", "child"): orientation},
         )
         for orientation in Orientation
     ]

@@ -30,7 +30,13 @@ class Checkpoint:
 def save_checkpoint(path: Path, network: nn.Module, about: dict[str, Any]) -> None:
     """Writes `path` (.safetensors) and a .json beside it."""
     with replacing(path) as temporary:
-        save_file({name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}, temporary)
+        save_file(
+            {
+                name: value.detach().cpu().contiguous()
+                for name, value in network.state_dict().items()
+            },
+            temporary,
+        )
     write_json(path.with_suffix(".json"), about)
 
 
@@ -41,7 +47,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         InputError: a file is missing or broken.
     """
     try:
-        return Checkpoint(load_file(path), json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
+        return Checkpoint(
+            load_file(path), json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        )
     except (OSError, SafetensorError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); allowed is a checkpoint, .safetensors with a .json beside it"
@@ -66,17 +74,27 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
 
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     """Those that are called `PART.NAME`, by NAME."""
-    return {name.removeprefix(f"{part}."): value for name, value in tensors.items() if name.startswith(f"{part}.")}
+    return {
+        name.removeprefix(f"{part}."): value
+        for name, value in tensors.items()
+        if name.startswith(f"{part}.")
+    }
 
 
 def learner_tensors(network: nn.Module, optimizer: Optimizer) -> dict[str, Tensor]:
     """A network's weights, as `network.NAME`, and what its optimiser remembers, as `optimizer.NUMBER.NAME`."""
     weights = {f"network.{name}": value for name, value in network.state_dict().items()}
     moments = optimizer.state_dict()["state"].items()
-    return weights | {f"optimizer.{number}.{name}": value for number, of_one in moments for name, value in of_one.items()}
+    return weights | {
+        f"optimizer.{number}.{name}": value
+        for number, of_one in moments
+        for name, value in of_one.items()
+    }
 
 
-def restore_learner(network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+def restore_learner(
+    network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]
+) -> None:
     """Gives back what `learner_tensors` took; other names are left alone."""
     network.load_state_dict(part_of(tensors, "network"))
     moments: dict[int, dict[str, Tensor]] = {}

@@ -20,11 +20,15 @@ def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
     """
     missing = [module for module in ("torch", "safetensors") if find_spec(module) is None]
     if missing:
-        raise InputError(f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]")
+        raise InputError(
+            f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]"
+        )
     try:
         return shipped_path(shipped[name]) if name in shipped else Path(name)
     except FileNotFoundError as error:
-        raise InputError(f"--agent {name}: {error}; train it with the scripts of training/, and give its file") from error
+        raise InputError(
+            f"--agent {name}: {error}; train it with the scripts of training/, and give its file"
+        ) from error
 
 
 def weights_of(name: str, shipped: Mapping[str, str]) -> str:
@@ -39,4 +43,6 @@ def weights_of(name: str, shipped: Mapping[str, str]) -> str:
     try:
         return sha256_of(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed is a checkpoint") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); allowed is a checkpoint"
+        ) from error

@@ -16,7 +16,12 @@ from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import config_yaml, to_plain
 
-CONFIG, STATE, HISTORY, TENSORBOARD = "config.yaml", "state.safetensors", "history.json", "tensorboard"
+CONFIG, STATE, HISTORY, TENSORBOARD = (
+    "config.yaml",
+    "state.safetensors",
+    "history.json",
+    "tensorboard",
+)
 
 
 class Learner(Protocol):
@@ -38,7 +43,9 @@ class TrainingRun:
         history: a row for each evaluation.
     """
 
-    def __init__(self, out: Path, config: Any, learner: Learner, steps: int, files: Sequence[Path] = ()) -> None:
+    def __init__(
+        self, out: Path, config: Any, learner: Learner, steps: int, files: Sequence[Path] = ()
+    ) -> None:
         """Begins a run, or takes up the one that is in the folder.
 
         Args:
@@ -50,7 +57,9 @@ class TrainingRun:
         """
         self._out, self._config, self._learner, self._steps = out, config, learner, steps
         self._files = {str(file): sha256_of(file) for file in files}
-        told = config_yaml(config) + "".join(f"# {file}: sha256 {digest}\n" for file, digest in self._files.items())
+        told = config_yaml(config) + "".join(
+            f"# {file}: sha256 {digest}\n" for file, digest in self._files.items()
+        )
         if not (out / CONFIG).exists():
             output_directory(out)
             write_text(out / CONFIG, told)
@@ -72,16 +81,27 @@ class TrainingRun:
         """Notes an evaluation: in the history, as curves, and on the screen."""
         step, spent = self._learner.step, time.monotonic() - self._begun
         rate = (step - self._begun_at) / spent if step > self._begun_at else 0.0
-        row = {"step": step, "seconds": self._seconds + spent, "commit": git_commit(), **losses, **charts}
+        row = {
+            "step": step,
+            "seconds": self._seconds + spent,
+            "commit": git_commit(),
+            **losses,
+            **charts,
+        }
         self.history.append(row)
         write_json(self._out / HISTORY, self.history)
-        for folder, values in (("charts", {**charts, "steps_per_second": rate}), ("losses", losses)):
+        for folder, values in (
+            ("charts", {**charts, "steps_per_second": rate}),
+            ("losses", losses),
+        ):
             for name, value in values.items():
                 self._writer.add_scalar(f"{folder}/{name}", value, step)
         left = (self._steps - step) / rate / 60 if rate else float("nan")
         told = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
         self._console.print(
-            f"{step:>7} of {self._steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left", highlight=False, soft_wrap=True
+            f"{step:>7} of {self._steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left",
+            highlight=False,
+            soft_wrap=True,
         )
 
     def save(self) -> None:
@@ -90,11 +110,20 @@ class TrainingRun:
 
     def finish(self, name: str, network: nn.Module, about: Mapping[str, Any]) -> None:
         """Writes the checkpoint, with config, hashes of files, last figures and commits, and the state."""
-        metrics, commits = self.history[-1], list(dict.fromkeys(row["commit"] for row in self.history))
+        metrics, commits = (
+            self.history[-1],
+            list(dict.fromkeys(row["commit"] for row in self.history)),
+        )
         save_checkpoint(
             self._out / name,
             network,
-            {**about, "config": to_plain(self._config), "files": self._files, "metrics": metrics, "commits": commits},
+            {
+                **about,
+                "config": to_plain(self._config),
+                "files": self._files,
+                "metrics": metrics,
+                "commits": commits,
+            },
         )
         self.save()
 
@@ -109,4 +138,6 @@ def device_of(name: str) -> torch.device:
         raise InputError(f"--device {name}; allowed are auto, cpu, cuda")
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch finds none; allowed here are auto, cpu")
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+    return torch.device(
+        ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+    )

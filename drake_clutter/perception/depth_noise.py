@@ -41,7 +41,9 @@ _LEFT_BY_SMOOTHING = 0.375
 """Of the standard deviation."""
 
 
-def noisy_depth(depth: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise = D435) -> NDArray[np.float32]:
+def noisy_depth(
+    depth: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise = D435
+) -> NDArray[np.float32]:
     """Depth as a stereo camera measures it.
 
     Args:
@@ -80,11 +82,24 @@ def _hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.float32
     return hidden
 
 
-def _punch_speckles(measured: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise) -> None:
+def _punch_speckles(
+    measured: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise
+) -> None:
     height, width = measured.shape
     reach = math.ceil(noise.speckle_radius)
     for _ in range(rng.poisson(noise.speckles)):
-        row, column, radius = rng.integers(height), rng.integers(width), rng.uniform(0.5, noise.speckle_radius)
-        rows, columns = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
-        y, x = np.ogrid[: min(rows.stop, height) - rows.start, : min(columns.stop, width) - columns.start]
-        measured[rows, columns][np.hypot(y + rows.start - row, x + columns.start - column) <= radius] = np.inf
+        row, column, radius = (
+            rng.integers(height),
+            rng.integers(width),
+            rng.uniform(0.5, noise.speckle_radius),
+        )
+        rows, columns = (
+            slice(max(0, row - reach), row + reach + 1),
+            slice(max(0, column - reach), column + reach + 1),
+        )
+        y, x = np.ogrid[
+            : min(rows.stop, height) - rows.start, : min(columns.stop, width) - columns.start
+        ]
+        measured[rows, columns][
+            np.hypot(y + rows.start - row, x + columns.start - column) <= radius
+        ] = np.inf

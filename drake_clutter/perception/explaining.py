@@ -53,7 +53,9 @@ class Explanation:
     @property
     def window(self) -> tuple[slice, slice]:
         """Rows and columns of the image that `seen` is of."""
-        return slice(self.top, self.top + self.seen.shape[0]), slice(self.left, self.left + self.seen.shape[1])
+        return slice(self.top, self.top + self.seen.shape[0]), slice(
+            self.left, self.left + self.seen.shape[1]
+        )
 
     def mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Where in the whole image, of a shape, it is `seen`."""
@@ -72,7 +74,10 @@ def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-d
     """
     R, p = pose_in_camera(camera, R, p)
     top, bottom, left, right = image_bounds(half, R, p, depth.shape, camera)
-    said, far = np.zeros((bottom - top, right - left), np.int8), np.zeros((bottom - top, right - left), np.float32)
+    said, far = (
+        np.zeros((bottom - top, right - left), np.int8),
+        np.zeros((bottom - top, right - left), np.float32),
+    )
     e, h, alone = eye_in(R, p), (half[0], half[1], half[2]), 0
     distances = np.empty(right - left)
     for v in range(top, bottom):
@@ -94,12 +99,20 @@ def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-d
     return top, left, said, far, alone
 
 
-def explanation(object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera) -> Explanation:
+def explanation(
+    object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera
+) -> Explanation:
     """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
-    half, R, p = np.asarray(object_class.size) / 2, np.ascontiguousarray(X_TO.rotation), np.asarray(X_TO.p, float)
+    half, R, p = (
+        np.asarray(object_class.size) / 2,
+        np.ascontiguousarray(X_TO.rotation),
+        np.asarray(X_TO.p, float),
+    )
     depth, cylinder = np.ascontiguousarray(depth, np.float32), object_class.shape is Shape.CYLINDER
     top, left, said, away, alone = _compared(cylinder, half, R, p, depth, camera.pinhole)
-    return Explanation(top, left, said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone))
+    return Explanation(
+        top, left, said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone)
+    )
 
 
 def chosen(

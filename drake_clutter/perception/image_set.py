@@ -69,7 +69,9 @@ class LabelledImage:
         return np.asarray(self.seen / np.maximum(self.alone, 1))
 
 
-def write_images(folder: Path, images: Iterable[LabelledImage], camera: Camera, class_names: Sequence[str]) -> None:
+def write_images(
+    folder: Path, images: Iterable[LabelledImage], camera: Camera, class_names: Sequence[str]
+) -> None:
     """Writes the images of one scene to a folder that is there once it is complete.
 
     Args:
@@ -96,14 +98,28 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: Camera, 
     for number, image in enumerate(images):
         name = f"{number:06d}.png"
         _write_png(image.color, temporary / COLOR / name)
-        depth = np.where(np.isfinite(image.depth), np.round(image.depth / _DEPTH_UNIT), 0).astype(np.uint16)
+        depth = np.where(np.isfinite(image.depth), np.round(image.depth / _DEPTH_UNIT), 0).astype(
+            np.uint16
+        )
         _write_png(depth, temporary / DEPTH / name)
-        _write_png(np.where(image.label < 0, _NO_INSTANCE, image.label).astype(np.uint8), temporary / LABEL / name)
+        _write_png(
+            np.where(image.label < 0, _NO_INSTANCE, image.label).astype(np.uint8),
+            temporary / LABEL / name,
+        )
         ids = [class_names.index(class_name) + 1 for class_name in image.classes]
         eyes[str(number)] = eye
-        poses[str(number)] = [{"obj_id": k, **_in_camera(X, camera)} for k, X in zip(ids, image.X_TO, strict=True)]
+        poses[str(number)] = [
+            {"obj_id": k, **_in_camera(X, camera)} for k, X in zip(ids, image.X_TO, strict=True)
+        ]
         infos[str(number)] = info = _infos(image)
-        coco["images"].append({"id": number, "file_name": f"{COLOR}/{name}", "width": camera.width, "height": camera.height})
+        coco["images"].append(
+            {
+                "id": number,
+                "file_name": f"{COLOR}/{name}",
+                "width": camera.width,
+                "height": camera.height,
+            }
+        )
         for instance, (category, about) in enumerate(zip(ids, info, strict=True)):
             if about["px_count_visib"]:
                 mask = image.label == instance
@@ -119,13 +135,22 @@ def write_images(folder: Path, images: Iterable[LabelledImage], camera: Camera, 
                         "visible_share": about["visib_fract"],
                     }
                 )
-    for file, value in ((CAMERA_FILE, eyes), (POSES_FILE, poses), (INFO_FILE, infos), (COCO_FILE, coco)):
-        (temporary / file).write_text(json.dumps(value, separators=(",", ":"), allow_nan=False), encoding="utf-8")
+    for file, value in (
+        (CAMERA_FILE, eyes),
+        (POSES_FILE, poses),
+        (INFO_FILE, infos),
+        (COCO_FILE, coco),
+    ):
+        (temporary / file).write_text(
+            json.dumps(value, separators=(",", ":"), allow_nan=False), encoding="utf-8"
+        )
     temporary.rename(folder)
 
 
 def _write_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None:
-    Image.fromarray(pixels).save(path, compress_level=1)  # a fifth larger than by default, written in a fraction of the time
+    Image.fromarray(pixels).save(
+        path, compress_level=1
+    )  # a fifth larger than by default, written in a fraction of the time
 
 
 def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
@@ -138,17 +163,32 @@ def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
 def _in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
     R_CT = camera.X_TC.rotation().matrix().T
     R_CO, p_CO = R_CT @ X_TO.rotation, R_CT @ (X_TO.p - camera.X_TC.translation())
-    return {"cam_R_m2c": R_CO.round(9).ravel().tolist(), "cam_t_m2c": (1000 * p_CO).round(6).tolist()}
+    return {
+        "cam_R_m2c": R_CO.round(9).ravel().tolist(),
+        "cam_t_m2c": (1000 * p_CO).round(6).tolist(),
+    }
 
 
 def _infos(image: LabelledImage) -> list[dict[str, Any]]:
     infos = []
-    for instance, (seen, alone, share) in enumerate(zip(image.seen, image.alone, image.visible_share, strict=True)):
+    for instance, (seen, alone, share) in enumerate(
+        zip(image.seen, image.alone, image.visible_share, strict=True)
+    ):
         box = [-1, -1, -1, -1]
         if seen:
             rows, columns = np.nonzero(image.label == instance)
-            box = [int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1]
-        info = {"px_count_all": int(alone), "px_count_visib": int(seen), "visib_fract": float(share), "bbox_visib": box}
+            box = [
+                int(columns.min()),
+                int(rows.min()),
+                int(np.ptp(columns)) + 1,
+                int(np.ptp(rows)) + 1,
+            ]
+        info = {
+            "px_count_all": int(alone),
+            "px_count_visib": int(seen),
+            "visib_fract": float(share),
+            "bbox_visib": box,
+        }
         infos.append(info)
     return infos
 
@@ -163,9 +203,13 @@ class ImageSet:
             InputError: there are no images in the folder.
         """
         scenes = sorted(path for path in folder.glob("[0-9]*") if (path / COCO_FILE).is_file())
-        self._files = [(scene, path.stem) for scene in scenes for path in sorted((scene / COLOR).glob("*.png"))]
+        self._files = [
+            (scene, path.stem) for scene in scenes for path in sorted((scene / COLOR).glob("*.png"))
+        ]
         if not self._files:
-            raise InputError(f"{folder}: holds no images; allowed is a folder that training/make_images.py wrote")
+            raise InputError(
+                f"{folder}: holds no images; allowed is a folder that training/make_images.py wrote"
+            )
         categories = json.loads((scenes[0] / COCO_FILE).read_text(encoding="utf-8"))["categories"]
         self._class_names = {category["id"]: category["name"] for category in categories}
 
@@ -175,8 +219,12 @@ class ImageSet:
     def __getitem__(self, index: int) -> LabelledImage:
         """The image of a number; those of one scene follow each other."""
         scene, name = self._files[index]
-        eye, instances, infos = (_of_scene(scene / file)[str(int(name))] for file in (CAMERA_FILE, POSES_FILE, INFO_FILE))
-        depth = np.asarray(Image.open(scene / DEPTH / f"{name}.png")).astype(np.float32) * np.float32(eye["depth_scale"] / 1000)
+        eye, instances, infos = (
+            _of_scene(scene / file)[str(int(name))] for file in (CAMERA_FILE, POSES_FILE, INFO_FILE)
+        )
+        depth = np.asarray(Image.open(scene / DEPTH / f"{name}.png")).astype(
+            np.float32
+        ) * np.float32(eye["depth_scale"] / 1000)
         depth[depth == 0] = np.inf
         label = np.asarray(Image.open(scene / LABEL / f"{name}.png")).astype(np.int64)
         label[label == _NO_INSTANCE] = -1

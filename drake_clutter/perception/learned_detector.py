@@ -16,7 +16,15 @@ from drake_clutter.cell.support import Support
 from drake_clutter.perception.explaining import Explanation, chosen, explanation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
 from drake_clutter.perception.pose_score import FLOOR_SLACK
-from drake_clutter.perception.second_look import LEAST, Mask, doubtful, halves, possible, surfaces, unexplained
+from drake_clutter.perception.second_look import (
+    LEAST,
+    Mask,
+    doubtful,
+    halves,
+    possible,
+    surfaces,
+    unexplained,
+)
 from drake_clutter.perception.segmentation import (
     Segment,
     SegmentationNetwork,
@@ -77,7 +85,13 @@ def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Can
     def clash(a: int, b: int) -> bool:
         return penetration(objects[a], objects[b]) > IN_EACH_OTHER
 
-    numbers = chosen([c.explains for c in candidates], [c.fitted.score for c in candidates], shape, LEAST_SHARE, clash)
+    numbers = chosen(
+        [c.explains for c in candidates],
+        [c.fitted.score for c in candidates],
+        shape,
+        LEAST_SHARE,
+        clash,
+    )
     return [candidates[k] for k in numbers]
 
 
@@ -88,13 +102,24 @@ class LearnedDetector:
     straight down. What another one shows them is not rectified; the poses are fitted to any.
     """
 
-    def __init__(self, network: SegmentationNetwork, classes: Sequence[ObjectClass], camera: Camera, support: Support) -> None:
+    def __init__(
+        self,
+        network: SegmentationNetwork,
+        classes: Sequence[ObjectClass],
+        camera: Camera,
+        support: Support,
+    ) -> None:
         """With a trained network, for objects of these classes, of which it must know all."""
         self._network, self._camera, self._support = network, camera, support
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, support)
-        self._unknown = torch.tensor([False] + [name not in self._classes for name in self._network.classes])
-        self._radii = [min(self._classes[n].size) / 2 if n in self._classes else 0.0 for n in self._network.classes]
+        self._unknown = torch.tensor(
+            [False] + [name not in self._classes for name in self._network.classes]
+        )
+        self._radii = [
+            min(self._classes[n].size) / 2 if n in self._classes else 0.0
+            for n in self._network.classes
+        ]
         self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(SIDE_BY_SIDE)
 
     def detect(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> Observation:
@@ -108,23 +133,35 @@ class LearnedDetector:
         """
         window, network = self._window, self._network
         p_TP = points(depth, self._camera, window)
-        given = network_input(p_TP, color[window.rows, window.columns] if network.looks_at_color else None)
+        given = network_input(
+            p_TP, color[window.rows, window.columns] if network.looks_at_color else None
+        )
         with torch.inference_mode():
-            logits, votes = network(torch.from_numpy(given)[None].to(memory_format=torch.channels_last))
+            logits, votes = network(
+                torch.from_numpy(given)[None].to(memory_format=torch.channels_last)
+            )
             logits = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf)
             kind, chances = logits.argmax(dim=0).numpy(), torch.softmax(logits, dim=0)[1:].numpy()
         votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
-        poses = self._sure_first(segments(kind, votes_T, self._radii, network.classes, window, depth.shape, LEAST), depth)
+        poses = self._sure_first(
+            segments(kind, votes_T, self._radii, network.classes, window, depth.shape, LEAST), depth
+        )
         surface = surfaces(coarse(p_TP)[..., 2])
         for again in (1, 2):
             best = _best(poses, depth.shape)
-            explained = [coarse(one.explains.mask(depth.shape)[window.rows, window.columns]) for one in best]
+            explained = [
+                coarse(one.explains.mask(depth.shape)[window.rows, window.columns]) for one in best
+            ]
             masks = unexplained(surface, explained)
             if again == 1:
                 classes = [network.classes.index(one.object_class.name) for one in best]
                 masks += doubtful(surface, explained, classes, chances)
             else:
-                masks += [mask for one, mask in zip(best, explained, strict=True) if _seen_past(one.explains)]
+                masks += [
+                    mask
+                    for one, mask in zip(best, explained, strict=True)
+                    if _seen_past(one.explains)
+                ]
                 masks = [half for mask in masks for half in halves(mask, votes_T)]
             poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
@@ -138,12 +175,28 @@ class LearnedDetector:
             counted[name] += 1
             clean[mask] = e.away[e.seen]
             answers = coarse(mask[window.rows, window.columns])
-            sure = _sure(candidate.fitted.X_TO, chances[network.classes.index(name)][answers], votes_T[answers])
-            found.append(Detection(f"{name}_{counted[name]}", candidate.object_class, candidate.fitted.X_TO, mask, sure))
+            sure = _sure(
+                candidate.fitted.X_TO,
+                chances[network.classes.index(name)][answers],
+                votes_T[answers],
+            )
+            found.append(
+                Detection(
+                    f"{name}_{counted[name]}",
+                    candidate.object_class,
+                    candidate.fitted.X_TO,
+                    mask,
+                    sure,
+                )
+            )
         return Observation(clean, tuple(found), self._camera, self._support)
 
     def _guessed(
-        self, masks: Sequence[Mask], chances: NDArray[np.float32], votes_T: NDArray[np.float32], shape: tuple[int, int]
+        self,
+        masks: Sequence[Mask],
+        chances: NDArray[np.float32],
+        votes_T: NDArray[np.float32],
+        shape: tuple[int, int],
     ) -> list[Segment]:
         """A segment for each class that may be in a mask of the network's answers."""
         found = []
@@ -151,8 +204,13 @@ class LearnedDetector:
             votes = votes_T[mask]
             votes = votes[np.isfinite(votes).all(axis=1)]
             if len(votes) >= LEAST:
-                whole, p_TO = fine(mask, self._window, shape), np.median(votes.astype(np.float64), axis=0)
-                found += [Segment(self._network.classes[k], whole, p_TO) for k in possible(mask, chances)]
+                whole, p_TO = (
+                    fine(mask, self._window, shape),
+                    np.median(votes.astype(np.float64), axis=0),
+                )
+                found += [
+                    Segment(self._network.classes[k], whole, p_TO) for k in possible(mask, chances)
+                ]
         return found
 
     def _sure_first(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
@@ -174,16 +232,23 @@ class LearnedDetector:
     def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
         """The poses of segments that are good enough."""
         classes = [self._classes[segment.name] for segment in found]
-        poses = self._workers.map(lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), found, classes)
+        poses = self._workers.map(
+            lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), found, classes
+        )
         return [
-            _Candidate(object_class, pose, explanation(object_class, pose.X_TO, depth, self._camera))
+            _Candidate(
+                object_class, pose, explanation(object_class, pose.X_TO, depth, self._camera)
+            )
             for object_class, pose in zip(classes, poses, strict=True)
-            if pose is not None and pose.score >= LEAST_SCORE and self._on_tray(object_class, pose.X_TO)
+            if pose is not None
+            and pose.score >= LEAST_SCORE
+            and self._on_tray(object_class, pose.X_TO)
         ]
 
     def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
         """Whether an object can be there: within the rim, and not below the floor."""
         corners = X_TO.apply(object_class.corners)
         return bool(
-            (np.abs(corners[:, :2]) < self._support.half_size + RIM_SLACK).all() and corners[:, 2].min() > -2 * FLOOR_SLACK
+            (np.abs(corners[:, :2]) < self._support.half_size + RIM_SLACK).all()
+            and corners[:, 2].min() > -2 * FLOOR_SLACK
         )

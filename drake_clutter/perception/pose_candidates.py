@@ -78,7 +78,14 @@ def _fullest_plane(points):  # type: ignore[no-untyped-def]
             state = (state * 1103515245 + 12345) % 2147483648
             picks[i] = (state >> 8) % count
         p, q, r = points[picks[0]], points[picks[1]], points[picks[2]]
-        ax, ay, az, bx, by, bz = q[0] - p[0], q[1] - p[1], q[2] - p[2], r[0] - p[0], r[1] - p[1], r[2] - p[2]
+        ax, ay, az, bx, by, bz = (
+            q[0] - p[0],
+            q[1] - p[1],
+            q[2] - p[2],
+            r[0] - p[0],
+            r[1] - p[1],
+            r[2] - p[2],
+        )
         x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         length = math.sqrt(x * x + y * y + z * z)
         if length < 1e-6:
@@ -86,7 +93,14 @@ def _fullest_plane(points):  # type: ignore[no-untyped-def]
         x, y, z = x / length, y / length, z / length
         on = 0
         for k in range(count):
-            on += abs(x * (points[k, 0] - p[0]) + y * (points[k, 1] - p[1]) + z * (points[k, 2] - p[2])) < _ON_PLANE
+            on += (
+                abs(
+                    x * (points[k, 0] - p[0])
+                    + y * (points[k, 1] - p[1])
+                    + z * (points[k, 2] - p[2])
+                )
+                < _ON_PLANE
+            )
         if on > best:
             best = on
             normal[0], normal[1], normal[2] = x, y, z
@@ -132,7 +146,11 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
     """Least and greatest m along an axis from p, without the outermost two in a hundred."""
     along = np.empty(len(points))
     for k in range(len(points)):
-        along[k] = (points[k, 0] - p[0]) * axis[0] + (points[k, 1] - p[1]) * axis[1] + (points[k, 2] - p[2]) * axis[2]
+        along[k] = (
+            (points[k, 0] - p[0]) * axis[0]
+            + (points[k, 1] - p[1]) * axis[1]
+            + (points[k, 2] - p[2]) * axis[2]
+        )
     along.sort()
     cut = len(points) // 100
     return along[cut], along[len(points) - 1 - cut]
@@ -141,13 +159,17 @@ def _extent(points, p, axis):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _crossed(a, b):  # type: ignore[no-untyped-def]
     """The cross product of two vectors (3,): NumPy's own is slow for so few."""
-    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+    return np.array(
+        (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    )
 
 
 @njit(cache=True, nogil=True)
 def _axes_in(n):  # type: ignore[no-untyped-def]
     """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
-    x_axis = _crossed(np.array((0.0, 1.0, 0.0)) if abs(n[1]) < 0.9 else np.array((1.0, 0.0, 0.0)), n)
+    x_axis = _crossed(
+        np.array((0.0, 1.0, 0.0)) if abs(n[1]) < 0.9 else np.array((1.0, 0.0, 0.0)), n
+    )
     x_axis /= math.sqrt(x_axis[0] * x_axis[0] + x_axis[1] * x_axis[1] + x_axis[2] * x_axis[2])
     return x_axis, _crossed(n, x_axis)
 
@@ -179,7 +201,12 @@ def _least_rectangle(x, y):  # type: ignore[no-untyped-def]
         low, high, left, right = np.inf, -np.inf, np.inf, -np.inf
         for i in range(len(x)):
             along, across = c * x[i] + s * y[i], c * y[i] - s * x[i]
-            low, high, left, right = min(low, along), max(high, along), min(left, across), max(right, across)
+            low, high, left, right = (
+                min(low, along),
+                max(high, along),
+                min(left, across),
+                max(right, across),
+            )
         if (high - low) * (right - left) < best:
             best, best_angle = (high - low) * (right - left), angle
     return best_angle
@@ -192,7 +219,9 @@ def _middles(low, high, size, guess, slack):  # type: ignore[no-untyped-def]
         return np.empty(0)
     if high - low > size - SLACKS[0] / 2:
         return np.array([(low + high) / 2])
-    return np.array([low + size / 2, high - size / 2, min(max(guess, high - size / 2), low + size / 2)])
+    return np.array(
+        [low + size / 2, high - size / 2, min(max(guess, high - size / 2), low + size / 2)]
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -213,7 +242,11 @@ def _faced(half, axes, points, p, n, sides, guess, slack, R, p_TO, count):  # ty
                     for v in _middles(left, right, 2 * half[c], (off * second).sum(), slack):
                         if count == len(R):
                             return count
-                        R[count, :, a], R[count, :, b], R[count, :, c] = n, first, second if swapped == 0 else -second
+                        R[count, :, a], R[count, :, b], R[count, :, c] = (
+                            n,
+                            first,
+                            second if swapped == 0 else -second,
+                        )
                         p_TO[count] = p + u * first + v * second - half[a] * n
                         count += 1
     return count
@@ -230,9 +263,15 @@ def _lying(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no
     low, high = _extent(points, guess, axis)
     left, right = _extent(points, guess, across)
     top = _extent(points, guess, up)[1]
-    along, to_the_side = _middles(low, high, 2 * half[2], 0.0, slack), _middles(left, right, 2 * half[0], 0.0, slack)[-1:]
+    along, to_the_side = (
+        _middles(low, high, 2 * half[2], 0.0, slack),
+        _middles(left, right, 2 * half[0], 0.0, slack)[-1:],
+    )
     if slack > SLACKS[0]:  # a marker's mask may hold more of the tray than of it
-        along, to_the_side = along if len(along) else np.zeros(1), to_the_side if len(to_the_side) else np.zeros(1)
+        along, to_the_side = (
+            along if len(along) else np.zeros(1),
+            to_the_side if len(to_the_side) else np.zeros(1),
+        )
     for u in along:
         for v in to_the_side:
             if count == len(R):
@@ -273,18 +312,37 @@ def candidates(
         second_n, second_p, second_member = _plane(rest, p_TC)
         if abs(n @ second_n) < 0.2 and second_member.sum() > _SECOND_PLANE_SHARE * len(points):
             planes.append((second_n, second_p, rest[second_member]))
-    normals = [np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(_PLANE_LEVEL_WITHIN) else n for n, _, _ in planes]
+    normals = [
+        np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(_PLANE_LEVEL_WITHIN) else n
+        for n, _, _ in planes
+    ]
     for n, (_, p, face) in zip(normals, planes, strict=True):
         x_axis, y_axis = _axes_in(n)
         angles = [0.0]
         if not cylinder:
             beside = edges[np.abs((edges - p) @ n) < 2 * _ON_PLANE]
-            angles = [_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)] if len(beside) >= FEWEST_POINTS else []
+            angles = (
+                [_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)]
+                if len(beside) >= FEWEST_POINTS
+                else []
+            )
             angles.append(_least_rectangle((face - p) @ x_axis, (face - p) @ y_axis))
-            angles += [math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n]
+            angles += [
+                math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n
+            ]
         firsts = [math.cos(angle) * x_axis + math.sin(angle) * y_axis for angle in angles]
         sides = np.array([(first, _crossed(n, first)) for first in firsts])
-        count = _faced(half, np.array([2]) if cylinder else np.arange(3), face, p, n, sides, guess, *given, count)
+        count = _faced(
+            half,
+            np.array([2]) if cylinder else np.arange(3),
+            face,
+            p,
+            n,
+            sides,
+            guess,
+            *given,
+            count,
+        )
     if cylinder:
         off, fewer = points - points.mean(axis=0), points[::2].copy()
         main = np.linalg.eigh(off.T @ off)[1][:, 2].copy()
@@ -292,7 +350,9 @@ def candidates(
         azimuth = math.atan2(main[1], main[0])
         for tilt, parts in ((0.0, 12), (-0.5, 6), (0.5, 6)):
             for a in azimuth + np.arange(parts) * (math.pi / parts):
-                axis = np.array([math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)])
+                axis = np.array(
+                    [math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)]
+                )
                 count = _lying(half, fewer, axis, guess, *given, count)
     rough = _worth_of_each(cylinder, half, R[:count], p_TO[:count], view, _FIRST_RAYS)
     best = np.argsort(-rough)[:_PROMISING]

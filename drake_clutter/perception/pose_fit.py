@@ -12,8 +12,21 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalogue import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
-from drake_clutter.perception.pose_candidates import FEWEST_POINTS, SLACKS, candidates, spread_points
-from drake_clutter.perception.pose_score import FINE_RAYS, WITHIN, View, search, share_explained, turned, worth
+from drake_clutter.perception.pose_candidates import (
+    FEWEST_POINTS,
+    SLACKS,
+    candidates,
+    spread_points,
+)
+from drake_clutter.perception.pose_score import (
+    FINE_RAYS,
+    WITHIN,
+    View,
+    search,
+    share_explained,
+    turned,
+    worth,
+)
 from drake_clutter.scenes.scene import Pose
 
 Floats = NDArray[np.float64]
@@ -50,7 +63,9 @@ class FittedPose:
 
 def _resting(cylinder: bool, R: Floats) -> Floats | None:
     """R_TO with the axis that is nearly vertical (or a cylinder's that is nearly level) exactly so; None if none is near."""
-    axis, up = (2, R[2, 2]) if cylinder else (int(np.abs(R[2]).argmax()), R[2, int(np.abs(R[2]).argmax())])
+    axis, up = (
+        (2, R[2, 2]) if cylinder else (int(np.abs(R[2]).argmax()), R[2, int(np.abs(R[2]).argmax())])
+    )
     vertical = np.array([0.0, 0.0, math.copysign(1.0, up)])
     column = R[:, axis]
     if math.acos(min(abs(up), 1.0)) < _RESTING_WITHIN:
@@ -72,8 +87,13 @@ def _surface(object_class: ObjectClass) -> Floats:
     x, y, z = (np.linspace(-h, h, max(2, math.ceil(2 * h / _MODEL_SPACING))) for h in half)
     if object_class.shape is Shape.BOX:
         grids = (x[[0, -1]], y, z), (x, y[[0, -1]], z), (x, y, z[[0, -1]])
-        return np.unique(np.vstack([np.stack(np.meshgrid(*axes), -1).reshape(-1, 3) for axes in grids]).round(9), axis=0)
-    angle = np.linspace(0, 2 * math.pi, math.ceil(2 * math.pi * half[0] / _MODEL_SPACING), endpoint=False)
+        return np.unique(
+            np.vstack([np.stack(np.meshgrid(*axes), -1).reshape(-1, 3) for axes in grids]).round(9),
+            axis=0,
+        )
+    angle = np.linspace(
+        0, 2 * math.pi, math.ceil(2 * math.pi * half[0] / _MODEL_SPACING), endpoint=False
+    )
     a, h = (grid.ravel() for grid in np.meshgrid(angle, z))
     side = np.column_stack([half[0] * np.cos(a), half[0] * np.sin(a), h])
     ends = np.stack(np.meshgrid(x, y, z[[0, -1]]), -1).reshape(-1, 3)
@@ -89,7 +109,11 @@ class PoseFitter:
         self._models: dict[ObjectClass, tuple[Any, Any]] = {}
 
     def fit(
-        self, object_class: ObjectClass, mask: NDArray[np.bool_], depth: NDArray[np.float32], p_TO_guess: Floats
+        self,
+        object_class: ObjectClass,
+        mask: NDArray[np.bool_],
+        depth: NDArray[np.float32],
+        p_TO_guess: Floats,
     ) -> FittedPose | None:
         """The pose of a segmented object; None if too little of it was measured, or nothing fits.
 
@@ -103,10 +127,14 @@ class PoseFitter:
             ValueError: the class is a mesh, or an image has not the camera's size.
         """
         if object_class.shape is Shape.MESH:
-            raise ValueError(f"class {object_class.name} is a mesh; allowed are boxes and cylinders")
+            raise ValueError(
+                f"class {object_class.name} is a mesh; allowed are boxes and cylinders"
+            )
         size = (self.config.height, self.config.width)
         if mask.shape != size or depth.shape != size:
-            raise ValueError(f"mask {mask.shape} and depth {depth.shape}; allowed is the camera's size, {size}")
+            raise ValueError(
+                f"mask {mask.shape} and depth {depth.shape}; allowed is the camera's size, {size}"
+            )
         guess = np.ascontiguousarray(p_TO_guess, float)
         window = self._window(object_class, mask, guess)
         if window is None:
@@ -124,15 +152,23 @@ class PoseFitter:
         if not len(value) or value[0] < _HOPELESS:
             return None
         chosen = self._distinct(object_class, R, p, value)
-        found = [self._refined(object_class, cylinder, half, R[k], p[k], points, view) for k in chosen]
+        found = [
+            self._refined(object_class, cylinder, half, R[k], p[k], points, view) for k in chosen
+        ]
         _, R_TO, p_TO = max(found, key=lambda one: one[0])
         score = float(share_explained(cylinder, half, R_TO, p_TO, view, FINE_RAYS, WITHIN))
         return FittedPose(Pose.of(R_TO, p_TO), score) if score > 0 else None
 
-    def _window(self, object_class: ObjectClass, mask: NDArray[np.bool_], p_TO_guess: Floats) -> tuple[int, int, int, int] | None:
+    def _window(
+        self, object_class: ObjectClass, mask: NDArray[np.bool_], p_TO_guess: Floats
+    ) -> tuple[int, int, int, int] | None:
         """First row, end row, first column, end column of the mask near the guess; None if it is empty there."""
         reach = float(np.linalg.norm(object_class.size)) / 2 + _GUESS_WITHIN
-        radius = self.config.focal_length * reach / max(self.config.depth(p_TO_guess[None])[0] - reach, 0.1)
+        radius = (
+            self.config.focal_length
+            * reach
+            / max(self.config.depth(p_TO_guess[None])[0] - reach, 0.1)
+        )
         u, v = self.config.project(p_TO_guess[None])[0]
         top, bottom = max(0, math.floor(v - radius)), max(0, math.ceil(v + radius) + 1)
         left, right = max(0, math.floor(u - radius)), max(0, math.ceil(u + radius) + 1)
@@ -140,38 +176,60 @@ class PoseFitter:
         rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
         if not len(rows):
             return None
-        return top + int(rows[0]), top + int(rows[-1]) + 1, left + int(columns[0]), left + int(columns[-1]) + 1
+        return (
+            top + int(rows[0]),
+            top + int(rows[-1]) + 1,
+            left + int(columns[0]),
+            left + int(columns[-1]) + 1,
+        )
 
     @staticmethod
     def _distinct(object_class: ObjectClass, R: Floats, p: Floats, value: Floats) -> list[int]:
         """The first few candidates that are not much the same as an earlier one."""
         chosen: list[int] = []
         for k in np.flatnonzero(value >= value[:1] - _WORSE).tolist():
-            if all(np.linalg.norm(p[k] - p[c]) > 0.01 or _turn_between(object_class, R[k], R[c]) > 0.15 for c in chosen):
+            if all(
+                np.linalg.norm(p[k] - p[c]) > 0.01 or _turn_between(object_class, R[k], R[c]) > 0.15
+                for c in chosen
+            ):
                 chosen.append(k)
             if len(chosen) == _REFINED:
                 break
         return chosen
 
     def _refined(
-        self, object_class: ObjectClass, cylinder: bool, half: Floats, R: Floats, p: Floats, points: Floats, view: View
+        self,
+        object_class: ObjectClass,
+        cylinder: bool,
+        half: Floats,
+        R: Floats,
+        p: Floats,
+        points: Floats,
+        view: View,
     ) -> tuple[float, Floats, Floats]:
         """Value, R_TO and p_TO (3,) m after ICP and search, at rest exactly if that is better."""
         start = [(R, p), self._aligned(object_class, R, p, points)]
-        R, p = max(start, key=lambda one: float(worth(cylinder, half, one[0], one[1], view, FINE_RAYS, WITHIN)))
+        R, p = max(
+            start,
+            key=lambda one: float(worth(cylinder, half, one[0], one[1], view, FINE_RAYS, WITHIN)),
+        )
         resting = _resting(cylinder, R)
         if resting is None:
             best = search(cylinder, half, R, p, view, _FIRST_STEP, _STEPS, False)
             resting = _resting(cylinder, best[1])
             if resting is None:
                 return best  # type: ignore[no-any-return]
-            level = search(cylinder, half, resting, best[2], view, _FIRST_STEP / 2, _STEPS - 1, True)
+            level = search(
+                cylinder, half, resting, best[2], view, _FIRST_STEP / 2, _STEPS - 1, True
+            )
             return max(best, level, key=lambda one: float(one[0]))  # type: ignore[no-any-return]
         level = search(cylinder, half, resting, p, view, _FIRST_STEP, _STEPS, True)
         free = search(cylinder, half, level[1], level[2], view, _FIRST_STEP / 4, 1, False)
         return free if free[0] > level[0] + 0.01 else level  # type: ignore[no-any-return]
 
-    def _aligned(self, object_class: ObjectClass, R: Floats, p: Floats, points: Floats) -> tuple[Floats, Floats]:
+    def _aligned(
+        self, object_class: ObjectClass, R: Floats, p: Floats, points: Floats
+    ) -> tuple[Floats, Floats]:
         """R_TO and p_TO after ICP, point to plane, of the points to the class's surface."""
         if object_class not in self._models:
             cloud = small_gicp.PointCloud(_surface(object_class))
@@ -215,7 +273,10 @@ def _symmetries(object_class: ObjectClass) -> Floats:
 def _turn_between(object_class: ObjectClass, R_TA: Floats, R_TB: Floats) -> float:
     """The least angle, rad, that turns one orientation into one that looks like the other."""
     if object_class.shape is Shape.CYLINDER:
-        return math.atan2(float(np.linalg.norm(np.cross(R_TA[:, 2], R_TB[:, 2]))), abs(float(R_TA[:, 2] @ R_TB[:, 2])))
+        return math.atan2(
+            float(np.linalg.norm(np.cross(R_TA[:, 2], R_TB[:, 2]))),
+            abs(float(R_TA[:, 2] @ R_TB[:, 2])),
+        )
     cosine = (float(np.einsum("ij,nji->n", R_TA.T @ R_TB, _symmetries(object_class)).max()) - 1) / 2
     return math.acos(min(max(cosine, -1.0), 1.0))
 
@@ -225,4 +286,6 @@ def pose_error(object_class: ObjectClass, X_TO: Pose, X_TO_true: Pose) -> tuple[
 
     A box may be given half turns about its axes, a cylinder any turn about its axis and upside down; a mesh has no symmetry.
     """
-    return float(np.linalg.norm(X_TO.p - X_TO_true.p)), _turn_between(object_class, X_TO.rotation, X_TO_true.rotation)
+    return float(np.linalg.norm(X_TO.p - X_TO_true.p)), _turn_between(
+        object_class, X_TO.rotation, X_TO_true.rotation
+    )

@@ -56,7 +56,12 @@ def _box_distances(h, e, ray, step, first, stride, away):  # type: ignore[no-unt
         iz = 1 / (z if abs(z) > 1e-12 else 1e-12)
         rx, ry, rz = h[0] * abs(ix), h[1] * abs(iy), h[2] * abs(iz)
         near, far = -e[0] * ix - rx, -e[0] * ix + rx
-        near_y, far_y, near_z, far_z = -e[1] * iy - ry, -e[1] * iy + ry, -e[2] * iz - rz, -e[2] * iz + rz
+        near_y, far_y, near_z, far_z = (
+            -e[1] * iy - ry,
+            -e[1] * iy + ry,
+            -e[2] * iz - rz,
+            -e[2] * iz + rz,
+        )
         near, far = near if near > near_y else near_y, far if far < far_y else far_y
         near, far = near if near > near_z else near_z, far if far < far_z else far_z
         away[k] = near if near <= far else np.inf
@@ -170,7 +175,9 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
                 speaks_for += 1.0 - off * off
                 against += off * off
             elif seen > away - within:
-                against += 1.0 if seen > away + within else 0.5  # masks are drawn too small rather than objects
+                against += (
+                    1.0 if seen > away + within else 0.5
+                )  # masks are drawn too small rather than objects
     return speaks_for / (speaks_for + against) if speaks_for > 0 else 0.0
 
 
@@ -179,7 +186,9 @@ def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-
     """The score, less what the distance to the guess costs, and what reaching below the tray's floor does."""
     off = p - view.p_TO_guess
     if cylinder:
-        lowest = p[2] - half[2] * abs(R[2, 2]) - half[0] * math.sqrt(max(0.0, 1.0 - R[2, 2] * R[2, 2]))
+        lowest = (
+            p[2] - half[2] * abs(R[2, 2]) - half[0] * math.sqrt(max(0.0, 1.0 - R[2, 2] * R[2, 2]))
+        )
     else:
         lowest = p[2] - half[0] * abs(R[2, 0]) - half[1] * abs(R[2, 1]) - half[2] * abs(R[2, 2])
     cost = _PRIOR * (off * off).sum() / 1e-4 + _BELOW * max(0.0, -lowest - FLOOR_SLACK)
@@ -196,7 +205,11 @@ def turned(R, axis, angle):  # type: ignore[no-untyped-def]
         along = axis[0] * column[0] + axis[1] * column[1] + axis[2] * column[2]
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
-            turned[j, i] = c * column[j] + s * (axis[k] * column[m] - axis[m] * column[k]) + (1 - c) * along * axis[j]
+            turned[j, i] = (
+                c * column[j]
+                + s * (axis[k] * column[m] - axis[m] * column[k])
+                + (1 - c) * along * axis[j]
+            )
     return turned
 
 
@@ -213,7 +226,9 @@ def search(cylinder, half, R, p, view, first_step, steps, resting):  # type: ign
             better = False
             for way in range(6):
                 turn = way - 3
-                if way >= 3 and ((resting and turn != 2) or (cylinder and not resting and turn == 2)):
+                if way >= 3 and (
+                    (resting and turn != 2) or (cylinder and not resting and turn == 2)
+                ):
                     continue
                 if resting and cylinder and way == 5 and abs(R[2, 2]) > 0.999:
                     continue

@@ -65,7 +65,10 @@ def unexplained(surface: NDArray[np.int64], explained: Sequence[Mask]) -> list[M
 
 
 def doubtful(
-    surface: NDArray[np.int64], explained: Sequence[Mask], classes: Sequence[int], chances: NDArray[np.float32]
+    surface: NDArray[np.int64],
+    explained: Sequence[Mask],
+    classes: Sequence[int],
+    chances: NDArray[np.float32],
 ) -> list[Mask]:
     """Of what each pose explains, where its class is doubtful, all of the surface about it that no other explains.
 
@@ -79,7 +82,9 @@ def doubtful(
         if mine.sum() < LEAST or np.delete(chances[:, mine].mean(axis=1), own).max() < _DOUBT:
             continue
         others = np.any([np.zeros_like(mine), *explained[:k], *explained[k + 1 :]], axis=0)
-        about = binary_dilation(mine, iterations=_MARGIN) & np.isin(surface, np.unique(surface[mine & (surface >= 0)]))
+        about = binary_dilation(mine, iterations=_MARGIN) & np.isin(
+            surface, np.unique(surface[mine & (surface >= 0)])
+        )
         found.append(mine | about & ~others)
     return found
 

@@ -57,11 +57,16 @@ class Window:
     def of(camera: Camera, support: Support) -> "Window":
         """Of a camera that looks at a support."""
         size = np.array([camera.width, camera.height])
-        middle, wanted = camera.support_bounds(support, _HIGHEST) or (np.array(camera.principal_point), math.inf)
+        middle, wanted = camera.support_bounds(support, _HIGHEST) or (
+            np.array(camera.principal_point),
+            math.inf,
+        )
         side = min(size) // _MULTIPLE * _MULTIPLE
         if wanted < side:
             side = _MULTIPLE * math.ceil(wanted / _MULTIPLE)
-        left, top = np.clip(np.floor(middle + 1 - side / 2 + 1e-6).astype(int), 0, size - side).tolist()
+        left, top = np.clip(
+            np.floor(middle + 1 - side / 2 + 1e-6).astype(int), 0, size - side
+        ).tolist()
         return Window(slice(top, top + side), slice(left, left + side))
 
     @property
@@ -102,7 +107,9 @@ def without_holes(image: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(image[tuple(nearest)])
 
 
-def network_input(points_T: NDArray[np.floating], color: NDArray[np.number] | None) -> NDArray[np.float32]:
+def network_input(
+    points_T: NDArray[np.floating], color: NDArray[np.number] | None
+) -> NDArray[np.float32]:
     """(channels, side, side) what the network is given: heights, where they are known, slopes, and colour if it looks at that.
 
     Slopes are given because a few millimetres, which tell a lid from a wall, are nothing beside a stack's height.
@@ -152,7 +159,9 @@ class SegmentationNetwork(nn.Module):
         Args:
             image: (B, channels, side, side), see `network_input`.
         """
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=image.is_cuda or _FAST_BFLOAT16):
+        with torch.autocast(
+            image.device.type, torch.bfloat16, enabled=image.is_cuda or _FAST_BFLOAT16
+        ):
             x = self.into(image)
             kept = []
             for down in self.down:
@@ -167,16 +176,25 @@ class SegmentationNetwork(nn.Module):
     def begin_with(self, learned: "SegmentationNetwork") -> None:
         """Takes over what another has learned: answers as it does of the classes that both know, whatever the colours are."""
         first = "into.1.0.weight"
-        kept = {name: value for name, value in learned.state_dict().items() if not name.startswith((first, "out."))}
+        kept = {
+            name: value
+            for name, value in learned.state_dict().items()
+            if not name.startswith((first, "out."))
+        }
         self.load_state_dict(kept, strict=False)
-        mine, theirs = self.get_parameter(first), learned.get_parameter(first)  # channels of depth come first
+        mine, theirs = (
+            self.get_parameter(first),
+            learned.get_parameter(first),
+        )  # channels of depth come first
         both = min(mine.shape[1], theirs.shape[1])
         rows, other_rows = self._rows(), learned._rows()
         with torch.no_grad():
             mine.zero_()
             mine[:, :both] = theirs[:, :both]
             for name in rows.keys() & other_rows.keys():
-                for own, others in zip(self.out.parameters(), learned.out.parameters(), strict=True):
+                for own, others in zip(
+                    self.out.parameters(), learned.out.parameters(), strict=True
+                ):
                     own[rows[name]] = others[other_rows[name]]
 
     def _rows(self) -> dict[str | int, int]:
@@ -195,7 +213,9 @@ class SegmentationNetwork(nn.Module):
         kind = checkpoint.about.get("kind")
         if kind != DETECTOR:
             raise InputError(f"{path}: is a checkpoint of a {kind}; allowed is one of a {DETECTOR}")
-        network = SegmentationNetwork(checkpoint.about["classes"], checkpoint.about["looks_at_color"])
+        network = SegmentationNetwork(
+            checkpoint.about["classes"], checkpoint.about["looks_at_color"]
+        )
         network.load_state_dict(checkpoint.weights)
         return network.eval()
 
@@ -214,7 +234,9 @@ def class_weights(kinds: Sequence[NDArray[np.int64]], classes: int) -> Tensor:
     return torch.from_numpy(share**-0.5 / (share**0.5).sum()).float()
 
 
-def loss(logits: Tensor, votes: Tensor, kind: Tensor, to_middle: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def loss(
+    logits: Tensor, votes: Tensor, kind: Tensor, to_middle: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
     """Cross entropy of the classes, and the mean error of the votes, m.
 
     Args:
@@ -238,7 +260,11 @@ def _densest(votes, free, cell):  # type: ignore[no-untyped-def]
     for n in range(len(left)):
         i, count = left[n], 0
         for j in left:
-            x, y, z = votes[i, 0] - votes[j, 0], votes[i, 1] - votes[j, 1], votes[i, 2] - votes[j, 2]
+            x, y, z = (
+                votes[i, 0] - votes[j, 0],
+                votes[i, 1] - votes[j, 1],
+                votes[i, 2] - votes[j, 2],
+            )
             count += x * x + y * y + z * z < cell * cell
         if count > best:
             best, found = count, int(i)
@@ -265,7 +291,12 @@ def gathered(votes, radius, least):  # type: ignore[no-untyped-def]
             for j in range(len(votes)):
                 a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
                 if free[j] and a * a + b * b + c * c < radius * radius:
-                    total, sx, sy, sz = total + 1, sx + votes[j, 0], sy + votes[j, 1], sz + votes[j, 2]
+                    total, sx, sy, sz = (
+                        total + 1,
+                        sx + votes[j, 0],
+                        sy + votes[j, 1],
+                        sz + votes[j, 2],
+                    )
             if total > 0:
                 x, y, z = sx / total, sy / total, sz / total
         total = 0

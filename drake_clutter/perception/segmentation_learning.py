@@ -13,7 +13,12 @@ from torch import Tensor
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
-from drake_clutter.learning.checkpoint import learner_tensors, load_tensors, restore_learner, save_tensors
+from drake_clutter.learning.checkpoint import (
+    learner_tensors,
+    load_tensors,
+    restore_learner,
+    save_tensors,
+)
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import LabelledImage
 from drake_clutter.perception.segmentation import (
@@ -78,19 +83,32 @@ def example(
         looks_at_color: whether colour is given.
     """
     depth = image.depth if rng is None else noisy_depth(image.depth, rng)
-    p_TP, color, label = points(depth, camera, window), image.color[window.rows, window.columns], image.label
-    label, middle = label[window.rows, window.columns], np.array([pose.translation for pose in image.X_TO]).reshape(-1, 3)
+    p_TP, color, label = (
+        points(depth, camera, window),
+        image.color[window.rows, window.columns],
+        image.label,
+    )
+    label, middle = (
+        label[window.rows, window.columns],
+        np.array([pose.translation for pose in image.X_TO]).reshape(-1, 3),
+    )
     if rng is not None:
         turns, step = int(rng.integers(4)), int(rng.choice([-1, 1]))
         p_TP, label = np.rot90(p_TP, turns)[:, ::step], np.rot90(label, turns)[:, ::step]
-        R = np.diag([step, 1.0, 1.0]) @ np.linalg.matrix_power([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], turns)
+        R = np.diag([step, 1.0, 1.0]) @ np.linalg.matrix_power(
+            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], turns
+        )
         p_TP, middle = (p_TP @ R.T).astype(np.float32), middle @ R.T
         light = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.4)
         color = np.clip(np.rot90(color, turns)[:, ::step] * light, 0, 255).astype(np.uint8)
     kind = np.array([0] + [classes.index(name) + 1 for name in image.classes])[coarse(label) + 1]
     to_middle = np.vstack([np.full(3, np.nan), middle])[coarse(label) + 1] - coarse(p_TP)
     given = network_input(p_TP, color if looks_at_color else None)
-    return Example(given, np.ascontiguousarray(kind), np.ascontiguousarray(np.moveaxis(to_middle, 2, 0), np.float32))
+    return Example(
+        given,
+        np.ascontiguousarray(kind),
+        np.ascontiguousarray(np.moveaxis(to_middle, 2, 0), np.float32),
+    )
 
 
 class SegmentationLearner:
@@ -113,12 +131,23 @@ class SegmentationLearner:
     ) -> None:
         """Begins a training with `count` images, each of which `read` reads."""
         self.step, self.losses = 0, dict[str, float]()
-        self._read, self._count, self._config, self._camera, self._seed = read, count, config, camera, seed
+        self._read, self._count, self._config, self._camera, self._seed = (
+            read,
+            count,
+            config,
+            camera,
+            seed,
+        )
         self._window, self._device = Window.of(camera, support), device
         self.network = network.to(device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-        counted = [example(read(k), network.classes, camera, self._window, None, False).kind for k in range(min(count, _COUNTED))]
+        self._optimizer = torch.optim.AdamW(
+            network.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        )
+        counted = [
+            example(read(k), network.classes, camera, self._window, None, False).kind
+            for k in range(min(count, _COUNTED))
+        ]
         self._weights = class_weights(counted, len(network.classes)).to(device)
         self._readers = ThreadPoolExecutor(1)
         self._ahead = {0: self._readers.submit(self._batch, 0)}
@@ -127,7 +156,11 @@ class SegmentationLearner:
     def learning_rate(self) -> float:
         """Of the present step."""
         done = self.step / self._config.steps
-        share = done / RISING if done < RISING else 0.5 + 0.5 * math.cos(math.pi * (done - RISING) / (1 - RISING))
+        share = (
+            done / RISING
+            if done < RISING
+            else 0.5 + 0.5 * math.cos(math.pi * (done - RISING) / (1 - RISING))
+        )
         return self._config.learning_rate * share
 
     def _batch(self, step: int) -> Example:
@@ -135,7 +168,15 @@ class SegmentationLearner:
         numbers = rng.integers(self._count, size=self._config.batch)
         network = self.network
         examples = [
-            example(self._read(int(k)), network.classes, self._camera, self._window, rng, network.looks_at_color) for k in numbers
+            example(
+                self._read(int(k)),
+                network.classes,
+                self._camera,
+                self._window,
+                rng,
+                network.looks_at_color,
+            )
+            for k in numbers
         ]
         return Example(*(np.stack(arrays) for arrays in zip(*examples, strict=True)))
 

@@ -142,9 +142,18 @@ class Attempts:
             for here in self._scene.close(q, REPORTED):
                 allowed = self._needed(here, end, least)
                 if here.distance < allowed:
-                    self.fail(progress, PlanFailure.IN_COLLISION, f"{what}: {' and '.join(here.pair)}", here.distance)
+                    self.fail(
+                        progress,
+                        PlanFailure.IN_COLLISION,
+                        f"{what}: {' and '.join(here.pair)}",
+                        here.distance,
+                    )
                     return None
-                if allowed == least and here.distance < found.distance and here.pair[1] not in self._scene.arm_names:
+                if (
+                    allowed == least
+                    and here.distance < found.distance
+                    and here.pair[1] not in self._scene.arm_names
+                ):
                     found = here
         return found
 
@@ -186,7 +195,10 @@ class Attempts:
         name = self._picked.name
         near = self._scene.close(q, self._config.clearance)
         close = [here for here in near if here.pair[0] == name]
-        return {here.pair[1]: here.distance - SLACK for here in sorted(close, key=lambda here: -here.distance)}
+        return {
+            here.pair[1]: here.distance - SLACK
+            for here in sorted(close, key=lambda here: -here.distance)
+        }
 
     def exist(self, grasp: Grasp) -> bool:
         """Whether some yaw and branch reach both ends without collision."""
@@ -251,7 +263,9 @@ class Attempts:
             way.append(step[1])
         if len(way) == 1:
             return None
-        return PiecewisePolynomial.FirstOrderHold(heights[: len(way)] / DESCENT_SPEED, np.array(way).T)
+        return PiecewisePolynomial.FirstOrderHold(
+            heights[: len(way)] / DESCENT_SPEED, np.array(way).T
+        )
 
     def _phases(
         self,
@@ -275,7 +289,10 @@ class Attempts:
                 return None
             found[name] = phase
         if self._config.optimise:
-            found = {name: self._shortened(found[name], payload, X_OG, ends) for name, (_, payload) in ways.items()}
+            found = {
+                name: self._shortened(found[name], payload, X_OG, ends)
+                for name, (_, payload) in ways.items()
+            }
         return found["approach"], found["carry"], found["retreat"]
 
     def _phase(
@@ -337,7 +354,9 @@ class Attempts:
             self.fail(progress, PlanFailure.TRAJECTORY_INFEASIBLE, "carry", tilt)
         return tilt > LEVEL
 
-    def _shortened(self, phase: Phase, payload: Payload, X_OG: RigidTransform, ends: tuple[End, End]) -> Phase:
+    def _shortened(
+        self, phase: Phase, payload: Payload, X_OG: RigidTransform, ends: tuple[End, End]
+    ) -> Phase:
         """The phase along a quicker way; as it is if none is found."""
         self._set_up(phase.name, X_OG)
         least, carried = self._config.clearance + SPARE, phase.name == "carry"
@@ -347,7 +366,9 @@ class Attempts:
             found = []
             for here, gradient in self._scene.gradients(q, NEAR):
                 needed = self._needed(here, ends[int(along >= 0.5)] if carried else away, least)
-                if np.abs(gradient).max() > 1e-6:  # some of the wrist's parts are always as far apart
+                if (
+                    np.abs(gradient).max() > 1e-6
+                ):  # some of the wrist's parts are always as far apart
                     found.append(Wall(gradient, here.distance - needed))
             return found
 

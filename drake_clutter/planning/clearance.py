@@ -5,7 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, CollisionFilterDeclaration, GeometryId, GeometrySet, SignedDistancePair
+from pydrake.geometry import (
+    Box,
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    SignedDistancePair,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
@@ -54,24 +60,35 @@ class ClearanceScene:
         builder = DiagramBuilder()
         made = add_scene_plant(builder, objects, cell.support, 0.0, visuals=False)
         self.plant, self._bodies = made.plant, made.bodies
-        self._arm: Arm = add_work_cell(made.plant, made.scene_graph, cell, compliant=False, visuals=False)
+        self._arm: Arm = add_work_cell(
+            made.plant, made.scene_graph, cell, compliant=False, visuals=False
+        )
         for k, block in enumerate(unseen):
             X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.middle)
             made.plant.RegisterCollisionGeometry(
-                made.plant.world_body(), X_TB, Box(*block.size), f"unseen_{k}", CoulombFriction(1.0, 1.0)
+                made.plant.world_body(),
+                X_TB,
+                Box(*block.size),
+                f"unseen_{k}",
+                CoulombFriction(1.0, 1.0),
             )
         made.plant.Finalize()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self._context = made.plant.GetMyMutableContextFromRoot(self._root)
-        self._scene_graph, self._geometry_context = made.scene_graph, made.scene_graph.GetMyMutableContextFromRoot(self._root)
+        self._scene_graph, self._geometry_context = (
+            made.scene_graph,
+            made.scene_graph.GetMyMutableContextFromRoot(self._root),
+        )
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
         self._at, self._v_at = joint_numbers(self.plant, self._arm)
         self._moved_by = self._joints_by_geometry(load_robot(cell.robot).links)
         self._fixed = (*self._arm.fixed, support_body(self.plant))
         self._names = self._name_geometries()
-        self._parts = {geometry: (name, geometry in self._moved_by) for geometry, name in self._names.items()}
+        self._parts = {
+            geometry: (name, geometry in self._moved_by) for geometry, name in self._names.items()
+        }
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
@@ -93,7 +110,9 @@ class ClearanceScene:
         """
         found = dict[GeometryId, int]()
         for body in self._arm.bodies:
-            moved_by = links[body.name()] if body.model_instance() == self._arm.robot else len(self._at)
+            moved_by = (
+                links[body.name()] if body.model_instance() == self._arm.robot else len(self._at)
+            )
             found |= dict.fromkeys(self.plant.GetCollisionGeometriesForBody(body), moved_by)
         return found
 
@@ -141,8 +160,12 @@ class ClearanceScene:
         self.release()
         held = self._geometries(self._bodies[name])
         others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
-        tool = self._geometries(*(body for body in self._arm.bodies if body.model_instance() == self._arm.tool))
-        declaration = CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
+        tool = self._geometries(
+            *(body for body in self._arm.bodies if body.model_instance() == self._arm.tool)
+        )
+        declaration = (
+            CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
+        )
         self._transient.append(self._filters.ApplyTransient(declaration))
         self._held = name, inverse(X_OG.GetAsMatrix4())
 
@@ -158,7 +181,9 @@ class ClearanceScene:
         if self._held is not None:
             name, X_GO = self._held
             X_TG = self._arm.cup.CalcPoseInWorld(self._context).GetAsMatrix4()
-            self.plant.SetFreeBodyPose(self._context, self._bodies[name], RigidTransform(X_TG @ X_GO))
+            self.plant.SetFreeBodyPose(
+                self._context, self._bodies[name], RigidTransform(X_TG @ X_GO)
+            )
         found: list[SignedDistancePair] = self._query_port.Eval(
             self._geometry_context
         ).ComputeSignedDistancePairwiseClosestPoints(within)
@@ -186,7 +211,10 @@ class ClearanceScene:
         found = []
         for pair in pairs:
             gradient = np.zeros(len(self._at))
-            for geometry, p_S, sign in ((pair.id_A, pair.p_ACa, 1.0), (pair.id_B, pair.p_BCb, -1.0)):
+            for geometry, p_S, sign in (
+                (pair.id_A, pair.p_ACa, 1.0),
+                (pair.id_B, pair.p_BCb, -1.0),
+            ):
                 if joints := self._joints_that_move(geometry):
                     nx, ny, nz = sign * pair.nhat_BA_W
                     x, y, z = query.GetPoseInWorld(geometry).multiply(p_S) - p_TF

@@ -10,7 +10,12 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
-from pydrake.trajectories import BsplineTrajectory, PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
+from pydrake.trajectories import (
+    BsplineTrajectory,
+    PathParameterizedTrajectory,
+    PiecewisePolynomial,
+    Trajectory,
+)
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
@@ -78,7 +83,12 @@ def smooth(way: Floats) -> BsplineTrajectory:
     while len(points) < _ORDER - 2:
         points = np.insert(points, 1, (points[0] + points[1]) / 2, axis=0)
     # A third of the first and last step away, else the path parameter would run three times as fast at the ends.
-    points = np.insert(points, [1, len(points) - 1], [(2 * points[0] + points[1]) / 3, (2 * points[-1] + points[-2]) / 3], axis=0)
+    points = np.insert(
+        points,
+        [1, len(points) - 1],
+        [(2 * points[0] + points[1]) / 3, (2 * points[-1] + points[-2]) / 3],
+        axis=0,
+    )
     basis = BsplineBasis(_ORDER, len(points), KnotVectorType.kClampedUniform, 0.0, 1.0)
     return BsplineTrajectory(basis, points.T)
 
@@ -96,7 +106,11 @@ def timed(path: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | No
     torque_limit = MARGIN * robot.torque_limits
     grid = np.linspace(path.start_time(), path.end_time(), _GRID)
     velocity = path.MakeDerivative(1)
-    q, slope, curve = path.vector_values(grid).T, velocity.vector_values(grid).T, velocity.MakeDerivative(1).vector_values(grid).T
+    q, slope, curve = (
+        path.vector_values(grid).T,
+        velocity.vector_values(grid).T,
+        velocity.MakeDerivative(1).vector_values(grid).T,
+    )
     with np.errstate(divide="ignore"):
         fastest = ((MARGIN * robot.velocity_limits / np.abs(slope)) ** 2).min(axis=1)
     limit = np.broadcast_to(MARGIN * robot.acceleration_limits, slope.shape)
@@ -118,13 +132,25 @@ def timed(path: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | No
         return PathParameterizedTrajectory(path, softened(along) if payload.mass else along)
 
     trajectory, rest = run_through(), np.zeros_like(q)
-    if trajectory is None or (np.abs(torques(plant, *motion(trajectory, 40))) <= torque_limit).all():
+    if (
+        trajectory is None
+        or (np.abs(torques(plant, *motion(trajectory, 40))) <= torque_limit).all()
+    ):
         return trajectory
-    held = torques(plant, q, rest, rest)  # the torques' limits are rarely needed, and take most of the time
+    held = torques(
+        plant, q, rest, rest
+    )  # the torques' limits are rarely needed, and take most of the time
     if (np.abs(held) > torque_limit).any():
         return None
     lower, upper = -torque_limit - held, torque_limit - held
-    rows.append((torques(plant, q, rest, slope) - held, torques(plant, q, slope, curve) - held, lower, upper))
+    rows.append(
+        (
+            torques(plant, q, rest, slope) - held,
+            torques(plant, q, slope, curve) - held,
+            lower,
+            upper,
+        )
+    )
     return run_through()
 
 
@@ -138,7 +164,9 @@ def softened(along: Trajectory) -> Trajectory:
     values = along.vector_values(np.clip(times, 0.0, along.end_time())).ravel()
     mean = np.convolve(values, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
     rest = np.zeros((1, 1))
-    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(np.arange(len(mean)) * step, mean[None], rest, rest)
+    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+        np.arange(len(mean)) * step, mean[None], rest, rest
+    )
 
 
 def slowed(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
@@ -160,7 +188,9 @@ def slowed(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajecto
         of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
         square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.acceleration)
     by = max(1.0, math.sqrt(square))
-    return PathParameterizedTrajectory(trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]]))
+    return PathParameterizedTrajectory(
+        trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]])
+    )
 
 
 def motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:

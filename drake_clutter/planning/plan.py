@@ -125,8 +125,16 @@ class Plan:
 def plan_fields(found: Plan | NoPlan) -> dict[str, Any]:
     """A plan as a document: its phases' ways sampled at 100 Hz (s, rad); or why there is none."""
     if isinstance(found, NoPlan):
-        number = found.number if math.isfinite(found.number) else None  # infinite: the lip is partly in the air
-        return {"planned": False, "reason": found.reason.value, "about": found.about, "number": number, "seconds": found.seconds}
+        number = (
+            found.number if math.isfinite(found.number) else None
+        )  # infinite: the lip is partly in the air
+        return {
+            "planned": False,
+            "reason": found.reason.value,
+            "about": found.about,
+            "number": number,
+            "seconds": found.seconds,
+        }
     phases = []
     for phase in found.phases:
         times = np.linspace(0.0, phase.duration, math.ceil(100 * phase.duration) + 1)

@@ -37,7 +37,9 @@ class PickPlacePlanner:
         self._scenes: dict[Hashable, ClearanceScene] = {}
         self._grasps = lru_cache(maxsize=256)(self._find_grasps)
 
-    def clearance_scene(self, objects: Sequence[SceneObject], unseen: Sequence[UnseenBlock] = ()) -> ClearanceScene:
+    def clearance_scene(
+        self, objects: Sequence[SceneObject], unseen: Sequence[UnseenBlock] = ()
+    ) -> ClearanceScene:
         """The objects and the arm; the latest of each set of objects is kept."""
         named = tuple((o.name, o.object_class) for o in objects)
         key = named, tuple(unseen)
@@ -49,7 +51,11 @@ class PickPlacePlanner:
         return scene
 
     def plan(
-        self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose, unseen: Sequence[UnseenBlock] = ()
+        self,
+        objects: Sequence[SceneObject],
+        pick: str,
+        X_TO_place: Pose,
+        unseen: Sequence[UnseenBlock] = (),
     ) -> Plan | NoPlan:
         """Plans to carry an object to a pose that differs by a shift and a turn about the vertical.
 
@@ -85,7 +91,9 @@ class PickPlacePlanner:
         scene = self.clearance_scene(objects, unseen)
         if hit := scene.close(self.tool.robot.home, self.planner.clearance):
             nearest = min(hit, key=lambda here: here.distance)
-            return NoPlan(PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance)
+            return NoPlan(
+                PlanFailure.IN_COLLISION, f"at home: {' and '.join(nearest.pair)}", nearest.distance
+            )
         tops = [*scene.fixture_tops, *(block.top for block in unseen)]
         attempt = Attempts(self.cell, self.planner, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
@@ -93,7 +101,9 @@ class PickPlacePlanner:
                 if attempt.count >= self.planner.attempts:
                     return attempt.furthest
                 if time.perf_counter() - begun > self.planner.time_limit:
-                    return NoPlan(PlanFailure.TIME_OUT, str(attempt.furthest), self.planner.time_limit)
+                    return NoPlan(
+                        PlanFailure.TIME_OUT, str(attempt.furthest), self.planner.time_limit
+                    )
                 found = attempt.carry_out(grasp, q_pick, q_place, yaw)
                 if found is not None:
                     return found

@@ -61,12 +61,19 @@ class Reachability:
                     break
                 at = robot.unwrap(q[k, branch], robot.home)
                 if hit := self._scene.close(at, self._least):
-                    in_the_way[k] = in_the_way[k] or " and ".join(min(hit, key=lambda c: c.distance).pair)
+                    in_the_way[k] = in_the_way[k] or " and ".join(
+                        min(hit, key=lambda c: c.distance).pair
+                    )
                     continue
                 if count[k] == 0:
                     best[k], best_q[k] = worth[k, branch], at
                 count[k] += 1
-        return Reach(count, best, best_q, tuple("" if n else hit for n, hit in zip(count, in_the_way, strict=True)))
+        return Reach(
+            count,
+            best,
+            best_q,
+            tuple("" if n else hit for n, hit in zip(count, in_the_way, strict=True)),
+        )
 
     def map(self, heights: Sequence[float], spacing: float) -> "ReachMap":
         """Of a cup that points down, over the tray.
@@ -77,13 +84,17 @@ class Reachability:
         """
         half_size = self._cell.support.half_size
         ends = np.maximum(half_size - MARGIN, half_size / 2).tolist()
-        along_x, along_y = (np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in ends)
+        along_x, along_y = (
+            np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in ends
+        )
         share, best = np.zeros((2, len(heights), len(along_x), len(along_y)))
         yaws = np.arange(YAWS) * (2 * np.pi / YAWS)
         for k, height in enumerate(heights):
             for i, x in enumerate(along_x):
                 for j, y in enumerate(along_y):
-                    found = self.poses(np.array([downwards(yaw, np.array([x, y, height])) for yaw in yaws]))
+                    found = self.poses(
+                        np.array([downwards(yaw, np.array([x, y, height])) for yaw in yaws])
+                    )
                     share[k, i, j] = np.mean(found.branches > 0)
                     best[k, i, j] = found.manipulability.max()
         return ReachMap(tuple(heights), along_x, along_y, share, best)
@@ -112,7 +123,9 @@ def base_scores(cell: WorkCell, places: Sequence[tuple[float, float]]) -> list[t
     """
     found = []
     for x, y in places:
-        base = cell.robot.base.model_copy(update={"translation": (x, y, cell.robot.base.translation[2])})
+        base = cell.robot.base.model_copy(
+            update={"translation": (x, y, cell.robot.base.translation[2])}
+        )
         moved = cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": base})})
         if moved.pedestal_in_support:
             found.append((0.0, 0.0))

@@ -109,7 +109,10 @@ def shortened(way: Way) -> BsplineTrajectory | None:
         found = _round(way, points, duration, step)
         if found is None:
             break
-        settled = np.abs(found[0] - points).max() < SETTLED and abs(found[1] - duration) < SETTLED * duration
+        settled = (
+            np.abs(found[0] - points).max() < SETTLED
+            and abs(found[1] - duration) < SETTLED * duration
+        )
         points, duration = found
         if settled:
             break
@@ -126,7 +129,9 @@ def _fitted(sure: Trajectory, still: int) -> Floats:
     points = np.empty((CONTROL_POINTS, q.shape[1]))
     points[:still], points[-still:] = q[0], q[-1]
     at_ends = [*range(still), *range(CONTROL_POINTS - still, CONTROL_POINTS)]
-    points[still:-still] = np.linalg.lstsq(B[:, still:-still], q - B[:, at_ends] @ points[at_ends], rcond=None)[0]
+    points[still:-still] = np.linalg.lstsq(
+        B[:, still:-still], q - B[:, at_ends] @ points[at_ends], rcond=None
+    )[0]
     return points
 
 
@@ -141,7 +146,9 @@ class _Rows:
         self._A.append(sparse.hstack([of_points, sparse.csr_matrix(of_square[:, None])]))
         self._b.append(b)
 
-    def add_both(self, of_points: sparse.csr_matrix, bound: Floats, b: Floats | None = None) -> None:
+    def add_both(
+        self, of_points: sparse.csr_matrix, bound: Floats, b: Floats | None = None
+    ) -> None:
         """-bound T^2 - b <= A p <= bound T^2 + b."""
         for sign in (1, -1):
             self.add(sign * of_points, -bound, np.zeros_like(bound) if b is None else b)
@@ -149,12 +156,16 @@ class _Rows:
     def impose(self, prog: MathematicalProgram, x: NDArray[np.object_]) -> None:
         """Adds them to a program."""
         b = np.concatenate(self._b)
-        prog.AddLinearConstraint(sparse.vstack(self._A, format="csc"), np.full(len(b), -np.inf), b, x)
+        prog.AddLinearConstraint(
+            sparse.vstack(self._A, format="csc"), np.full(len(b), -np.inf), b, x
+        )
 
 
 def _of_points(weights: Floats, directions: Floats) -> sparse.csr_matrix:
     """(m, 28 n), from all control points to what splines of these weights (m, 28) go in directions (m, n)."""
-    return sparse.csr_matrix((weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1))
+    return sparse.csr_matrix(
+        (weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1)
+    )
 
 
 def _limits(way: Way, points: Floats, duration: float) -> _Rows:
@@ -167,10 +178,17 @@ def _limits(way: Way, points: Floats, duration: float) -> _Rows:
     rows.add_both(_to_derivative(1, n), speeds / (2 * duration), speeds * duration / 2)
     rows.add_both(_to_derivative(2, n), accelerations)
     if seen := [(k, wall) for k, s in enumerate(_ALONG) for wall in way.walls(q[k], s)]:
-        at, gradients = np.array([k for k, _ in seen]), np.array([wall.gradient for _, wall in seen])
+        at, gradients = (
+            np.array([k for k, _ in seen]),
+            np.array([wall.gradient for _, wall in seen]),
+        )
         room = np.array([wall.room for _, wall in seen])
         room = np.where(np.minimum(_ALONG, 1 - _ALONG)[at] < ENDS, np.maximum(room, 0.0), room)
-        rows.add(_of_points(-_TO_VALUES[at], gradients), np.zeros(len(at)), room - (gradients * q[at]).sum(axis=1))
+        rows.add(
+            _of_points(-_TO_VALUES[at], gradients),
+            np.zeros(len(at)),
+            room - (gradients * q[at]).sum(axis=1),
+        )
     if math.isfinite(way.acceleration):
         at = np.repeat(np.arange(0, LOOKED_AT, 2), 3)
         J = np.vstack([way.jacobian(q[k])[3:] for k in at[::3]])
@@ -215,14 +233,18 @@ def _round(way: Way, points: Floats, duration: float, step: float) -> tuple[Floa
             J, q = way.jacobian(points[end]), points[end]
             for k, least in ((way.still, 0.0), (way.still + 1, UPRIGHT)):
                 prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, control[end + inwards * k])
-                prog.AddLinearConstraint(J[5:], J[5:] @ q + least, [np.inf], control[end + inwards * k])
+                prog.AddLinearConstraint(
+                    J[5:], J[5:] @ q + least, [np.inf], control[end + inwards * k]
+                )
     if way.level:
         _keep_level(way, points, prog, control)
     _limits(way, points, duration).impose(prog, x)
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
     limits = np.tile(MARGIN * way.robot.acceleration_limits, CONTROL_POINTS - 2)
     curved = sparse.diags(1 / limits) @ _to_derivative(2, n) / duration**2
-    prog.AddQuadraticCost(2 * _SMOOTH * (curved.T @ curved).toarray(), np.zeros(points.size), x[:-1], is_convex=True)
+    prog.AddQuadraticCost(
+        2 * _SMOOTH * (curved.T @ curved).toarray(), np.zeros(points.size), x[:-1], is_convex=True
+    )
     result = ClarabelSolver().Solve(prog)
     if not result.is_success():
         return None

@@ -29,7 +29,9 @@ def _accelerations(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
     return least, greatest
 
 
-def squared_speeds(step: float, a: Floats, b: Floats, lower: Floats, upper: Floats, fastest: Floats) -> Floats:
+def squared_speeds(
+    step: float, a: Floats, b: Floats, lower: Floats, upper: Floats, fastest: Floats
+) -> Floats:
     """(n,) x at each point of a path, from rest to rest, so that every x is as large as it can be.
 
     From one point to the next u stays the same, and the limits of both hold for it.
@@ -41,7 +43,13 @@ def squared_speeds(step: float, a: Floats, b: Floats, lower: Floats, upper: Floa
     """
     at_next = a[1:] + 2 * step * b[1:]
     a, b, lower, upper = (
-        np.hstack(pair) for pair in ((a[:-1], at_next), (b[:-1], b[1:]), (lower[:-1], lower[1:]), (upper[:-1], upper[1:]))
+        np.hstack(pair)
+        for pair in (
+            (a[:-1], at_next),
+            (b[:-1], b[1:]),
+            (lower[:-1], lower[1:]),
+            (upper[:-1], upper[1:]),
+        )
     )
     found: Floats = _squared_speeds(step, a, b, lower, upper, fastest)
     return found
@@ -55,7 +63,10 @@ def _squared_speeds(step, a, b, lower, upper, fastest):  # type: ignore[no-untyp
         allowed, refused, x = 0.0, fastest[i], fastest[i]
         for _ in range(_HALVINGS):
             least, greatest = _accelerations(a[i], b[i], lower[i], upper[i], x)
-            least, greatest = max(least, -x / (2 * step)), min(greatest, (controllable[i + 1] - x) / (2 * step))
+            least, greatest = (
+                max(least, -x / (2 * step)),
+                min(greatest, (controllable[i + 1] - x) / (2 * step)),
+            )
             if least <= greatest:
                 allowed = x
                 if x == fastest[i]:

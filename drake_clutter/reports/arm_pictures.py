@@ -32,13 +32,18 @@ _RENDERER = "arm_pictures"
 def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
     """The frames of a recorded move that tell it: before, the object's rise, its way, and when it stands."""
     height = np.array([frame.poses[pick].p[2] for frame in frames])
-    aside = np.array([np.linalg.norm(frame.poses[pick].p[:2] - frames[0].poses[pick].p[:2]) for frame in frames])
+    aside = np.array(
+        [np.linalg.norm(frame.poses[pick].p[:2] - frames[0].poses[pick].p[:2]) for frame in frames]
+    )
     lifted = np.flatnonzero(height > height[0] + 0.002)
     first = int(lifted[0]) if len(lifted) else len(frames) // 2
     there = int(np.flatnonzero(aside >= 0.98 * aside.max())[0]) if len(lifted) else len(frames) // 2
     still = np.flatnonzero(np.abs(height - height[-1]) > 0.002)
     down = min(int(still[-1]) + 1, len(frames) - 1) if len(still) else len(frames) - 1
-    return [frames[k] for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)]
+    return [
+        frames[k]
+        for k in (max(first - 2, 0), (first + there) // 2, down, (down + len(frames)) // 2)
+    ]
 
 
 def quarter_turn_to_base(cell: WorkCell) -> NDArray[np.float64]:
@@ -53,7 +58,13 @@ def quarter_turn_to_base(cell: WorkCell) -> NDArray[np.float64]:
 def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.uint8]:
     """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
     builder, cell = DiagramBuilder(), cell.with_support(scene.support)
-    made = add_scene_plant(builder, [(o.name, o.object_class) for o in scene.objects], scene.support, 0.01, visuals=True)
+    made = add_scene_plant(
+        builder,
+        [(o.name, o.object_class) for o in scene.objects],
+        scene.support,
+        0.01,
+        visuals=True,
+    )
     plant = made.plant
     arm = add_work_cell(plant, made.scene_graph, cell, compliant=True, visuals=True)
     plant.Finalize()
@@ -63,7 +74,9 @@ def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.u
     context = plant.GetMyMutableContextFromRoot(root)
     width, height = (_OVERSAMPLING * size for size in _SIZE)
     info = CameraInfo(width, height, np.radians(_FOV_Y_DEG))
-    camera = ColorRenderCamera(RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False)
+    camera = ColorRenderCamera(
+        RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False
+    )
     R = quarter_turn_to_base(cell)
     X_TC = rigid_transform(look_at(R @ np.array(_EYE), R @ np.array(_TARGET)))
     query_port = made.scene_graph.get_query_output_port()
@@ -74,6 +87,8 @@ def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.u
         assert frame.arm is not None, "these are an arm's motions"
         set_joint_angles(plant, context, arm, frame.arm.q)
         query = query_port.Eval(made.scene_graph.GetMyContextFromRoot(root))
-        color = query.RenderColorImage(camera, query.inspector().world_frame_id(), X_TC).data[:, :, :3]
+        color = query.RenderColorImage(camera, query.inspector().world_frame_id(), X_TC).data[
+            :, :, :3
+        ]
         pictures.append(np.asarray(Image.fromarray(color).resize(_SIZE, Image.Resampling.LANCZOS)))
     return np.hstack(pictures)

@@ -41,13 +41,27 @@ def write_contact_sheet(path: Path, entries: Sequence[tuple[NDArray[np.uint8], s
         left, top = _GAP + index % columns * TILE[0], _GAP + index // columns * TILE[1]
         colour, outer = _STABLE if stable else _UNSTABLE, THUMBNAIL_SIDE + 2 * _FRAME
         draw.rectangle((left, top, left + outer - 1, top + outer + CAPTION_HEIGHT - 1), fill=colour)
-        draw.rectangle((left + _FRAME, top + outer, left + outer - _FRAME - 1, top + outer + CAPTION_HEIGHT - 4), fill=_PAPER)
+        draw.rectangle(
+            (
+                left + _FRAME,
+                top + outer,
+                left + outer - _FRAME - 1,
+                top + outer + CAPTION_HEIGHT - 4,
+            ),
+            fill=_PAPER,
+        )
         thumbnail = Image.fromarray(picture)
         thumbnail.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.LANCZOS)
-        draw.rectangle((left + _FRAME, top + _FRAME, left + outer - _FRAME - 1, top + outer - _FRAME - 1), fill=_PAPER)
+        draw.rectangle(
+            (left + _FRAME, top + _FRAME, left + outer - _FRAME - 1, top + outer - _FRAME - 1),
+            fill=_PAPER,
+        )
         sheet.paste(
             thumbnail,
-            (left + _FRAME + (THUMBNAIL_SIDE - thumbnail.width) // 2, top + _FRAME + (THUMBNAIL_SIDE - thumbnail.height) // 2),
+            (
+                left + _FRAME + (THUMBNAIL_SIDE - thumbnail.width) // 2,
+                top + _FRAME + (THUMBNAIL_SIDE - thumbnail.height) // 2,
+            ),
         )
         _caption(draw, caption, (left + outer / 2, top + outer + CAPTION_HEIGHT / 2 - 2))
     with replacing(path) as temporary:
@@ -59,6 +73,8 @@ def _caption(draw: ImageDraw.ImageDraw, caption: str, middle: tuple[float, float
     size, room = _FONT_SIZE, THUMBNAIL_SIDE - 6
     if font(size).getlength(caption) > room:
         caption = caption.replace(": ", ":\n", 1)
-    while size > 9 and max(font(size).getlength(line) for line in caption.splitlines() or [""]) > room:
+    while (
+        size > 9 and max(font(size).getlength(line) for line in caption.splitlines() or [""]) > room
+    ):
         size -= 1
     draw.multiline_text(middle, caption, _INK, font(size), anchor="mm", align="center")

@@ -26,18 +26,27 @@ def detections_picture(observation: Observation) -> NDArray[np.uint8]:
     """
     camera, depth = observation.camera, observation.depth
     size_px = np.array([camera.width, camera.height])
-    middle_px, wanted = camera.support_bounds(observation.support, _TALL) or (np.array(camera.principal_point), np.inf)
+    middle_px, wanted = camera.support_bounds(observation.support, _TALL) or (
+        np.array(camera.principal_point),
+        np.inf,
+    )
     side = int(min(np.round(wanted), *size_px))
-    left, top = np.clip(np.floor(middle_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side).tolist()
+    left, top = np.clip(
+        np.floor(middle_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side
+    ).tolist()
     rows, columns = slice(top, top + side), slice(left, left + side)
     pixels = pixel_grid(depth.shape)[rows, columns]
     measured = np.isfinite(depth) & (depth > 0)
     height = np.where(
-        measured[rows, columns], camera.backproject(pixels, np.where(measured, depth, 1.0)[rows, columns])[..., 2], 0.0
+        measured[rows, columns],
+        camera.backproject(pixels, np.where(measured, depth, 1.0)[rows, columns])[..., 2],
+        0.0,
     )
     shades = matplotlib.colormaps["viridis"](np.clip(height / _HIGHEST, 0, 1))[..., :3]
     size = (_OVERSAMPLING * SIDE, _OVERSAMPLING * SIDE)
-    canvas = Canvas(Image.fromarray((255 * shades).astype(np.uint8)).resize(size, Image.Resampling.NEAREST))
+    canvas = Canvas(
+        Image.fromarray((255 * shades).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+    )
     labels = []
     for detection in observation.detections:
         small = Image.fromarray(detection.mask[rows, columns])

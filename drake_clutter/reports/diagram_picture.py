@@ -32,10 +32,14 @@ def connections(diagram: Diagram) -> nx.DiGraph:
     found = defaultdict[tuple[str, str], list[str]](list)
     for (reader, to), (writer, of) in diagram.connection_map().items():
         output, input_ = writer.get_output_port(of).get_name(), reader.get_input_port(to).get_name()
-        found[writer.get_name(), reader.get_name()].append(output if output == input_ else f"{output} → {input_}")
+        found[writer.get_name(), reader.get_name()].append(
+            output if output == input_ else f"{output} → {input_}"
+        )
     graph = nx.DiGraph()
     graph.add_nodes_from(system.get_name() for system in diagram.GetSystems())
-    graph.add_edges_from((a, b, {"ports": sorted(ports)}) for (a, b), ports in sorted(found.items()))
+    graph.add_edges_from(
+        (a, b, {"ports": sorted(ports)}) for (a, b), ports in sorted(found.items())
+    )
     return graph
 
 
@@ -47,24 +51,57 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     loop = loop[first:] + loop[:first]
     order = [*loop, *(name for name in graph if name not in loop)]
     angles = np.pi / 2 - 2 * np.pi * np.arange(len(order)) / len(order)
-    at = {name: np.array([6.2 * np.cos(a), 3.6 * np.sin(a)]) for name, a in zip(order, angles, strict=True)}
+    at = {
+        name: np.array([6.2 * np.cos(a), 3.6 * np.sin(a)])
+        for name, a in zip(order, angles, strict=True)
+    }
     plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "drake_clutter", "font.size": 15})
     figure, axes = plt.subplots(figsize=(15, 9), layout="constrained")
     kinds = {system.get_name(): type(system).__name__ for system in diagram.GetSystems()}
     for name, (x, y) in at.items():
         corner = (x - _WIDTH / 2, y - _HEIGHT / 2)
-        axes.add_patch(Rectangle(corner, _WIDTH, _HEIGHT, facecolor="#e8eef7", edgecolor="#30507a", linewidth=2, zorder=2))
+        axes.add_patch(
+            Rectangle(
+                corner,
+                _WIDTH,
+                _HEIGHT,
+                facecolor="#e8eef7",
+                edgecolor="#30507a",
+                linewidth=2,
+                zorder=2,
+            )
+        )
         axes.text(x, y + 0.17, kinds[name], ha="center", va="center", weight="bold", zorder=3)
         axes.text(x, y - 0.22, name, ha="center", va="center", size=12, color="#444444", zorder=3)
     for a, b, ports in graph.edges(data="ports"):
         way = at[b] - at[a]
-        aside = _AWAY * np.array([way[1], -way[0]]) / np.linalg.norm(way) if graph.has_edge(b, a) else np.zeros(2)
+        aside = (
+            _AWAY * np.array([way[1], -way[0]]) / np.linalg.norm(way)
+            if graph.has_edge(b, a)
+            else np.zeros(2)
+        )
         start, end = _at_box(at[a], way, aside), _at_box(at[b], -way, aside)
-        arrow = {"arrowstyle": "-|>", "linewidth": 2, "color": "#30507a", "mutation_scale": 20, "shrinkA": 0, "shrinkB": 0}
+        arrow = {
+            "arrowstyle": "-|>",
+            "linewidth": 2,
+            "color": "#30507a",
+            "mutation_scale": 20,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=arrow, zorder=1)
         middle = (start + end) / 2 + 2.2 * aside
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
-        axes.text(middle[0], middle[1], "\n".join(ports), ha="center", va="center", size=11, bbox=box, zorder=2)
+        axes.text(
+            middle[0],
+            middle[1],
+            "\n".join(ports),
+            ha="center",
+            va="center",
+            size=11,
+            bbox=box,
+            zorder=2,
+        )
     axes.set(xlim=(-9, 9), ylim=(-4.8, 4.8), aspect="equal")
     axes.axis("off")
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)

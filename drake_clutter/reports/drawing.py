@@ -24,7 +24,9 @@ Rectangle = tuple[float, float, float, float]
 @lru_cache
 def font(size: int) -> ImageFont.FreeTypeFont:
     """A bold sans-serif font of a height in pixels."""
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size)
+    return ImageFont.truetype(
+        str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,9 @@ class Canvas:
     def _draw(self) -> ImageDraw.ImageDraw:
         return ImageDraw.Draw(self.image, "RGBA")
 
-    def outline(self, mask: NDArray[np.bool_], corner: tuple[int, int], colour: str, width: int) -> None:
+    def outline(
+        self, mask: NDArray[np.bool_], corner: tuple[int, int], colour: str, width: int
+    ) -> None:
         """The inner edge of a region (height, width) whose left upper corner lies at `corner`."""
         edge = mask & ~binary_erosion(mask, iterations=width)
         self.image.paste(Image.new("RGB", edge.shape[::-1], colour), corner, Image.fromarray(edge))
@@ -81,13 +85,18 @@ class Canvas:
                 step = min(left, length - done)
                 a, b = done / length, (done + step) / length
                 if on:
-                    ends = [(x0 + a * (x1 - x0), y0 + a * (y1 - y0)), (x0 + b * (x1 - x0), y0 + b * (y1 - y0))]
+                    ends = [
+                        (x0 + a * (x1 - x0), y0 + a * (y1 - y0)),
+                        (x0 + b * (x1 - x0), y0 + b * (y1 - y0)),
+                    ]
                     self._draw.line(ends, fill=colour, width=width)
                 done, left = done + step, left - step
                 if left <= 0:
                     left, on = (0.6 * dash, False) if on else (dash, True)
 
-    def arrow(self, start: tuple[float, float], end: tuple[float, float], colour: str, width: int) -> None:
+    def arrow(
+        self, start: tuple[float, float], end: tuple[float, float], colour: str, width: int
+    ) -> None:
         """A slightly bent arrow; nothing if it would be shorter than its head."""
         a, b = np.asarray(start), np.asarray(end)
         along = b - a
@@ -120,11 +129,21 @@ class Canvas:
                 end = (min(max(x, left), right), min(max(y, top), bottom))
                 self._draw.line([label.anchor, end], fill=_HALO, width=8)
                 self._draw.line([label.anchor, end], fill=label.colour, width=4)
-                self._draw.ellipse((x - 7, y - 7, x + 7, y + 7), fill=label.colour, outline=_HALO, width=2)
+                self._draw.ellipse(
+                    (x - 7, y - 7, x + 7, y + 7), fill=label.colour, outline=_HALO, width=2
+                )
         for label, box in placed:
             fill, ink = ("#ffffffd8", label.colour) if label.faint else (label.colour, "#ffffff")
-            self._draw.rounded_rectangle(box, label.size * 0.35, fill=fill, outline=None if label.faint else _HALO, width=2)
-            self._draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), label.text, ink, font(label.size), anchor="mm")
+            self._draw.rounded_rectangle(
+                box, label.size * 0.35, fill=fill, outline=None if label.faint else _HALO, width=2
+            )
+            self._draw.text(
+                ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2),
+                label.text,
+                ink,
+                font(label.size),
+                anchor="mm",
+            )
 
     def _room(self, label: Label) -> Rectangle:
         width = font(label.size).getlength(label.text) + 0.7 * label.size
@@ -132,7 +151,9 @@ class Canvas:
         own = max(1.0, _overlap(label.about, label.about))
         hiding = 0.0 if label.faint else 16 * height / own
         best, least = (0.0, 0.0, width, height), math.inf
-        for radius, angle in itertools.product(np.arange(0, 12) * 0.8 * height, np.arange(12) * (math.pi / 6)):
+        for radius, angle in itertools.product(
+            np.arange(0, 12) * 0.8 * height, np.arange(12) * (math.pi / 6)
+        ):
             away = 0.02 * height * radius
             if away >= least:
                 break
@@ -141,7 +162,11 @@ class Canvas:
             x = min(max(x, width / 2 + 4), self.image.width - width / 2 - 4)
             y = min(max(y, height / 2 + 4), self.image.height - height / 2 - 4)
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-            cost = away + hiding * _overlap(box, label.about) + sum(_overlap(box, other) for other in self.taken)
+            cost = (
+                away
+                + hiding * _overlap(box, label.about)
+                + sum(_overlap(box, other) for other in self.taken)
+            )
             if cost < least:
                 best, least = box, cost
         return best
@@ -149,7 +174,9 @@ class Canvas:
 
 def middle(mask: NDArray[np.bool_]) -> tuple[float, float]:
     """The point (x, y) of a region (height, width) that lies farthest from its edge."""
-    row, column = np.unravel_index(int(np.argmax(distance_transform_edt(np.pad(mask, 1)))), np.add(mask.shape, 2))
+    row, column = np.unravel_index(
+        int(np.argmax(distance_transform_edt(np.pad(mask, 1)))), np.add(mask.shape, 2)
+    )
     return float(column - 1), float(row - 1)
 
 

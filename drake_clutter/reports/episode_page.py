@@ -40,7 +40,13 @@ _BADGES = {MoveResult.PLACED: "good", MoveResult.COLLAPSED: "bad", MoveResult.DR
 
 
 def write_episode_page(
-    out: Path, title: str, start: Scene, first_look: Look, steps: Sequence[Step], summary: Mapping[str, Any], cell: WorkCell
+    out: Path,
+    title: str,
+    start: Scene,
+    first_look: Look,
+    steps: Sequence[Step],
+    summary: Mapping[str, Any],
+    cell: WorkCell,
 ) -> None:
     """Writes `index.html`, `recording.html` and `images/*.png`; the page needs nothing else, and no network.
 
@@ -100,19 +106,39 @@ def _start(pictures: _Pictures, start: Scene, hidden: Sequence[str]) -> str:
     listed = f"Hidden: {_listed(hidden)}." if hidden else "Nothing is hidden."
     return (
         '<div class="pair start">'
-        + pictures.figure("start_overhead", above, f"The tray from above at the start. {listed}", f"From above. {listed}")
-        + pictures.figure("start_oblique", pictures.camera.oblique(start), "The tray from the front, at an angle", "At an angle.")
+        + pictures.figure(
+            "start_overhead",
+            above,
+            f"The tray from above at the start. {listed}",
+            f"From above. {listed}",
+        )
+        + pictures.figure(
+            "start_oblique",
+            pictures.camera.oblique(start),
+            "The tray from the front, at an angle",
+            "At an angle.",
+        )
         + "</div>"
     )
 
 
-def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step, known: frozenset[str], cell: WorkCell) -> str:
+def _move(
+    pictures: _Pictures,
+    number: int,
+    scene: Scene,
+    look: Look,
+    step: Step,
+    known: frozenset[str],
+    cell: WorkCell,
+) -> str:
     """One move's part of the page; `scene` and `look` are from before it, `known` is what had been found by then."""
     outcome, words = step.outcome, _move_in_words(step.move)
     before_view, after_view = _in_view(look), _in_view(step.look)
     unknown = tuple(name for name in scene.names if name not in known)
     covered = tuple(name for name in scene.names if name in known and name not in before_view)
-    before = Marks(hidden=unknown, covered=covered, moved=step.move.pick, X_T_placed=_place(scene, step))
+    before = Marks(
+        hidden=unknown, covered=covered, moved=step.move.pick, X_T_placed=_place(scene, step)
+    )
     figures = pictures.figure(
         f"move_{number:02d}_before",
         pictures.camera.annotated(scene, before),
@@ -123,7 +149,9 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         still_unknown = tuple(name for name in unknown if name not in step.newly_found)
         after = Marks(
             hidden=still_unknown,
-            covered=tuple(name for name in scene.names if name not in still_unknown and name not in after_view),
+            covered=tuple(
+                name for name in scene.names if name not in still_unknown and name not in after_view
+            ),
             found=step.newly_found,
             fallen=(outcome.instability.object,) if outcome.instability else (),
             moved=step.move.pick,
@@ -135,7 +163,9 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
             "After.",
         )
     notes = [
-        f"Newly found: <strong>{escape(_listed(step.newly_found))}</strong>." if step.newly_found else "Nothing newly found."
+        f"Newly found: <strong>{escape(_listed(step.newly_found))}</strong>."
+        if step.newly_found
+        else "Nothing newly found."
     ]
     notes.append(f"Reward {step.reward:+g}.")
     if outcome.instability:
@@ -147,7 +177,9 @@ def _move(pictures: _Pictures, number: int, scene: Scene, look: Look, step: Step
         names = _listed([detection.object_class.name for detection in seen.detections])
         alt = f"The depth image before move {number}, with what was recognised in it: {names or 'nothing'}"
         caption = "What the camera measured before the move, brighter is higher, and what was recognised in it."
-        figures += pictures.figure(f"move_{number:02d}_seen", detections_picture(seen), alt, caption)
+        figures += pictures.figure(
+            f"move_{number:02d}_seen", detections_picture(seen), alt, caption
+        )
     if outcome.motion and outcome.motion[0].arm:
         moments = arm_moments(outcome.motion, step.move.pick)
         alt = f"The arm in four moments of move {number}: before the lift, on the way, at the place, and when it has let go"
@@ -173,7 +205,9 @@ def _place(scene: Scene, step: Step) -> Pose | None:
     if step.outcome.result.carried_out:
         return step.outcome.released or step.outcome.scene[step.move.pick].X_TO
     return (
-        None if step.move.place == TRAY else Pose(scene[step.move.place].X_TO.translation, scene[step.move.pick].X_TO.quaternion)
+        None
+        if step.move.place == TRAY
+        else Pose(scene[step.move.place].X_TO.translation, scene[step.move.pick].X_TO.quaternion)
     )
 
 
@@ -187,7 +221,9 @@ def _beliefs(decision: Decision, scene: Scene, found: Sequence[str]) -> str:
         f'<span class="track"><b style="width:{_percent(chance)}"></b></span><span>{chance:.0%}</span></div>'
         for name, chance in likeliest
     ]
-    unlikely = [bar for bar, (_, chance) in zip(bars, likeliest, strict=True) if chance < _NOTICEABLE]
+    unlikely = [
+        bar for bar, (_, chance) in zip(bars, likeliest, strict=True) if chance < _NOTICEABLE
+    ]
     html = f'<div class="bars">{"".join(bar for bar in bars if bar not in unlikely)}</div>'
     if unlikely:
         html += f'<details><summary>{len(unlikely)} less likely</summary><div class="bars">{"".join(unlikely)}</div></details>'
@@ -199,7 +235,9 @@ def _beliefs(decision: Decision, scene: Scene, found: Sequence[str]) -> str:
     return f"<h4>The agent's choice of what to pick; {what}</h4>{html}"
 
 
-def _shares(before: Mapping[str, float], after: Mapping[str, float], threshold: float, found: Sequence[str]) -> str:
+def _shares(
+    before: Mapping[str, float], after: Mapping[str, float], threshold: float, found: Sequence[str]
+) -> str:
     """Bars of the visible shares: those that changed or are hidden, and the others below a fold."""
     shown: list[str] = []
     folded: list[str] = []
@@ -213,8 +251,14 @@ def _shares(before: Mapping[str, float], after: Mapping[str, float], threshold: 
             f'<u class="before" style="left:calc({_percent(was)} - 1.5px)"></u></span>'
             f"<span>{was:.0%} &rarr; {share:.0%}</span></div>"
         )
-        (shown if kind or was < threshold or abs(share - was) >= _NOTICEABLE else folded).append(bar)
-    html = f'<div class="bars">{"".join(shown)}</div>' if shown else '<p class="soft">No share changed.</p>'
+        (shown if kind or was < threshold or abs(share - was) >= _NOTICEABLE else folded).append(
+            bar
+        )
+    html = (
+        f'<div class="bars">{"".join(shown)}</div>'
+        if shown
+        else '<p class="soft">No share changed.</p>'
+    )
     if shown:
         html += '<p class="soft">Bar: after; framed tick: before; dotted line: threshold.</p>'
     if folded:
@@ -223,11 +267,19 @@ def _shares(before: Mapping[str, float], after: Mapping[str, float], threshold: 
 
 
 def _figures(objects: int, hidden: int, found: int, moves: int, summary: Mapping[str, Any]) -> str:
-    figures = {"objects": str(objects), "hidden_at_start": str(hidden), "found": f"{found} of {hidden}", "moves": str(moves)}
+    figures = {
+        "objects": str(objects),
+        "hidden_at_start": str(hidden),
+        "found": f"{found} of {hidden}",
+        "moves": str(moves),
+    }
     for key, value in summary.items():
         if key not in figures and isinstance(value, str | int | float):
             figures[key] = _in_words(value)
-    return "".join(f"<div><dt>{escape(humanised(key))}</dt><dd>{escape(text)}</dd></div>" for key, text in figures.items())
+    return "".join(
+        f"<div><dt>{escape(humanised(key))}</dt><dd>{escape(text)}</dd></div>"
+        for key, text in figures.items()
+    )
 
 
 def _in_words(value: str | int | float) -> str:

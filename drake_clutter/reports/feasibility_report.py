@@ -37,7 +37,12 @@ Rows = Sequence[Mapping[str, Any]]
 
 WORST = 3
 """Moves that are shown of each kind: nearest to a collision, longest, and one for each reason."""
-_STYLE: dict[Any, Any] = {"font.size": 15, "axes.grid": True, "grid.alpha": 0.35, "figure.constrained_layout.use": True}
+_STYLE: dict[Any, Any] = {
+    "font.size": 15,
+    "axes.grid": True,
+    "grid.alpha": 0.35,
+    "figure.constrained_layout.use": True,
+}
 _CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:1120px;margin:2em auto;padding:0 1em;color:#1f2630}
 h1,h2{line-height:1.2}table{border-collapse:collapse;margin:1em 0}
 td,th{border:1px solid #cdd2d9;padding:.3em .6em;text-align:left}
@@ -59,33 +64,58 @@ def write_report(
 ) -> None:
     """Writes the page; see `commands/feasibility.py` for what it is given."""
     plt.rcParams.update(_STYLE)
-    parts = [f"<h1>Kinematic feasibility: {summary['scenes']} scenes, {len(moves)} moves</h1>", _setups_table(setups, summary)]
+    parts = [
+        f"<h1>Kinematic feasibility: {summary['scenes']} scenes, {len(moves)} moves</h1>",
+        _setups_table(setups, summary),
+    ]
     if summary["unstable_scenes"]:
-        parts.append(f"<p>Left out, because they do not stay as they are: {escape(', '.join(summary['unstable_scenes']))}.</p>")
+        parts.append(
+            f"<p>Left out, because they do not stay as they are: {escape(', '.join(summary['unstable_scenes']))}.</p>"
+        )
     if len(setups) > 1:
-        rows = "".join(f"<tr><td>{escape(pair)}</td><td>{n}</td></tr>" for pair, n in summary["planned_by"].items())
-        parts.append(f"<h2>The same moves, compared</h2><table><tr><th>planned by</th><th>moves</th></tr>{rows}</table>")
+        rows = "".join(
+            f"<tr><td>{escape(pair)}</td><td>{n}</td></tr>"
+            for pair, n in summary["planned_by"].items()
+        )
+        parts.append(
+            f"<h2>The same moves, compared</h2><table><tr><th>planned by</th><th>moves</th></tr>{rows}</table>"
+        )
     if moves:
         parts += [
             _figure("Results of all moves", _reasons(moves, list(setups))),
-            _figure("Planned, of all legal moves of a kind (bars: 95 %)", _kinds(moves, list(setups))),
-            _figure("Planned, of the moves that pick there (number of moves)", _over_tray(moves, setups)),
+            _figure(
+                "Planned, of all legal moves of a kind (bars: 95 %)", _kinds(moves, list(setups))
+            ),
+            _figure(
+                "Planned, of the moves that pick there (number of moves)", _over_tray(moves, setups)
+            ),
         ]
     for setup, found in reach.items():
-        parts.append(_figure(f"{setup}: where a cup that points down can go, in the empty cell", _reach(found)))
+        parts.append(
+            _figure(
+                f"{setup}: where a cup that points down can go, in the empty cell", _reach(found)
+            )
+        )
     parts.append(
-        _figure("Places of the base, as high and turned as the first setup's", _bases(bases, next(iter(setups.values()))))
+        _figure(
+            "Places of the base, as high and turned as the first setup's",
+            _bases(bases, next(iter(setups.values()))),
+        )
     )
     if noise:
-        parts.append(_figure("Plans made from wrong poses that hold where the objects really are (bars: 95 %)", _noise(noise)))
+        parts.append(
+            _figure(
+                "Plans made from wrong poses that hold where the objects really are (bars: 95 %)",
+                _noise(noise),
+            )
+        )
     if targets:
         parts.append(_targets_table(targets))
     if moves:
         parts.append("<h2>Worst cases</h2>")
         parts += _worst(moves, setups, scene_of, world)
-    page = (
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>Feasibility</title><style>{_CSS}</style><body>{''.join(parts)}"
-    )
+    page = "<!doctype html><html lang=en><meta charset=utf-8><title>Feasibility</title>"
+    page += f"<style>{_CSS}</style><body>{''.join(parts)}"
     write_text(path, page + "</body></html>")
 
 
@@ -94,9 +124,15 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
     for name, cell in setups.items():
         found = summary["setups"][name]
         low, high = found["planned_ci95"]
-        share = "-" if found["planned_share"] is None else f"{found['planned_share']:.3f} ({low:.3f} to {high:.3f})"
+        share = (
+            "-"
+            if found["planned_share"] is None
+            else f"{found['planned_share']:.3f} ({low:.3f} to {high:.3f})"
+        )
         motion = "-" if found["motion_s_median"] is None else f"{found['motion_s_median']:.2f} s"
-        base = ", ".join(f"{v:g}" for v in (*cell.robot.base.translation, cell.robot.base.rpy_deg[2]))
+        base = ", ".join(
+            f"{v:g}" for v in (*cell.robot.base.translation, cell.robot.base.rpy_deg[2])
+        )
         cells = (
             name,
             base,
@@ -108,7 +144,16 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
             f"{1000 * found['planning_s']['p50']:.0f} / {1000 * found['planning_s']['p95']:.0f} ms (p50 / p95)",
         )
         rows += f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
-    heads = ("setup", "base x, y, z, yaw (m, deg)", "cup, tube", "payload", "planned", "share (95 %)", "motion", "planning")
+    heads = (
+        "setup",
+        "base x, y, z, yaw (m, deg)",
+        "cup, tube",
+        "payload",
+        "planned",
+        "share (95 %)",
+        "motion",
+        "planning",
+    )
     return f"<table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{rows}</table>"
 
 
@@ -154,7 +199,13 @@ def _reasons(moves: Rows, setups: Sequence[str]) -> Figure:
     return figure
 
 
-def _share_bars(axes: Any, moves: Rows, setups: Sequence[str], key: Callable[[Mapping[str, Any]], str], label: str) -> None:
+def _share_bars(
+    axes: Any,
+    moves: Rows,
+    setups: Sequence[str],
+    key: Callable[[Mapping[str, Any]], str],
+    label: str,
+) -> None:
     kinds = sorted({key(row) for row in moves})
     width = 0.8 / len(setups)
     for k, setup in enumerate(setups):
@@ -165,16 +216,33 @@ def _share_bars(axes: Any, moves: Rows, setups: Sequence[str], key: Callable[[Ma
             found.append((good / max(1, len(rows)), *wilson_interval(good, len(rows))))
         share, low, high = np.array(found).T
         error = np.clip([share - low, high - share], 0, None)
-        axes.bar(np.arange(len(kinds)) + k * width, share, width, yerr=error, capsize=3, label=setup)
-    axes.set_xticks(np.arange(len(kinds)) + 0.4 - width / 2, kinds, rotation=40, ha="right", rotation_mode="anchor", fontsize=12)
+        axes.bar(
+            np.arange(len(kinds)) + k * width, share, width, yerr=error, capsize=3, label=setup
+        )
+    axes.set_xticks(
+        np.arange(len(kinds)) + 0.4 - width / 2,
+        kinds,
+        rotation=40,
+        ha="right",
+        rotation_mode="anchor",
+        fontsize=12,
+    )
     axes.set(title=label, ylim=(0, 1))
 
 
 def _kinds(moves: Rows, setups: Sequence[str]) -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
-    _share_bars(axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class")
+    _share_bars(
+        axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class"
+    )
     _share_bars(axes[1], moves, setups, lambda row: str(row["rest"]), "axis that points up")
-    _share_bars(axes[2], moves, setups, lambda row: f"{10 * int(row['pick_top'] // 0.1):02d}+ cm", "height of its top")
+    _share_bars(
+        axes[2],
+        moves,
+        setups,
+        lambda row: f"{10 * int(row['pick_top'] // 0.1):02d}+ cm",
+        "height of its top",
+    )
     axes[0].set_ylabel("share planned")
     if len(setups) > 1:
         axes[2].legend(fontsize=11)
@@ -183,12 +251,16 @@ def _kinds(moves: Rows, setups: Sequence[str]) -> Figure:
 
 def _heat(axes: Any, values: NDArray[np.float64], extent: Sequence[float], top: float) -> Any:
     axes.grid(visible=False)
-    return axes.imshow(values.T, origin="lower", extent=extent, vmin=0, vmax=top, cmap="viridis", aspect="equal")
+    return axes.imshow(
+        values.T, origin="lower", extent=extent, vmin=0, vmax=top, cmap="viridis", aspect="equal"
+    )
 
 
 def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
     picked = np.abs([(row["pick_x"], row["pick_y"]) for row in moves])
-    half_x, half_y = np.max([*picked, *(cell.support.half_size for cell in setups.values())], axis=0)
+    half_x, half_y = np.max(
+        [*picked, *(cell.support.half_size for cell in setups.values())], axis=0
+    )
     edges_x, edges_y = np.linspace(-half_x, half_x, 8), np.linspace(-half_y, half_y, 8)
     figure, axes = plt.subplots(1, len(setups), figsize=(6.6 * len(setups), 5.6), squeeze=False)
     for panel, setup in zip(axes[0], setups, strict=True):
@@ -202,7 +274,15 @@ def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
         for i, cx in enumerate((edges_x[1:] + edges_x[:-1]) / 2):
             for j, cy in enumerate((edges_y[1:] + edges_y[:-1]) / 2):
                 if count[i, j]:
-                    panel.text(cx, cy, f"{count[i, j]:.0f}", ha="center", va="center", color="white", fontsize=11)
+                    panel.text(
+                        cx,
+                        cy,
+                        f"{count[i, j]:.0f}",
+                        ha="center",
+                        va="center",
+                        color="white",
+                        fontsize=11,
+                    )
         panel.set(title=setup, xlabel="x of the tray, m", ylabel="y, m")
     figure.colorbar(image, ax=axes[0], label="share planned")
     return figure
@@ -212,7 +292,9 @@ def _reach(found: Mapping[str, Any]) -> Figure:
     heights = found["heights"]
     half_x, half_y = (along[-1] + (along[1] - along[0]) / 2 for along in (found["x"], found["y"]))
     extent = (-half_x, half_x, -half_y, half_y)
-    figure, axes = plt.subplots(2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True)
+    figure, axes = plt.subplots(
+        2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True
+    )
     best = max(0.01, float(np.max(found["manipulability"])))
     for k, height in enumerate(heights):
         top = _heat(axes[0][k], np.array(found["share"][k]), extent, 1.0)
@@ -235,10 +317,19 @@ def _bases(bases: Rows, cell: WorkCell) -> Figure:
     for panel, (name, label) in zip(axes, labels.items(), strict=True):
         at = {(row["x"], row["y"]): row[name] for row in bases}
         values = np.array([[at[i, j] for j in y] for i in x])
-        figure.colorbar(_heat(panel, values, extent, max(0.01, float(values.max()))), ax=panel, label=label)
+        figure.colorbar(
+            _heat(panel, values, extent, max(0.01, float(values.max()))), ax=panel, label=label
+        )
         panel.plot(*cell.robot.base.translation[:2], "r*", markersize=18, label="first setup")
         best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
-        panel.plot(best["x"], best["y"], "wo", markersize=12, markeredgecolor="black", label="best of the grid")
+        panel.plot(
+            best["x"],
+            best["y"],
+            "wo",
+            markersize=12,
+            markeredgecolor="black",
+            label="best of the grid",
+        )
         panel.set(xlabel="x of the base, m (the tray's middle is 0, 0)", ylabel="y, m")
         panel.legend(fontsize=11, loc="upper left")
     return figure
@@ -256,39 +347,68 @@ def _noise(noise: Rows) -> Figure:
         share, low, high = np.array(found).T
         around = np.clip([share - low, high - share], 0, None)
         axes.errorbar(1000 * np.array(errors), share, around, marker="o", capsize=5, label=setup)
-    axes.set(xlabel="standard deviation of x and of y, mm; yaw: half a degree for each mm", ylim=(0, 1.03))
+    axes.set(
+        xlabel="standard deviation of x and of y, mm; yaw: half a degree for each mm",
+        ylim=(0, 1.03),
+    )
     axes.set_ylabel("share that holds")
     axes.legend()
     return figure
 
 
-def _worst(moves: Rows, setups: Mapping[str, WorkCell], scene_of: Callable[[str], Scene], world: ClutterConfig) -> list[str]:
+def _worst(
+    moves: Rows,
+    setups: Mapping[str, WorkCell],
+    scene_of: Callable[[str], Scene],
+    world: ClutterConfig,
+) -> list[str]:
     planned = [row for row in moves if row["result"] == PLANNED]
-    closest = sorted((row for row in planned if row["clearance"] is not None), key=lambda row: float(row["clearance"]))
+    closest = sorted(
+        (row for row in planned if row["clearance"] is not None),
+        key=lambda row: float(row["clearance"]),
+    )
     long = sorted(planned, key=lambda row: -float(row["motion_s"]))
-    chosen = [("nearest to a collision", row) for row in closest[:WORST]] + [("longest", row) for row in long[:WORST]]
-    for reason in dict.fromkeys(row["result"] for row in moves if row["result"] not in (PLANNED, "no free spot")):
+    chosen = [("nearest to a collision", row) for row in closest[:WORST]] + [
+        ("longest", row) for row in long[:WORST]
+    ]
+    for reason in dict.fromkeys(
+        row["result"] for row in moves if row["result"] not in (PLANNED, "no free spot")
+    ):
         chosen.append((reason, next(row for row in moves if row["result"] == reason)))
     camera, parts = PictureCamera(), []
     for kind, row in chosen:
         scene, cell = scene_of(row["scene"]), setups[row["setup"]]
         known = row["place_x"] is not None
-        X_TO = Pose((row["place_x"], row["place_y"], row["place_z"]), scene[row["pick"]].X_TO.quaternion) if known else None
+        X_TO = (
+            Pose(
+                (row["place_x"], row["place_y"], row["place_z"]), scene[row["pick"]].X_TO.quaternion
+            )
+            if known
+            else None
+        )
         told = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
         if row["result"] == PLANNED:
             near = row["clearance"]
-            distance = "nothing within 3 cm" if near is None else f"{1000 * near:.1f} mm ({row['between']})"
+            distance = (
+                "nothing within 3 cm"
+                if near is None
+                else f"{1000 * near:.1f} mm ({row['between']})"
+            )
             why = f"{row['motion_s']:.2f} s, {distance}"
         else:
             why = ": ".join(filter(None, (row["result"], row["about"])))
         pictures = [camera.annotated(scene, Marks(moved=row["pick"], X_T_placed=X_TO))]
         if row["result"] == PLANNED and X_TO is not None:
-            planner = PickPlacePlanner(cell.with_support(scene.support), PlannerConfig(optimise=False))
+            planner = PickPlacePlanner(
+                cell.with_support(scene.support), PlannerConfig(optimise=False)
+            )
             plan = planner.plan(scene.objects, row["pick"], X_TO)
             if isinstance(plan, Plan):
                 pictures.append(strip(scene, _moments(plan, scene, cell), cell))
         images = "".join(_embedded(_png(picture), told) for picture in pictures)
-        parts.append(f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(told)}: {escape(why)}</p>{images}</div>')
+        parts.append(
+            f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(told)}: {escape(why)}</p>{images}</div>'
+        )
     return parts
 
 

@@ -13,7 +13,10 @@ def in_words(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]
     for limit in limits:
         part = row[f"within_{limit}"]
         low, high = part["success_ci95"]
-        cells = {"in": str(limit), "success (95 %)": f"{part['success']:.2f} ({low:.2f}-{high:.2f})"}
+        cells = {
+            "in": str(limit),
+            "success (95 %)": f"{part['success']:.2f} ({low:.2f}-{high:.2f})",
+        }
         cells |= {"found": f"{part['found']:.2f}", "of hidden": f"{part['found_of_hidden']:.2f}"}
         lines.append(cells | {"collapsed": f"{part['collapsed']:.2f}", "moves": ""})
     if row["moves_of_successes"] is not None:
@@ -35,5 +38,7 @@ def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
             clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
             words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['seconds']:.2f} s"
         else:
-            words[move] = f"no plan: {plan['reason']}{': ' + plan['about'] if plan['about'] else ''}"
+            words[move] = (
+                f"no plan: {plan['reason']}{': ' + plan['about'] if plan['about'] else ''}"
+            )
     return words

@@ -30,7 +30,9 @@ _ABOVE, _TRAY_SIDE = 1.60, 0.70
 _EYE, _TARGET = (0.45, -1.30, 1.05), (0.0, -0.02, 0.08)
 
 
-def _lamp(kind: str, position: tuple[float, float, float], intensity: float, frame: str = "world") -> LightParameter:
+def _lamp(
+    kind: str, position: tuple[float, float, float], intensity: float, frame: str = "world"
+) -> LightParameter:
     return LightParameter(
         type=kind,
         position=position,
@@ -133,7 +135,9 @@ class PictureCamera:
     def oblique(self, scene: Scene) -> NDArray[np.uint8]:
         """The tray from the front, at an angle, (720, 960, 3) uint8."""
         scale = max(scene.support.size) / _TRAY_SIDE
-        images = self._oblique.render(scene, look_at(scale * np.array(_EYE), scale * np.array(_TARGET)))
+        images = self._oblique.render(
+            scene, look_at(scale * np.array(_EYE), scale * np.array(_TARGET))
+        )
         return _scaled(Image.fromarray(images.color))
 
     def annotated(self, scene: Scene, marks: Marks) -> NDArray[np.uint8]:
@@ -161,13 +165,20 @@ class PictureCamera:
                 about = (area[1].start, area[0].start, area[1].stop, area[0].stop)
                 x, y = middle(mask)
                 anchor = (about[0] + x, about[1] + y)
-                canvas.outline(mask, (area[1].start, area[0].start), mark.value, 3 if mark is Mark.IN_VIEW else 9)
+                canvas.outline(
+                    mask,
+                    (area[1].start, area[0].start),
+                    mark.value,
+                    3 if mark is Mark.IN_VIEW else 9,
+                )
             if mark is Mark.IN_VIEW:
                 weak.append(Label(_short(name), anchor, about, mark.value, 38, faint=True))
             else:
                 strong.append(Label(humanised(name), anchor, about, mark.value, 46))
             if name == marks.moved and marks.X_T_placed is not None:
-                landing = self._project(scene, marks.X_T_placed.apply(scene_object.object_class.corners))
+                landing = self._project(
+                    scene, marks.X_T_placed.apply(scene_object.object_class.corners)
+                )
                 dashed.append((landing, Mark.MOVED))
                 arrows.append((anchor, _centre(_bounds(landing))))
         for corners, mark in dashed:
@@ -195,13 +206,17 @@ class PictureCamera:
         """Pixels (N, 2) in the picture from above, before it is scaled down, of points (N, 3) m in the tray frame."""
         camera = _over(scene.support)
         # Nothing reaches the camera, save what a collapse has flung there.
-        return camera.project(np.minimum(p_T, [np.inf, np.inf, camera.X_TC.translation()[2] - 0.05]))
+        return camera.project(
+            np.minimum(p_T, [np.inf, np.inf, camera.X_TC.translation()[2] - 0.05])
+        )
 
 
 def _over(support: Support, size: tuple[int, int] = OVERHEAD_SIZE) -> Camera:
     """A camera for pictures of a size from above a support."""
     width, height = (_OVERSAMPLING * pixels for pixels in size)
-    return Camera.over(_ABOVE * max(support.size) / _TRAY_SIDE, width=width, height=height, fov_y_deg=_FOV_Y_DEG)
+    return Camera.over(
+        _ABOVE * max(support.size) / _TRAY_SIDE, width=width, height=height, fov_y_deg=_FOV_Y_DEG
+    )
 
 
 def _bounds(points: NDArray[np.float64]) -> Rectangle:
@@ -214,4 +229,9 @@ def _centre(rectangle: Rectangle) -> tuple[float, float]:
 
 
 def _scaled(picture: Image.Image) -> NDArray[np.uint8]:
-    return np.asarray(picture.resize((picture.width // _OVERSAMPLING, picture.height // _OVERSAMPLING), Image.Resampling.LANCZOS))
+    return np.asarray(
+        picture.resize(
+            (picture.width // _OVERSAMPLING, picture.height // _OVERSAMPLING),
+            Image.Resampling.LANCZOS,
+        )
+    )

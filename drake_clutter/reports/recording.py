@@ -41,7 +41,12 @@ _FOREVER = 1_000_000_000
 _EYE, _TARGET, _FOV_Y_DEG = (0.45, -1.35, 1.10), (0.0, 0.0, 0.14), 36.0
 """m, for a tray of 0.7 m."""
 _LAMPS: dict[str, dict[str, Any]] = {
-    "SpotLight": {"intensity": 20.0, "castShadow": True, "shadow.bias": -0.003, "position": [-1.0, -1.1, 2.6]},
+    "SpotLight": {
+        "intensity": 20.0,
+        "castShadow": True,
+        "shadow.bias": -0.003,
+        "position": [-1.0, -1.1, 2.6],
+    },
     "PointLightNegativeX": {"intensity": 3.0},
     "PointLightPositiveX": {"intensity": 3.0},
     "AmbientLight": {"intensity": 0.4},
@@ -65,7 +70,9 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
             continue
         pick, motion = step.move.pick, step.outcome.motion
         if not (motion and motion[0].arm):
-            for X_TO in _carried(scene, pick, step.outcome.released or step.outcome.scene[pick].X_TO):
+            for X_TO in _carried(
+                scene, pick, step.outcome.released or step.outcome.scene[pick].X_TO
+            ):
                 poses[pick] = X_TO
                 frames.append(Frame(time, dict(poses)))
                 time += 1 / FRAMES_PER_SECOND
@@ -106,7 +113,11 @@ def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     for leg in range(3):
         for s in smooth:
             turned = (0.0, s, 1.0)[leg]
-            poses.append(Pose.of(turn(turned).as_matrix(), corners[leg] + s * (corners[leg + 1] - corners[leg])))
+            poses.append(
+                Pose.of(
+                    turn(turned).as_matrix(), corners[leg] + s * (corners[leg + 1] - corners[leg])
+                )
+            )
     return poses
 
 
@@ -154,7 +165,9 @@ ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]
 """X_TL of the arm's links by name, from its joint angles."""
 
 
-def _shown(scene: Scene, cell: WorkCell, *, arm: bool = False) -> tuple[Meshcat, dict[str, str], ArmPoses]:
+def _shown(
+    scene: Scene, cell: WorkCell, *, arm: bool = False
+) -> tuple[Meshcat, dict[str, str], ArmPoses]:
     """A viewer with the scene in it, with or without the arm; the Meshcat path of each object and link by name; `ArmPoses`."""
     builder = DiagramBuilder()
     objects = [(o.name, o.object_class) for o in scene.objects]
@@ -162,12 +175,24 @@ def _shown(scene: Scene, cell: WorkCell, *, arm: bool = False) -> tuple[Meshcat,
     plant = scene_plant.plant
     links, added = {}, None
     if arm:
-        added = add_work_cell(plant, scene_plant.scene_graph, cell.with_support(scene.support), compliant=False, visuals=True)
-        links = {f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body for body in added.bodies}
+        added = add_work_cell(
+            plant,
+            scene_plant.scene_graph,
+            cell.with_support(scene.support),
+            compliant=False,
+            visuals=True,
+        )
+        links = {
+            f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body
+            for body in added.bodies
+        }
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     visualizer = MeshcatVisualizer.AddToBuilder(
-        builder, scene_plant.scene_graph, meshcat, MeshcatVisualizerParams(role=Role.kIllustration, prefix="/scene")
+        builder,
+        scene_plant.scene_graph,
+        meshcat,
+        MeshcatVisualizerParams(role=Role.kIllustration, prefix="/scene"),
     )
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
@@ -188,14 +213,19 @@ def _shown(scene: Scene, cell: WorkCell, *, arm: bool = False) -> tuple[Meshcat,
     for which, colour in (("top_color", [0.50, 0.53, 0.57]), ("bottom_color", [0.70, 0.71, 0.73])):
         meshcat.SetProperty("/Background", which, colour)
     inspector = scene_plant.scene_graph.model_inspector()
-    frame_ids = {name: plant.GetBodyFrameIdOrThrow(body.index()) for name, body in (scene_plant.bodies | links).items()}
+    frame_ids = {
+        name: plant.GetBodyFrameIdOrThrow(body.index())
+        for name, body in (scene_plant.bodies | links).items()
+    }
 
     def arm_poses(q: Sequence[float]) -> dict[str, Pose]:
         if added is not None:
             set_joint_angles(plant, plant_context, added, q)
         return {name: pose_of(body.EvalPoseInWorld(plant_context)) for name, body in links.items()}
 
-    paths = {name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()}
+    paths = {
+        name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()
+    }
     return meshcat, paths, arm_poses
 
 
@@ -215,5 +245,8 @@ def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
 
 def _same(a: Pose, b: Pose) -> bool:
     # A turn by a small angle moves the unit quaternion by half of it; q and -q are one rotation.
-    turn = 2 * min(np.linalg.norm(np.subtract(a.quaternion, b.quaternion)), np.linalg.norm(np.add(a.quaternion, b.quaternion)))
+    turn = 2 * min(
+        np.linalg.norm(np.subtract(a.quaternion, b.quaternion)),
+        np.linalg.norm(np.add(a.quaternion, b.quaternion)),
+    )
     return bool(np.linalg.norm(a.p - b.p) < _SAME_DISTANCE and turn < _SAME_TURN)

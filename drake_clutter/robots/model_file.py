@@ -136,7 +136,9 @@ def parse_model(
 def mimicking_joint(path: Path) -> str | None:
     """Return the name of a joint of a model file that follows another one; None: it has none."""
     joints = _root(path).iter("joint")
-    return next((joint.get("name", "") for joint in joints if joint.find(".//mimic") is not None), None)
+    return next(
+        (joint.get("name", "") for joint in joints if joint.find(".//mimic") is not None), None
+    )
 
 
 @lru_cache(maxsize=32)

@@ -52,14 +52,19 @@ def _add_motors(plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanc
     """Give each joint a motor, in the order of the joints, which is that of commands to the plant."""
     motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     motors = [motor for motor in motors if motor.model_instance() == instance]
-    by_joint = {motor.joint().name(): (motor.default_rotor_inertia(), motor.default_gear_ratio()) for motor in motors}
+    by_joint = {
+        motor.joint().name(): (motor.default_rotor_inertia(), motor.default_gear_ratio())
+        for motor in motors
+    }
     in_order = tuple(by_joint) == robot.joint_names
     for k, motor in enumerate(motors):
         if not in_order:
             plant.RemoveJointActuator(motor)
         elif robot.spec.limits.torque is not None:
             motor.set_effort_limit(float(robot.torque_limits[k]))
-    for name, torque in () if in_order else zip(robot.joint_names, robot.torque_limits.tolist(), strict=True):
+    for name, torque in (
+        () if in_order else zip(robot.joint_names, robot.torque_limits.tolist(), strict=True)
+    ):
         motor = plant.AddJointActuator(name, plant.GetJointByName(name, instance), torque)
         inertia, ratio = by_joint.get(name, (0.0, 1.0))
         motor.set_default_rotor_inertia(inertia)
@@ -87,8 +92,14 @@ def filter_collisions(
     solids = plant.GetCollisionGeometriesForBody(plant.world_body())
     pedestal = GeometrySet([g for g in solids if inspector.GetName(g).split("::")[-1] == PEDESTAL])
     excluded = [(world, bodies[name]) for name in in_place]
-    excluded += [(pedestal, bodies[name]) for name, moved_by in robot.links.items() if moved_by == 1 and name not in in_place]
-    excluded += [(shapes(bodies[first]), bodies[second]) for first, second in unmeeting_links(robot)]
+    excluded += [
+        (pedestal, bodies[name])
+        for name, moved_by in robot.links.items()
+        if moved_by == 1 and name not in in_place
+    ]
+    excluded += [
+        (shapes(bodies[first]), bodies[second]) for first, second in unmeeting_links(robot)
+    ]
     filters = scene_graph.collision_filter_manager()
     for first, second in excluded:
         filters.Apply(CollisionFilterDeclaration().ExcludeBetween(first, shapes(second)))
@@ -120,7 +131,9 @@ def links_in_place(robot: RobotModel) -> tuple[str, ...]:
 
     turns = bool(robot.chain.revolute[0])
     moved = robot.links.items()
-    return tuple(name for name, by in moved if by == 0 or (by == 1 and turns and reach(name) < _IN_PLACE))
+    return tuple(
+        name for name, by in moved if by == 0 or (by == 1 and turns and reach(name) < _IN_PLACE)
+    )
 
 
 @lru_cache(maxsize=32)

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")
+JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
 """In the order of q, everywhere."""
 _SINGULAR = 1e-7
 
@@ -80,7 +87,9 @@ def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
     The reach of the wrist in the arm's plane, times the elbow's and the wrist's bend: the determinant of an arm of the UR family.
     """
     _, a2, a3 = parameters.a[:3]
-    return np.asarray(np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * _reach(q, parameters)))
+    return np.asarray(
+        np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * _reach(q, parameters))
+    )
 
 
 def _reach(q: Floats, parameters: DenavitHartenberg) -> Floats:
@@ -97,7 +106,9 @@ def branch_of(q: Floats, parameters: DenavitHartenberg) -> int:
     return int(np.dot(turned_back, (4, 2, 1)))
 
 
-def inverse_kinematics(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:
+def inverse_kinematics(
+    X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10
+) -> Floats:
     """All joint angles that reach a pose, see `branches`.
 
     Args:
@@ -125,8 +136,17 @@ def branches(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg =
         (..., 8, 6) rad, within -pi to pi; NaN where a branch does not reach. A branch keeps its number from pose to pose.
     """
     X = np.ascontiguousarray(X_B6, float)
-    lengths = parameters.d[0], parameters.a[1], parameters.a[2], parameters.d[3], parameters.d[4], parameters.d[5]
-    return np.asarray(_branches(X.reshape(-1, 4, 4), wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6))
+    lengths = (
+        parameters.d[0],
+        parameters.a[1],
+        parameters.a[2],
+        parameters.d[3],
+        parameters.d[4],
+        parameters.d[5],
+    )
+    return np.asarray(
+        _branches(X.reshape(-1, 4, 4), wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6)
+    )
 
 
 @njit(cache=True)
@@ -134,12 +154,20 @@ def _branches(X_B6, wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped
     found = np.full((len(X_B6), 8, 6), np.nan)
     for k in range(len(X_B6)):
         X = X_B6[k]
-        x, y, z = X[0, 3] - d6 * X[0, 2], X[1, 3] - d6 * X[1, 2], X[2, 3] - d6 * X[2, 2]  # origin of frame 5
+        x, y, z = (
+            X[0, 3] - d6 * X[0, 2],
+            X[1, 3] - d6 * X[1, 2],
+            X[2, 3] - d6 * X[2, 2],
+        )  # origin of frame 5
         reach = np.hypot(x, y)
         if reach < abs(d4):
             continue
         for branch in range(8):
-            shoulder, wrist, elbow = 1 - 2 * (branch // 4), 1 - 2 * (branch // 2 % 2), 1 - 2 * (branch % 2)
+            shoulder, wrist, elbow = (
+                1 - 2 * (branch // 4),
+                1 - 2 * (branch // 2 % 2),
+                1 - 2 * (branch % 2),
+            )
             # The arm moves in a vertical plane at the distance d4 from the base's axis.
             q1 = np.arctan2(y, x) + shoulder * np.arccos(d4 / reach) + np.pi / 2
             s1, c1 = np.sin(q1), np.cos(q1)
@@ -153,7 +181,11 @@ def _branches(X_B6, wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped
             q6 = np.arctan2(-along_y / s5, along_x / s5) if abs(s5) > _SINGULAR else wrist_3
             # In the plane, whose x is c1, s1 and whose y is up: frame 4 is d5 behind frame 5 along its y.
             s6, c6 = np.sin(q6), np.cos(q6)
-            u, v, w = X[0, 0] * s6 + X[0, 1] * c6, X[1, 0] * s6 + X[1, 1] * c6, X[2, 0] * s6 + X[2, 1] * c6
+            u, v, w = (
+                X[0, 0] * s6 + X[0, 1] * c6,
+                X[1, 0] * s6 + X[1, 1] * c6,
+                X[2, 0] * s6 + X[2, 1] * c6,
+            )
             px = (x + d5 * u) * c1 + (y + d5 * v) * s1
             py = z + d5 * w - d1
             distance = np.hypot(px, py)

@@ -28,7 +28,10 @@ class _Polytope:
         edges = []
         for triangle, neighbours in enumerate(hull.neighbors):
             for opposite, neighbour in enumerate(neighbours):
-                bends = np.abs(hull.equations[triangle, :3] - hull.equations[neighbour, :3]).max() > 1e-6
+                bends = (
+                    np.abs(hull.equations[triangle, :3] - hull.equations[neighbour, :3]).max()
+                    > 1e-6
+                )
                 if neighbour > triangle and bends:
                     start, end = np.delete(hull.simplices[triangle], opposite)
                     edges.append(corners[end] - corners[start])
@@ -52,7 +55,9 @@ def _pieces(object_class: ObjectClass) -> tuple[_Polytope, ...]:
     return _polytopes[object_class]
 
 
-def _piece_penetration(a: _Polytope, b: _Polytope, first: SceneObject, second: SceneObject) -> float:
+def _piece_penetration(
+    a: _Polytope, b: _Polytope, first: SceneObject, second: SceneObject
+) -> float:
     """Separating-axis test: the least overlap over all face normals and pairs of edges; negative is a gap."""
     R_a, R_b = first.X_TO.rotation, second.X_TO.rotation
     edges_a, edges_b = a.edges @ R_a.T, b.edges @ R_b.T
@@ -76,14 +81,20 @@ def penetration(first: SceneObject, second: SceneObject) -> float:
     apart = float(np.maximum(lower_a - upper_b, lower_b - upper_a).max())
     if apart >= 0:
         return -apart
-    return max(_piece_penetration(a, b, first, second) for a in _pieces(first.object_class) for b in _pieces(second.object_class))
+    return max(
+        _piece_penetration(a, b, first, second)
+        for a in _pieces(first.object_class)
+        for b in _pieces(second.object_class)
+    )
 
 
 def deepest_penetration(objects: Sequence[SceneObject]) -> tuple[float, str, str]:
     """The deepest penetration of any two objects, m, and their names; (-inf, "", "") for fewer than two objects."""
     found = (-np.inf, "", "")
     for first, second in combinations(objects, 2):
-        found = max(found, (penetration(first, second), first.name, second.name), key=lambda item: item[0])
+        found = max(
+            found, (penetration(first, second), first.name, second.name), key=lambda item: item[0]
+        )
     return found
 
 
@@ -104,7 +115,9 @@ def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
     return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
 
 
-def rests_on(picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004) -> tuple[str, ...]:
+def rests_on(
+    picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004
+) -> tuple[str, ...]:
     """The names of the objects that stand or lean on the picked one: they touch it and reach over it."""
     found = []
     for other in objects:

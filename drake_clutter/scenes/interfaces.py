@@ -255,7 +255,9 @@ class Observation:
         for detection in self.detections:
             if detection.name == name:
                 return detection
-        raise KeyError(f"object {name!r} is not in view; in view are {', '.join(d.name for d in self.detections)}")
+        raise KeyError(
+            f"object {name!r} is not in view; in view are {', '.join(d.name for d in self.detections)}"
+        )
 
 
 class MoveExecutor(Protocol):

@@ -73,7 +73,11 @@ class Stack:
     """
 
     def __init__(
-        self, graph: ClutterGraph, classes: Mapping[str, ObjectClass], bottom: Sequence[int], config: LayoutConfig
+        self,
+        graph: ClutterGraph,
+        classes: Mapping[str, ObjectClass],
+        bottom: Sequence[int],
+        config: LayoutConfig,
     ) -> None:
         """Lays out a stack whose attributes are all terminal; `bottom`: the single or the pair that stands on the tray."""
         self.nodes: list[int] = []
@@ -91,7 +95,11 @@ class Stack:
             self.nodes += level
             self._resting += [resting] * len(level)
             height = floor - resting.lower[2]
-            origins += [[0.0, 0.0, height]] if len(level) == 1 else [[0.0, -aside, height], [0.0, aside, height]]
+            origins += (
+                [[0.0, 0.0, height]]
+                if len(level) == 1
+                else [[0.0, -aside, height], [0.0, aside, height]]
+            )
             floor = height + resting.upper[2]
             parent = level[0]
             above = graph.children(parent)
@@ -100,8 +108,12 @@ class Stack:
                 above = graph.children(parent)
             level = [node for node in above if graph.kind(node) != END]
         self.p_T = np.array(origins)
-        self.lower = np.min(self.p_T + np.array([resting.lower for resting in self._resting]), axis=0)
-        self.upper = np.max(self.p_T + np.array([resting.upper for resting in self._resting]), axis=0)
+        self.lower = np.min(
+            self.p_T + np.array([resting.lower for resting in self._resting]), axis=0
+        )
+        self.upper = np.max(
+            self.p_T + np.array([resting.upper for resting in self._resting]), axis=0
+        )
 
     def objects(self, x: float = 0.0, y: float = 0.0) -> list[SceneObject]:
         """The stack's objects, the stack moved by x and y (m)."""
@@ -110,12 +122,22 @@ class Stack:
             self.nodes, self._resting, (self.p_T + np.array([x, y, 0.0])).tolist(), strict=True
         ):
             object_class = self._classes[self._graph.kind(node)]
-            made.append(SceneObject(f"{object_class.name}_{node}", object_class, Pose((px, py, pz), resting.quaternion), node))
+            made.append(
+                SceneObject(
+                    f"{object_class.name}_{node}",
+                    object_class,
+                    Pose((px, py, pz), resting.quaternion),
+                    node,
+                )
+            )
         return made
 
 
 def _place(
-    half_sizes: NDArray[np.float64], support: Support, config: LayoutConfig, rng: np.random.Generator
+    half_sizes: NDArray[np.float64],
+    support: Support,
+    config: LayoutConfig,
+    rng: np.random.Generator,
 ) -> NDArray[np.float64] | None:
     """(S, 2) m, centres of S rectangles on the support's floor, gap kept; None if no draw fits. Large ones are drawn first."""
     reach = support.half_size - config.stack_gap - half_sizes
@@ -127,7 +149,9 @@ def _place(
         for drawn, stack in enumerate(order):
             draws = rng.uniform(-1, 1, (config.placement_tries, 2)) * reach[stack]
             others = order[:drawn]
-            apart = np.abs(draws[:, None] - centres[others]) - half_sizes[others] - half_sizes[stack]
+            apart = (
+                np.abs(draws[:, None] - centres[others]) - half_sizes[others] - half_sizes[stack]
+            )
             free = (apart.max(axis=2) >= config.stack_gap).all(axis=1)
             if not free.any():
                 break
@@ -162,11 +186,20 @@ def lay_out(
     height = max(float(stack.upper[2]) for stack in stacks)
     if height > config.layout.max_stack_height:
         return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.layout.max_stack_height)
-    lower, upper = np.array([stack.lower[:2] for stack in stacks]), np.array([stack.upper[:2] for stack in stacks])
+    lower, upper = (
+        np.array([stack.lower[:2] for stack in stacks]),
+        np.array([stack.upper[:2] for stack in stacks]),
+    )
     centres = _place((upper - lower) / 2, config.cell.support, config.layout, rng)
     if centres is None:
-        return LayoutFailure(LayoutFailureReason.NO_ROOM, float((upper - lower).prod(axis=1).sum()), config.cell.support.area)
+        return LayoutFailure(
+            LayoutFailureReason.NO_ROOM,
+            float((upper - lower).prod(axis=1).sum()),
+            config.cell.support.area,
+        )
     objects = [
-        o for stack, (x, y) in zip(stacks, centres - (lower + upper) / 2, strict=True) for o in stack.objects(float(x), float(y))
+        o
+        for stack, (x, y) in zip(stacks, centres - (lower + upper) / 2, strict=True)
+        for o in stack.objects(float(x), float(y))
     ]
     return Scene(tuple(objects), config.cell.support, graph, derivation.rules, seed)

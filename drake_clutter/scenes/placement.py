@@ -61,14 +61,22 @@ class _Grid:
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
 
 
-def _pixels(camera: Camera, p_T: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+def _pixels(
+    camera: Camera, p_T: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Row and column of the pixel on which each of points (N, 3) m falls, and how deep it is, m.
 
     Out of the frame the depth is NaN, and the pixel any.
     """
     pixels, depth = camera.project_with_depth(p_T)
     columns, rows = np.rint(pixels).astype(np.int64).T
-    within = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width) & (depth > NEAREST)
+    within = (
+        (rows >= 0)
+        & (rows < camera.height)
+        & (columns >= 0)
+        & (columns < camera.width)
+        & (depth > NEAREST)
+    )
     return rows * within, columns * within, np.where(within, depth, np.nan)
 
 
@@ -94,9 +102,17 @@ class _Turned(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def _turned(object_class: ObjectClass, quaternion: tuple[float, float, float, float], yaw: float, clearance: float) -> _Turned:
+def _turned(
+    object_class: ObjectClass,
+    quaternion: tuple[float, float, float, float],
+    yaw: float,
+    clearance: float,
+) -> _Turned:
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    R_TO = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ Pose((0.0, 0.0, 0.0), quaternion).rotation
+    R_TO = (
+        np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        @ Pose((0.0, 0.0, 0.0), quaternion).rotation
+    )
     corners = object_class.corners @ R_TO.T
     reach = int(np.ceil((np.abs(corners[:, :2]).max() + clearance) / CELL))
     offsets = np.arange(-reach, reach + 1)
@@ -107,7 +123,9 @@ def _turned(object_class: ObjectClass, quaternion: tuple[float, float, float, fl
     covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL / 2]
     outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
     turned = quaternion if yaw == 0 else Pose.of(R_TO, (0.0, 0.0, 0.0)).quaternion
-    return _Turned(turned, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first])
+    return _Turned(
+        turned, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first]
+    )
 
 
 @lru_cache(maxsize=16)
@@ -120,14 +138,18 @@ def _tray_places(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float6
     return cells[order], cost[order]
 
 
-def _top_places(observation: Observation, target: Detection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _top_places(
+    observation: Observation, target: Detection
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(n, 2) cells well inside what is seen of an object's top, those nearest to its middle first, and (n,) how near, m."""
     grid = _Grid.over(observation.support)
     corners = target.X_TO.apply(target.object_class.corners)
     floor = float(corners[:, 2].max())
     # A cell more all around: a pixel of the top's edge may lie in a cell whose middle is beside it.
     axes, lower, upper = (grid.x, grid.y), corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
-    x0, y0 = (max(int(np.searchsorted(axis, low)) - 1, 0) for axis, low in zip(axes, lower, strict=True))
+    x0, y0 = (
+        max(int(np.searchsorted(axis, low)) - 1, 0) for axis, low in zip(axes, lower, strict=True)
+    )
     x1, y1 = (int(np.searchsorted(axis, high)) + 1 for axis, high in zip(axes, upper, strict=True))
     x, y = np.meshgrid(grid.x[x0:x1], grid.y[y0:y1], indexing="ij")
     p_T = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)])
@@ -170,7 +192,9 @@ def _first_fits(depth, camera, x, y, levels, footprint, cells, cost):  # type: i
                     if away > NEAREST:
                         u, v = project(camera, p_x, p_y, away)
                         column, row = int(np.rint(u)), int(np.rint(v))
-                        seen = 0 <= row < height and 0 <= column < width and depth[row, column] >= away
+                        seen = (
+                            0 <= row < height and 0 <= column < width and depth[row, column] >= away
+                        )
                     if not seen:
                         known[i, j] = 2
                         break
@@ -259,8 +283,14 @@ def _search_places(
     camera = observation.camera.pinhole
     for yaw in _YAWS:
         turned = _turned(picked.object_class, picked.X_TO.quaternion, yaw, config.clearance)
-        levels = floor + _DEPTH_TOLERANCE + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
-        if not observation.camera.vertical:  # nothing that is seen through below speaks for what is above
+        levels = (
+            floor
+            + _DEPTH_TOLERANCE
+            + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
+        )
+        if (
+            not observation.camera.vertical
+        ):  # nothing that is seen through below speaks for what is above
             levels = np.append(levels, floor + turned.height + config.release_height)
         arguments = (grid.x, grid.y, levels, turned.footprint, cells, cost)
         best = _first_fits(observation.depth, camera, *arguments)

@@ -35,7 +35,10 @@ class Pose:
     @staticmethod
     def of(rotation: NDArray[np.float64], translation: Iterable[float]) -> "Pose":
         """The pose with R_AB (3, 3) and p_AB (3,) m; w is not negative."""
-        w, x, y, z = (float(v) for v in Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True))
+        w, x, y, z = (
+            float(v)
+            for v in Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+        )
         px, py, pz = (float(v) for v in translation)
         return Pose((px, py, pz), (w, x, y, z))
 
@@ -132,7 +135,12 @@ class Scene:
 
     def at(self, poses: Mapping[str, Pose]) -> "Scene":
         """The scene with the poses of the objects that are named replaced."""
-        return replace(self, objects=tuple(replace(o, X_TO=poses[o.name]) if o.name in poses else o for o in self.objects))
+        return replace(
+            self,
+            objects=tuple(
+                replace(o, X_TO=poses[o.name]) if o.name in poses else o for o in self.objects
+            ),
+        )
 
 
 def random_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -142,10 +150,14 @@ def random_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArr
     return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)])
 
 
-def jittered(objects: Sequence[SceneObject], radius: float, rng: np.random.Generator) -> list[SceneObject]:
+def jittered(
+    objects: Sequence[SceneObject], radius: float, rng: np.random.Generator
+) -> list[SceneObject]:
     """The objects, each moved by a random offset of its own."""
     offsets = random_offsets(len(objects), radius, rng)
-    return [replace(o, X_TO=o.X_TO.moved(offset)) for o, offset in zip(objects, offsets, strict=True)]
+    return [
+        replace(o, X_TO=o.X_TO.moved(offset)) for o, offset in zip(objects, offsets, strict=True)
+    ]
 
 
 def tilt_between(object_class: ObjectClass, X_TA: Pose, X_TB: Pose) -> float:

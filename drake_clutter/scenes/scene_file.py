@@ -34,7 +34,9 @@ from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
 
 VERSION = 2
 _QUATERNION_TOLERANCE = 1e-3  # a hand-written 0.7071 is close enough, and is normalized
-_EDGE_KINDS: dict[str, EdgeKind] = {PRIMITIVE: PRIMITIVE} | {orientation.name.lower(): orientation for orientation in Orientation}
+_EDGE_KINDS: dict[str, EdgeKind] = {PRIMITIVE: PRIMITIVE} | {
+    orientation.name.lower(): orientation for orientation in Orientation
+}
 
 
 @dataclass(frozen=True)
@@ -272,18 +274,34 @@ def _pose_fields(pose: Pose) -> dict[str, list[float]]:
 def scene_fields(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> dict[str, Any]:
     """Return the document of a scene file, as plain lists and mappings; see `save_scene`."""
     plain = to_plain(cell.with_support(scene.support))
-    document: dict[str, Any] = {"version": VERSION, "seed": scene.seed, "cell": plain, "objects": []}
+    document: dict[str, Any] = {
+        "version": VERSION,
+        "seed": scene.seed,
+        "cell": plain,
+        "objects": [],
+    }
     for o in scene.objects:
-        entry: dict[str, Any] = {"name": o.name, "class": o.object_class.name, "X_TO": _pose_fields(o.X_TO)}
+        entry: dict[str, Any] = {
+            "name": o.name,
+            "class": o.object_class.name,
+            "X_TO": _pose_fields(o.X_TO),
+        }
         if o.node is not None:
             entry["node"] = o.node
         document["objects"].append(entry)
     if scene.graph is not None:
         edges = scene.graph.nx.edges(data="kind")
         document["graph"] = {
-            "nodes": [{"id": node, "kind": kind} for node, kind in scene.graph.nx.nodes(data="kind")],
+            "nodes": [
+                {"id": node, "kind": kind} for node, kind in scene.graph.nx.nodes(data="kind")
+            ],
             "edges": [
-                {"parent": a, "child": b, "kind": k.name.lower() if isinstance(k, Orientation) else k} for a, b, k in edges
+                {
+                    "parent": a,
+                    "child": b,
+                    "kind": k.name.lower() if isinstance(k, Orientation) else k,
+                }
+                for a, b, k in edges
             ],
         }
     if scene.derivation:
@@ -303,8 +321,14 @@ def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
             "displacement": why.displacement,
             "tilt": why.tilt,
         }
-    settled: Mapping[str, Any] = {name: _pose_fields(pose) for name, pose in verdict.settled.items()}
-    return fields | {"hidden": list(verdict.hidden), "visible_share": dict(verdict.visible_share), "settled": settled}
+    settled: Mapping[str, Any] = {
+        name: _pose_fields(pose) for name, pose in verdict.settled.items()
+    }
+    return fields | {
+        "hidden": list(verdict.hidden),
+        "visible_share": dict(verdict.visible_share),
+        "settled": settled,
+    }
 
 
 def save_scene(path: Path, scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> None:

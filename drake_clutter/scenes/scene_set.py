@@ -87,11 +87,15 @@ class SceneSet:
                 f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
             )
         world = replace(config, cell=config.cell.with_support(self.cell.support))
-        scene = lay_anew(self.derivation(index, grammar), grammar, world, np.random.default_rng(index))
+        scene = lay_anew(
+            self.derivation(index, grammar), grammar, world, np.random.default_rng(index)
+        )
         return scene.at(dict(zip(scene.names, poses, strict=True)))
 
 
-def lay_anew(derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator) -> Scene:
+def lay_anew(
+    derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator
+) -> Scene:
     """A graph that has been laid out before, with its stacks in new places."""
     for _ in range(_LAYOUT_TRIES):
         scene = lay_out(derivation, grammar.classes, config, rng)
@@ -106,7 +110,9 @@ def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> st
     return hashlib.sha256(json.dumps([head, entries], sort_keys=True).encode()).hexdigest()
 
 
-def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene], cell: WorkCell) -> None:
+def save_scene_set(
+    path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene], cell: WorkCell
+) -> None:
     """Write a set, one scene a line.
 
     Args:
@@ -119,10 +125,17 @@ def save_scene_set(path: Path, about: Mapping[str, Any], scenes: Sequence[SetSce
     number = {name: k for k, name in enumerate(names)}
     entries: list[dict[str, Any]] = []
     for scene in scenes:
-        entry: dict[str, Any] = {"form": scene.form, "hidden": scene.hidden, "solvable": scene.solvable}
+        entry: dict[str, Any] = {
+            "form": scene.form,
+            "hidden": scene.hidden,
+            "solvable": scene.solvable,
+        }
         entry["rules"] = [number[rule] for rule in scene.rules]
         if scene.settled is not None:
-            entry["settled"] = [[round(v, 6) for v in (*pose.translation, *pose.quaternion)] for pose in scene.settled]
+            entry["settled"] = [
+                [round(v, 6) for v in (*pose.translation, *pose.quaternion)]
+                for pose in scene.settled
+            ]
         entries.append(entry)
     head = {"version": VERSION, **about, "cell": to_plain(cell), "rules": names}
     head["sha256"] = _digest(head, entries)
@@ -140,7 +153,11 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
         document = json.loads(path.read_text(encoding="utf-8"))
         entries, digest = document.pop("scenes"), document.pop("sha256")
         changed = _digest(document, entries) != digest
-        version, names, objects = document.pop("version"), document.pop("rules"), document["objects"]
+        version, names, objects = (
+            document.pop("version"),
+            document.pop("rules"),
+            document["objects"],
+        )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -150,13 +167,17 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
     if version != VERSION:
         raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
     if changed:
-        raise InputError(f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made")
+        raise InputError(
+            f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made"
+        )
     # A set of version 0.1 has no cell.
     given = document.pop("cell", None)
     cell = default_cell() if given is None else validate(WorkCell, given, f"{path}: cell")
     scenes = []
     for entry in entries:
-        poses = tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
+        poses = (
+            tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
+        )
         rules = tuple(names[k] for k in entry["rules"])
         scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
     return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes), digest, cell)

@@ -59,7 +59,9 @@ class UnseenBlock:
         return UnseenBlock((float(x), float(y), top / 2), (float(length), float(width), top), yaw)
 
 
-def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> tuple[UnseenBlock, ...]:
+def unseen_blocks(
+    known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]
+) -> tuple[UnseenBlock, ...]:
     """What lies in the shadow of known objects, and under what is seen but belongs to none of them.
 
     Args:
@@ -68,7 +70,11 @@ def unseen_blocks(known: Sequence[SceneObject], observation: Observation, empty:
         empty: (height, width) m, the depth that the camera shows of the cell with nothing on the tray, the arm at home.
     """
     lower = [float(o.bounds_T[0][2]) for o in known]
-    shadows = [UnseenBlock.under(o.corners_T, z - _GAP) for o, z in zip(known, lower, strict=True) if z > _FLAT]
+    shadows = [
+        UnseenBlock.under(o.corners_T, z - _GAP)
+        for o, z in zip(known, lower, strict=True)
+        if z > _FLAT
+    ]
     behind = [] if observation.camera.vertical else _behind(known, observation)
     return (*shadows, *behind, *_nameless(known, observation, empty))
 
@@ -79,9 +85,14 @@ def _behind(known: Sequence[SceneObject], observation: Observation) -> list[Unse
     What is so near to them that nothing has room in between is left out.
     """
     eye, top = observation.camera.X_TC.translation(), max((o.top for o in known), default=0.0)
-    x, y = (np.arange(-count, count + 1) * (_CELL / 2) for count in (int(side / _CELL) for side in observation.support.size))
+    x, y = (
+        np.arange(-count, count + 1) * (_CELL / 2)
+        for count in (int(side / _CELL) for side in observation.support.size)
+    )
     z = np.arange(_FLAT, top, _LEVEL)
-    p_TP = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)  # corners of the columns, and in between their middles
+    p_TP = np.stack(
+        np.meshgrid(x, y, z, indexing="ij"), axis=-1
+    )  # corners of the columns, and in between their middles
     shadow, own = np.zeros(p_TP.shape[:3], bool), np.zeros(p_TP.shape[:3], bool)
     for o in known:
         half, R = np.asarray(o.object_class.size) / 2, o.X_TO.rotation
@@ -105,7 +116,9 @@ def _behind(known: Sequence[SceneObject], observation: Observation) -> list[Unse
     return blocks
 
 
-def under_nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> frozenset[str]:
+def under_nameless(
+    known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]
+) -> frozenset[str]:
     """The names of known objects right above which something is seen that belongs to none of them: it may lie on them.
 
     Arguments: as of `unseen_blocks`.
@@ -115,13 +128,17 @@ def under_nameless(known: Sequence[SceneObject], observation: Observation, empty
     for o in known:
         p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
         level = np.arange(3) != np.abs(o.X_TO.rotation[2]).argmax()
-        over = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2)[:, level].all(axis=1) & (p_TP[:, 2] > o.top + _FLAT)
+        over = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2)[:, level].all(axis=1) & (
+            p_TP[:, 2] > o.top + _FLAT
+        )
         if over.sum() >= _FEWEST:
             found.add(o.name)
     return frozenset(found)
 
 
-def _nameless(known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]) -> list[UnseenBlock]:
+def _nameless(
+    known: Sequence[SceneObject], observation: Observation, empty: NDArray[np.float32]
+) -> list[UnseenBlock]:
     p_TP, part = _nameless_points(known, observation, empty)
     blocks = []
     for k in np.unique(part):
@@ -151,9 +168,14 @@ def _nameless_points(
     """p_TP (N, 3) m of what is seen and belongs to nothing known, and (N,) the number of the patch of the image it is in."""
     camera = observation.camera
     plane = np.where(np.isfinite(camera.floor_depth), camera.floor_depth, 0)
-    z, floor = observation.depth[::_EVERY, ::_EVERY], (minimum_filter(empty - plane, _BESIDE) + plane)[::_EVERY, ::_EVERY]
+    z, floor = (
+        observation.depth[::_EVERY, ::_EVERY],
+        (minimum_filter(empty - plane, _BESIDE) + plane)[::_EVERY, ::_EVERY],
+    )
     pixels = _EVERY * pixel_grid(z.shape)
-    measured = np.isfinite(z) & (z > 0) & np.isfinite(floor)  # where nothing can be measured, a detector may have filled holes
+    measured = (
+        np.isfinite(z) & (z > 0) & np.isfinite(floor)
+    )  # where nothing can be measured, a detector may have filled holes
     z = np.where(measured, z, np.nan)
     x, y, height = np.moveaxis(camera.backproject(pixels, z), -1, 0)
     half_x, half_y = observation.support.half_size

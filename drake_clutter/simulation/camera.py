@@ -35,8 +35,12 @@ RENDERER = "vtk"
 ENGINE = RenderEngineVtkParams(
     backend="EGL",
     lights=[
-        LightParameter(type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4),
-        LightParameter(type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9),
+        LightParameter(
+            type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4
+        ),
+        LightParameter(
+            type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9
+        ),
     ],
 )
 _NO_OBJECT = -1
@@ -76,9 +80,16 @@ class Intrinsics:
         """Of a config."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
-        over_tray = RenderCameraCore(RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform())
+        over_tray = RenderCameraCore(
+            RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform()
+        )
         depth = DepthRenderCamera(anywhere, DepthRange(0.1, FARTHEST))
-        return Intrinsics(ColorRenderCamera(anywhere, False), depth, ColorRenderCamera(over_tray, False), config.X_TC)
+        return Intrinsics(
+            ColorRenderCamera(anywhere, False),
+            depth,
+            ColorRenderCamera(over_tray, False),
+            config.X_TC,
+        )
 
 
 def _clipping_over_tray(X_TC: RigidTransform) -> ClippingRange:
@@ -102,7 +113,12 @@ class OverheadCamera:
         self._counts: Counter[ObjectClass] = Counter()
         self._support: Support | None = None
         eye = Intrinsics.of(config)
-        self._color_camera, self._depth_camera, self._label_camera, self._X_TC = eye.color, eye.depth, eye.label, eye.X_TC
+        self._color_camera, self._depth_camera, self._label_camera, self._X_TC = (
+            eye.color,
+            eye.depth,
+            eye.label,
+            eye.X_TC,
+        )
         # Behind the camera.
         self._X_T_parked = RigidTransform(eye.X_TC @ [0.0, 0.0, -5.0])
 
@@ -151,7 +167,9 @@ class OverheadCamera:
 
     def _query(self) -> QueryObject:
         scene_graph = self._scene_plant.scene_graph
-        return scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(self._context))
+        return scene_graph.get_query_output_port().Eval(
+            scene_graph.GetMyContextFromRoot(self._context)
+        )
 
     def _world_frame(self) -> FrameId:
         return self._scene_plant.scene_graph.world_frame_id()
@@ -167,7 +185,9 @@ class OverheadCamera:
         X = self._X_TC if X_TC is None else rigid_transform(X_TC)
         color = self._query().RenderColorImage(self._color_camera, self._world_frame(), X)
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), X)
-        return Images(color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels, X))
+        return Images(
+            color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels, X)
+        )
 
     def depth_and_label(self, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The depth image and the label image, without the colour image, which takes longer than both; see `Images`."""
@@ -179,23 +199,35 @@ class OverheadCamera:
         """The label image alone, see `Images`."""
         return self._label_image(self._show(scene, scene.names), self._X_TC)
 
-    def visible_shares(self, scene: Scene, label: NDArray[np.int64] | None = None) -> dict[str, float]:
+    def visible_shares(
+        self, scene: Scene, label: NDArray[np.int64] | None = None
+    ) -> dict[str, float]:
         """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
 
         An object that is out of the camera's frame is not hidden: its share is 1. `label` is the scene's label image, if it is
         there already.
         """
-        seen = np.bincount((self.label(scene) if label is None else label).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+        seen = np.bincount(
+            (self.label(scene) if label is None else label).ravel() + 1,
+            minlength=len(scene.objects) + 1,
+        )[1:]
         alone = np.zeros(len(scene.objects), int)
         for together in self._apart_in_image(scene):
             labels = self._show(scene, {scene.objects[i].name for i in together})
-            counts = np.bincount(self._label_image(labels, self._X_TC).ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+            counts = np.bincount(
+                self._label_image(labels, self._X_TC).ravel() + 1, minlength=len(scene.objects) + 1
+            )[1:]
             alone[together] = counts[together]
-        return {o.name: float(seen[i] / alone[i]) if alone[i] else 1.0 for i, o in enumerate(scene.objects)}
+        return {
+            o.name: float(seen[i] / alone[i]) if alone[i] else 1.0
+            for i, o in enumerate(scene.objects)
+        }
 
     def hidden(self, shares: Mapping[str, float]) -> tuple[str, ...]:
         """The names whose visible share is below the config's threshold, in order."""
-        return tuple(name for name, share in shares.items() if share < self.config.visibility_threshold)
+        return tuple(
+            name for name, share in shares.items() if share < self.config.visibility_threshold
+        )
 
     def _apart_in_image(self, scene: Scene) -> list[list[int]]:
         """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""

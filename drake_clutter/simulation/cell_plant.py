@@ -149,14 +149,18 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     plant.WeldFrames(plant.world_frame(), frame, fixture.pose.transform)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if len(joints) != len(bodies) or any(joint.num_positions() for joint in joints):
-        raise InputError(f"{field}: {fixture.model!r} has parts that move; allowed is a rigid model")
+        raise InputError(
+            f"{field}: {fixture.model!r} has parts that move; allowed is a rigid model"
+        )
     return bodies
 
 
 def joint_numbers(plant: MultibodyPlant, arm: Arm) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return where q (n,) and v (n,) of the arm lie in the finalized plant's."""
     joints = [plant.GetJointByName(name, arm.robot) for name in arm.joints]
-    return np.array([j.position_start() for j in joints]), np.array([j.velocity_start() for j in joints])
+    return np.array([j.position_start() for j in joints]), np.array(
+        [j.velocity_start() for j in joints]
+    )
 
 
 def set_joint_angles(plant: MultibodyPlant, context: Context, arm: Arm, q: Sequence[float]) -> None:

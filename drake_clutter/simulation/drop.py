@@ -24,7 +24,9 @@ def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.
     for number, object_class in enumerate(classes):
         R_TO = Rotation.random(rng=rng).as_matrix()
         x, y = rng.uniform(-_WITHIN, _WITHIN, 2) * support.size
-        loose = SceneObject(f"{object_class.name}_{number}", object_class, Pose.of(R_TO, (x, y, 0.0)))
+        loose = SceneObject(
+            f"{object_class.name}_{number}", object_class, Pose.of(R_TO, (x, y, 0.0))
+        )
         lower, upper = loose.bounds_T
         below = [
             top[2]
@@ -56,7 +58,9 @@ def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Sc
     for moment in moments:
         simulator.AdvanceTo(moment)
         fallen = scene.at(scene_plant.poses(context))
-        scenes.append(Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.support)), scene.support))
+        scenes.append(
+            Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.support)), scene.support)
+        )
     return scenes
 
 

@@ -55,13 +55,27 @@ class SettleExecutor:
                 if not self._follow_falls:
                     after = moved.at(settled[-1].poses)
                     motion = _together(moved.poses, settled)
-                    return Outcome(MoveResult.COLLAPSED, after, settled[-1].instability, motion, released=released.X_TO)
+                    return Outcome(
+                        MoveResult.COLLAPSED,
+                        after,
+                        settled[-1].instability,
+                        motion,
+                        released=released.X_TO,
+                    )
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
                 whole = settle(moved.objects, scene.support, coarse, record=True, follow_falls=True)
                 fall = settled[-1].instability
-                return Outcome(MoveResult.COLLAPSED, moved.at(whole.poses), fall, whole.motion, released=released.X_TO)
+                return Outcome(
+                    MoveResult.COLLAPSED,
+                    moved.at(whole.poses),
+                    fall,
+                    whole.motion,
+                    released=released.X_TO,
+                )
         motion = _together(moved.poses, settled)
-        return Outcome(MoveResult.PLACED, moved.at(_poses(settled)), None, motion, released=released.X_TO)
+        return Outcome(
+            MoveResult.PLACED, moved.at(_poses(settled)), None, motion, released=released.X_TO
+        )
 
 
 def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
@@ -69,7 +83,9 @@ def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
     lower, upper = (bound[:2] for bound in released.bounds_T)
     with_released, others = list[SceneObject](), []
     for group in touching_groups(scene.objects, TOUCHING_MARGIN):
-        if any((lower <= o.bounds_T[1][:2]).all() and (o.bounds_T[0][:2] <= upper).all() for o in group):
+        if any(
+            (lower <= o.bounds_T[1][:2]).all() and (o.bounds_T[0][:2] <= upper).all() for o in group
+        ):
             with_released += group
         else:
             others.append(group)

@@ -34,7 +34,10 @@ class FastOrDrakeExecutor:
 
     def __init__(self, config: ClutterConfig, *, follow_falls: bool = True) -> None:
         """Makes both; `follow_falls` is Drake's, see `SettleExecutor`."""
-        self._fast, self._settle = FastExecutor(config), SettleExecutor(config, follow_falls=follow_falls)
+        self._fast, self._settle = (
+            FastExecutor(config),
+            SettleExecutor(config, follow_falls=follow_falls),
+        )
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""

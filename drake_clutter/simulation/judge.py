@@ -42,13 +42,23 @@ class DrakeJudge:
                 return Verdict(result.instability, settled, {}, ())
         return self.look(scene.at(settled))
 
-    def settle_groups(self, scene: Scene, rng: np.random.Generator) -> Iterator[tuple[tuple[SceneObject, ...], Settled]]:
+    def settle_groups(
+        self, scene: Scene, rng: np.random.Generator
+    ) -> Iterator[tuple[tuple[SceneObject, ...], Settled]]:
         """Settles group after group of objects that may touch, random offsets added; each with how it settled."""
         config = self._config.settle
         groups = touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN)
-        for group in sorted(groups, key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None):
+        for group in sorted(
+            groups,
+            key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None,
+        ):
             alone = len(group) == 1 and _well_inside(group[0], scene.support)
-            yield tuple(group), self._settle_alone(group[0], scene.support) if alone else settle(group, scene.support, config)
+            yield (
+                tuple(group),
+                self._settle_alone(group[0], scene.support)
+                if alone
+                else settle(group, scene.support, config),
+            )
 
     def _settle_alone(self, single: SceneObject, support: Support) -> Settled:
         """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
@@ -59,7 +69,9 @@ class DrakeJudge:
             self._singles[key] = settle([centred], support, self._config.settle)
         settled = self._singles[key]
         (pose,) = settled.poses.values()
-        instability = replace(settled.instability, object=single.name) if settled.instability else None
+        instability = (
+            replace(settled.instability, object=single.name) if settled.instability else None
+        )
         return Settled(instability, {single.name: pose.moved((x, y, 0.0))}, ())
 
     def look(self, scene: Scene) -> Verdict:

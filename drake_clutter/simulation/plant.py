@@ -49,15 +49,25 @@ class ScenePlant:
     def set_poses(self, context: Context, objects: Sequence[SceneObject]) -> None:
         """Puts the objects at their X_TO, in the plant's context; velocities are untouched."""
         for scene_object in objects:
-            self.plant.SetFreeBodyPose(context, self.bodies[scene_object.name], rigid_transform(scene_object.X_TO))
+            self.plant.SetFreeBodyPose(
+                context, self.bodies[scene_object.name], rigid_transform(scene_object.X_TO)
+            )
 
     def poses(self, context: Context, names: Iterable[str] | None = None) -> dict[str, Pose]:
         """X_TO of all objects, or of those that are named, by name; from the plant's context."""
-        return {n: pose_of(self.bodies[n].EvalPoseInWorld(context)) for n in (self.bodies if names is None else names)}
+        return {
+            n: pose_of(self.bodies[n].EvalPoseInWorld(context))
+            for n in (self.bodies if names is None else names)
+        }
 
     def speeds(self, context: Context, names: Iterable[str]) -> dict[str, float]:
         """Speed of the origin of each object that is named, m/s."""
-        return {n: float(np.linalg.norm(self.bodies[n].EvalSpatialVelocityInWorld(context).translational())) for n in names}
+        return {
+            n: float(
+                np.linalg.norm(self.bodies[n].EvalSpatialVelocityInWorld(context).translational())
+            )
+            for n in names
+        }
 
 
 def support_body(plant: MultibodyPlant) -> RigidBody:
@@ -85,7 +95,9 @@ def add_scene_plant(
         jointed: the name of an object that the caller gives a joint.
     """
     config = MultibodyPlantConfig(
-        time_step=time_step, contact_model="hydroelastic_with_fallback", discrete_contact_approximation="lagged"
+        time_step=time_step,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation="lagged",
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
     return populated(plant, scene_graph, objects, support, visuals=visuals, jointed=jointed)
@@ -108,12 +120,21 @@ def populated(
         text = sdf_text(object_class.model_path, visuals=visuals)
         (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
-        if name != jointed and object_class.shape is Shape.CYLINDER and object_class.only_rest is not Rest.UPRIGHT:
+        if (
+            name != jointed
+            and object_class.shape is Shape.CYLINDER
+            and object_class.only_rest is not Rest.UPRIGHT
+        ):
             radius = object_class.size[0] / 2
-            rolling_inertia = 1.5 * object_class.mass * radius**2  # of a solid cylinder about its line of contact
+            rolling_inertia = (
+                1.5 * object_class.mass * radius**2
+            )  # of a solid cylinder about its line of contact
             plant.AddJoint(
                 QuaternionFloatingJoint(
-                    f"{name}_floating", plant.world_frame(), bodies[name].body_frame(), rolling_inertia / ROLLING_STOPS_WITHIN
+                    f"{name}_floating",
+                    plant.world_frame(),
+                    bodies[name].body_frame(),
+                    rolling_inertia / ROLLING_STOPS_WITHIN,
                 )
             )
     return ScenePlant(plant, scene_graph, bodies)

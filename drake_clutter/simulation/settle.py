@@ -36,7 +36,9 @@ class Settled:
     motion: tuple[Frame, ...]
 
 
-def fallen(before: SceneObject, after: Pose, support: Support, config: SettleConfig) -> Instability | None:
+def fallen(
+    before: SceneObject, after: Pose, support: Support, config: SettleConfig
+) -> Instability | None:
     """How an object has fallen that was before, and is now; None if it stayed within the limits."""
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
@@ -53,7 +55,12 @@ def fallen(before: SceneObject, after: Pose, support: Support, config: SettleCon
 
 
 def settle(
-    objects: Sequence[SceneObject], support: Support, config: SettleConfig, *, record: bool = False, follow_falls: bool = False
+    objects: Sequence[SceneObject],
+    support: Support,
+    config: SettleConfig,
+    *,
+    record: bool = False,
+    follow_falls: bool = False,
 ) -> Settled:
     """Simulates objects alone on the tray, from rest where they are.
 
@@ -68,7 +75,13 @@ def settle(
         follow_falls: go on after an object has fallen, until everything is calm or the time is up.
     """
     builder = DiagramBuilder()
-    scene_plant = add_scene_plant(builder, [(o.name, o.object_class) for o in objects], support, config.time_step, visuals=False)
+    scene_plant = add_scene_plant(
+        builder,
+        [(o.name, o.object_class) for o in objects],
+        support,
+        config.time_step,
+        visuals=False,
+    )
     scene_plant.plant.Finalize()
     simulator = Simulator(builder.Build())
     context = scene_plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -93,7 +106,11 @@ def settle(
             motion.append(Frame(sample * SAMPLE_PERIOD, poses))
         # Every second time: by then what topples has turned so far that it is not taken for something that slides.
         if instability is None and (sample % 2 == 0 or sample == last):
-            gone = [found for o in objects if (found := fallen(o, poses[o.name], support, config)) is not None]
+            gone = [
+                found
+                for o in objects
+                if (found := fallen(o, poses[o.name], support, config)) is not None
+            ]
             instability = max(gone, key=lambda f: f.displacement, default=None)
             if instability is not None and not follow_falls:
                 return Settled(instability, poses, tuple(motion))
@@ -101,25 +118,35 @@ def settle(
         calm = all(
             speeds[o.name] < config.calm_speed
             and _distance(poses[o.name], reference[o.name]) < config.calm_displacement
-            and tilt_between(o.object_class, reference[o.name], poses[o.name]) < math.radians(config.calm_tilt_deg)
+            and tilt_between(o.object_class, reference[o.name], poses[o.name])
+            < math.radians(config.calm_tilt_deg)
             for o in objects
         )
         calm_samples = calm_samples + 1 if calm else 0
         if calm_samples >= config.calm_samples and (instability or not may_creep):
             return Settled(instability, poses, tuple(motion))
-        if sample % 2 == 0 and len(history) > still_samples and _still(objects, history[-1 - still_samples :], config):
+        if (
+            sample % 2 == 0
+            and len(history) > still_samples
+            and _still(objects, history[-1 - still_samples :], config)
+        ):
             return Settled(instability, poses, tuple(motion))
     if instability is None:
-        instability = _still_moving(objects, poses, history[max(0, len(history) - 1 - REST_SAMPLES)], config)
+        instability = _still_moving(
+            objects, poses, history[max(0, len(history) - 1 - REST_SAMPLES)], config
+        )
     return Settled(instability, poses, tuple(motion))
 
 
-def _still(objects: Sequence[SceneObject], history: Sequence[dict[str, Pose]], config: SettleConfig) -> bool:
+def _still(
+    objects: Sequence[SceneObject], history: Sequence[dict[str, Pose]], config: SettleConfig
+) -> bool:
     """Whether all objects have been close to where they are now."""
     *earlier, now = history
     return all(
         _distance(poses[o.name], now[o.name]) < config.still_displacement
-        and tilt_between(o.object_class, poses[o.name], now[o.name]) < math.radians(config.calm_tilt_deg)
+        and tilt_between(o.object_class, poses[o.name], now[o.name])
+        < math.radians(config.calm_tilt_deg)
         for poses in earlier
         for o in objects
     )
@@ -130,7 +157,10 @@ def _distance(X_TA: Pose, X_TB: Pose) -> float:
 
 
 def _still_moving(
-    objects: Sequence[SceneObject], poses: dict[str, Pose], earlier: dict[str, Pose], config: SettleConfig
+    objects: Sequence[SceneObject],
+    poses: dict[str, Pose],
+    earlier: dict[str, Pose],
+    config: SettleConfig,
 ) -> Instability | None:
     """The object that went furthest since the earlier poses, if further than the config allows one at rest."""
     furthest = max(objects, key=lambda o: _distance(poses[o.name], earlier[o.name]))
@@ -138,7 +168,9 @@ def _still_moving(
     if _distance(pose, earlier[furthest.name]) <= config.rest_drift:
         return None
     tilt = tilt_between(furthest.object_class, furthest.X_TO, pose)
-    return Instability(InstabilityReason.NOT_AT_REST, furthest.name, _distance(pose, furthest.X_TO), tilt)
+    return Instability(
+        InstabilityReason.NOT_AT_REST, furthest.name, _distance(pose, furthest.X_TO), tilt
+    )
 
 
 def _may_creep(objects: Sequence[SceneObject]) -> bool:

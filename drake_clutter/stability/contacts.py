@@ -30,7 +30,9 @@ def _clip(polygon, count, x, y, nx, ny, room):  # type: ignore[no-untyped-def]
         if (here < 0 < there or there < 0 < here) and found < len(kept):
             share = here / (here - there)
             for axis in range(2):
-                kept[found, axis] = polygon[k, axis] + share * (polygon[after, axis] - polygon[k, axis])
+                kept[found, axis] = polygon[k, axis] + share * (
+                    polygon[after, axis] - polygon[k, axis]
+                )
             found += 1
     for k in range(found):
         polygon[k, 0], polygon[k, 1] = kept[k, 0], kept[k, 1]
@@ -52,7 +54,9 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
         after = (k + 1) % other_count
         ex, ey = other[after, 0] - other[k, 0], other[after, 1] - other[k, 1]
         length = np.hypot(ex, ey)
-        count = _clip(polygon, count, other[k, 0] + dx, other[k, 1] + dy, ey / length, -ex / length, -margin)
+        count = _clip(
+            polygon, count, other[k, 0] + dx, other[k, 1] + dy, ey / length, -ex / length, -margin
+        )
         if count == 0:
             return 0
     return count
@@ -73,7 +77,11 @@ def contact_polygon(posed, lower_shape, upper_shape, lower_p, upper_p, margin): 
     count = _clip_to(polygon, 4, bottom, corners, upper_p[0], upper_p[1], margin)
     if lower_shape >= 0:
         top, corners = posed[lower_shape].top, posed[lower_shape].top_count
-        count = _clip_to(polygon, count, top, corners, lower_p[0], lower_p[1], margin) if corners > 0 else 0
+        count = (
+            _clip_to(polygon, count, top, corners, lower_p[0], lower_p[1], margin)
+            if corners > 0
+            else 0
+        )
     return polygon[:count]
 
 
@@ -113,7 +121,15 @@ def free_top(posed, shape, above, p_T, above_p, margin):  # type: ignore[no-unty
         length = np.hypot(ex, ey)
         polygon = np.zeros((48, 2))
         polygon[:count] = top[:count] + p_T[:2]
-        beyond = _clip(polygon, count, outline[k, 0] + above_p[0], outline[k, 1] + above_p[1], -ey / length, ex / length, -margin)
+        beyond = _clip(
+            polygon,
+            count,
+            outline[k, 0] + above_p[0],
+            outline[k, 1] + above_p[1],
+            -ey / length,
+            ex / length,
+            -margin,
+        )
         found = np.vstack((found, polygon[:beyond]))
     return found
 
@@ -166,7 +182,13 @@ def find_contacts(posed, shapes, p_T, half_size):  # type: ignore[no-untyped-def
         if posed[shape].fault != 0:
             return LEANING if posed[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
         for axis in range(2):
-            beyond = max(posed[shape].upper[axis] + p_T[j, axis], -posed[shape].lower[axis] - p_T[j, axis]) - half_size[axis]
+            beyond = (
+                max(
+                    posed[shape].upper[axis] + p_T[j, axis],
+                    -posed[shape].lower[axis] - p_T[j, axis],
+                )
+                - half_size[axis]
+            )
             if beyond > DEEPEST:
                 return OUTSIDE, j, pairs[:0], stack
     for j in range(n):
@@ -198,7 +220,9 @@ def find_contacts(posed, shapes, p_T, half_size):  # type: ignore[no-untyped-def
             above |= deep > 0
             if deep <= 0:
                 continue
-            whole = posed[upper].flat and posed[lower].flat  # what overlaps seen from above is in contact
+            whole = (
+                posed[upper].flat and posed[lower].flat
+            )  # what overlaps seen from above is in contact
             if whole or len(contact_polygon(posed, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1

@@ -36,7 +36,10 @@ def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
         (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
     """
     n = len(shapes)
-    at, ends = np.empty((48 * len(pairs) + len(loads), 3)), np.empty((48 * len(pairs) + len(loads), 2), np.int64)
+    at, ends = (
+        np.empty((48 * len(pairs) + len(loads), 3)),
+        np.empty((48 * len(pairs) + len(loads), 2), np.int64),
+    )
     count = 0
     for load in loads:
         at[count] = load[:3]
@@ -45,7 +48,9 @@ def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
     for c in range(len(pairs)):
         lower, upper = pairs[c]
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
-        polygon = contact_polygon(posed, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper])
+        polygon = contact_polygon(
+            posed, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper]
+        )
         for k in range(len(polygon)):
             at[count, 0], at[count, 1] = polygon[k, 0], polygon[k, 1]
             at[count, 2] = p_T[upper, 2] + posed[shapes[upper]].low
@@ -55,7 +60,10 @@ def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
     for i in range(n):
         total += posed[shapes[i]].mass
     rows, sides = (6, 4) if friction > 0 else (3, 1)
-    A, b = np.zeros((sides * count, rows * n)), np.zeros(rows * n)  # a row of A is a column of the problem
+    A, b = (
+        np.zeros((sides * count, rows * n)),
+        np.zeros(rows * n),
+    )  # a row of A is a column of the problem
     for i in range(n):
         b[rows * i] = posed[shapes[i]].mass / total
     for k in range(count):
@@ -149,7 +157,9 @@ def weakest(posed, shapes, p_T, pairs, margin, friction):  # type: ignore[no-unt
     if rest.max() > 0:
         needed = friction
         if residuals(posed, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
-            return np.nonzero(rest > rest.max() - 1e-9)[0][0], False  # of twins the first, whatever rounding says
+            return np.nonzero(rest > rest.max() - 1e-9)[0][
+                0
+            ], False  # of twins the first, whatever rounding says
     for lower, upper in pairs:
         if lower >= 0 and posed[shapes[lower]].rolls:
             line = posed[shapes[lower]].top[1] - posed[shapes[lower]].top[0]
@@ -183,7 +193,11 @@ def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
         if stack[i] < 0:
             continue
         key[i, 0], key[i, 2] = stack[i], shapes[i]
-        key[i, 1], key[i, 3], key[i, 4] = np.rint(p_T[i, 2] / grid), np.rint(p_T[i, 0] / grid), np.rint(p_T[i, 1] / grid)
+        key[i, 1], key[i, 3], key[i, 4] = (
+            np.rint(p_T[i, 2] / grid),
+            np.rint(p_T[i, 0] / grid),
+            np.rint(p_T[i, 1] / grid),
+        )
         at = count
         while at > 0:
             before = order[at - 1]
@@ -229,5 +243,7 @@ def weakest_each(posed, shapes, p_T, pairs, order, first, chosen, margin, fricti
             if position[lower] != -2 and position[upper] != -2:
                 within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
                 contacts += 1
-        found[k, 0], found[k, 1] = weakest(posed, shapes[rows], p_T[rows], within[:contacts], margin, friction)
+        found[k, 0], found[k, 1] = weakest(
+            posed, shapes[rows], p_T[rows], within[:contacts], margin, friction
+        )
     return found

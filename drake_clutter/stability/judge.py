@@ -8,7 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Instability, InstabilityReason, Verdict
+from drake_clutter.scenes.interfaces import (
+    CannotJudge,
+    CannotJudgeReason,
+    Instability,
+    InstabilityReason,
+    Verdict,
+)
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, random_offsets
 from drake_clutter.stability import contacts, equilibrium
 from drake_clutter.stability.shapes import Floats, Ints, Shapes
@@ -56,7 +62,9 @@ class FastJudge:
     remembered by stack, wherever it stands on the tray: after a change, only the stacks that changed are judged again.
     """
 
-    def __init__(self, config: ClutterConfig, margin: float | None = None, friction: float = FRICTION) -> None:
+    def __init__(
+        self, config: ClutterConfig, margin: float | None = None, friction: float = FRICTION
+    ) -> None:
         """Makes a judge.
 
         Args:
@@ -65,7 +73,10 @@ class FastJudge:
             friction: coefficient that is relied on.
         """
         self._config = config
-        self._margin, self._friction = 2 * config.settle.jitter + _ROUNDING if margin is None else margin, friction
+        self._margin, self._friction = (
+            2 * config.settle.jitter + _ROUNDING if margin is None else margin,
+            friction,
+        )
         self._shapes = Shapes()
         self.rays = RayCaster(config.cell.camera, self._shapes)
         self._known: dict[bytes, tuple[int, int]] = {}  # see `_weakest`
@@ -78,18 +89,25 @@ class FastJudge:
         if isinstance(found, CannotJudge):
             return found
         moved = p_T + random_offsets(len(p_T), self._config.settle.jitter, rng)
-        settled = {o.name: Pose((x, y, z), o.X_TO.quaternion) for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)}
+        settled = {
+            o.name: Pose((x, y, z), o.X_TO.quaternion)
+            for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)
+        }
         if found is not None:
             return Verdict(found, settled, {}, ())
         shares = dict(zip(settled, self.rays.shares(shapes, moved), strict=True))
         below = self._config.cell.camera.visibility_threshold
-        return Verdict(None, settled, shares, tuple(name for name, share in shares.items() if share < below))
+        return Verdict(
+            None, settled, shares, tuple(name for name, share in shares.items() if share < below)
+        )
 
     def stability(self, scene: Scene) -> Instability | CannotJudge | None:
         """What does not stand, or None if everything does."""
         return self._stability(scene, *self._arrays(scene.objects))
 
-    def _stability(self, scene: Scene, shapes: Ints, p_T: Floats) -> Instability | CannotJudge | None:
+    def _stability(
+        self, scene: Scene, shapes: Ints, p_T: Floats
+    ) -> Instability | CannotJudge | None:
         standing = self._standing(scene, shapes, p_T)
         if isinstance(standing, CannotJudge):
             if standing.reason is CannotJudgeReason.UNSUPPORTED:
@@ -119,7 +137,9 @@ class FastJudge:
         """
         scene[name]
         shapes, p_T = self._arrays(scene.objects)
-        reached = contacts.touching(self._shapes.table.posed, shapes, p_T, scene.names.index(name), _TOUCHING)
+        reached = contacts.touching(
+            self._shapes.table.posed, shapes, p_T, scene.names.index(name), _TOUCHING
+        )
         return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
 
     def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
@@ -139,7 +159,11 @@ class FastJudge:
         left = [row for row in np.flatnonzero(stack == stack[taken]).tolist() if row != taken]
         fallen = []
         while left:
-            carried = {upper for lower, upper in pairs.tolist() if upper in left and (lower in left or lower < 0)}
+            carried = {
+                upper
+                for lower, upper in pairs.tolist()
+                if upper in left and (lower in left or lower < 0)
+            }
             unsupported = [row for row in left if row not in carried]
             if not unsupported:
                 ((weakest, _),) = self._weakest(standing, _only(left, len(shapes)))
@@ -170,7 +194,14 @@ class FastJudge:
                 margin[own] = (low + high) / 2
                 aside = np.zeros((len(rows), 2))
                 rest = equilibrium.residuals(
-                    self._shapes.table.posed, shapes[rows], p_T[rows], members, margin, aside, 0.0, equilibrium.NO_LOADS
+                    self._shapes.table.posed,
+                    shapes[rows],
+                    p_T[rows],
+                    members,
+                    margin,
+                    aside,
+                    0.0,
+                    equilibrium.NO_LOADS,
                 )
                 low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
             found[scene_object.name] = round((low + high) / 2 / _MARGIN_STEP) * _MARGIN_STEP
@@ -200,7 +231,8 @@ class FastJudge:
             return False
 
         return all(
-            taken_apart(frozenset(np.flatnonzero(standing.stack == stack).tolist())) for stack in set(standing.stack.tolist())
+            taken_apart(frozenset(np.flatnonzero(standing.stack == stack).tolist()))
+            for stack in set(standing.stack.tolist())
         )
 
     def never_movable(self, scene: Scene) -> frozenset[str] | CannotJudge:
@@ -216,16 +248,26 @@ class FastJudge:
         shapes, p_T, pairs, _ = standing
         fixed = set(range(len(shapes)))
         while True:
-            free = [row for row in sorted(fixed) if self._could_be_taken(shapes, p_T, pairs, fixed, row)]
+            free = [
+                row for row in sorted(fixed) if self._could_be_taken(shapes, p_T, pairs, fixed, row)
+            ]
             if not free:
                 return frozenset(scene.objects[row].name for row in fixed)
             fixed -= set(free)
 
-    def _could_be_taken(self, shapes: Ints, p_T: Floats, pairs: Ints, fixed: set[int], taken: int) -> bool:
+    def _could_be_taken(
+        self, shapes: Ints, p_T: Floats, pairs: Ints, fixed: set[int], taken: int
+    ) -> bool:
         """Whether the rest of the fixed objects could stand without one of them, what is not fixed helping."""
         stack = {taken}
         while True:  # all fixed objects that it is in contact with, directly or not
-            more = {row for pair in pairs.tolist() if stack & set(pair) - {contacts.GROUND} for row in pair if row in fixed}
+            more = {
+                row
+                for pair in pairs.tolist()
+                if stack & set(pair) - {contacts.GROUND}
+                for row in pair
+                if row in fixed
+            }
             if more <= stack:
                 break
             stack |= more
@@ -235,11 +277,17 @@ class FastJudge:
         posed = self._shapes.table.posed
         # What is not fixed holds like the ground does while it is there.
         number = {row: k for k, row in enumerate(rest)}
-        held = [(number.get(a, contacts.GROUND), number[b]) for a, b in pairs.tolist() if b in number and a != taken]
+        held = [
+            (number.get(a, contacts.GROUND), number[b])
+            for a, b in pairs.tolist()
+            if b in number and a != taken
+        ]
         loads = [
             (x, y, p_T[row, 2] + posed[shapes[row]]["high"], number[row])
             for row in rest
-            for x, y in contacts.free_top(posed, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin)
+            for x, y in contacts.free_top(
+                posed, shapes[row], shapes[taken], p_T[row], p_T[taken], self._margin
+            )
         ]
         residuals = equilibrium.residuals(
             posed,
@@ -255,7 +303,9 @@ class FastJudge:
 
     def _standing(self, scene: Scene, shapes: Ints, p_T: Floats) -> "_Standing | CannotJudge":
         """Who stands on whom, if all objects are within the model."""
-        fault, culprit, pairs, stack = contacts.find_contacts(self._shapes.table.posed, shapes, p_T, scene.support.half_size)
+        fault, culprit, pairs, stack = contacts.find_contacts(
+            self._shapes.table.posed, shapes, p_T, scene.support.half_size
+        )
         if fault != contacts.SOUND:
             return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
         return _Standing(shapes, p_T, pairs, stack)
@@ -272,16 +322,25 @@ class FastJudge:
 
         `stack`: its number for each object; objects of stack -1 are not there.
         """
-        order, first, described = equilibrium.canonical_order(standing.shapes, standing.p_T, stack, _GRID)
+        order, first, described = equilibrium.canonical_order(
+            standing.shapes, standing.p_T, stack, _GRID
+        )
         rows, starts, content = order.tolist(), first.tolist(), described.tobytes()
         keys = [content[start * _ROW : end * _ROW] for start, end in itertools.pairwise(starts)]
         unknown = [k for k, key in enumerate(keys) if key not in self._known]
         if unknown:
             table, options = self._shapes.table.posed, (self._margin, self._friction)
-            found = equilibrium.weakest_each(table, *standing[:3], order, first, np.array(unknown), *options)
-            self._known.update(zip((keys[k] for k in unknown), map(tuple, found.tolist()), strict=True))
+            found = equilibrium.weakest_each(
+                table, *standing[:3], order, first, np.array(unknown), *options
+            )
+            self._known.update(
+                zip((keys[k] for k in unknown), map(tuple, found.tolist()), strict=True)
+            )
         answers = [self._known[key] for key in keys]
-        return [(rows[start + at] if at >= 0 else -1, bool(rolls)) for start, (at, rolls) in zip(starts, answers, strict=False)]
+        return [
+            (rows[start + at] if at >= 0 else -1, bool(rolls))
+            for start, (at, rolls) in zip(starts, answers, strict=False)
+        ]
 
 
 def _only(rows: Iterable[int], count: int) -> Ints:
@@ -294,5 +353,7 @@ def _only(rows: Iterable[int], count: int) -> Ints:
 def _within(pairs: Ints, rows: list[int]) -> Ints:
     """The contacts among the rows and with the tray, with the rows numbered as they stand in the list."""
     number = {row: k for k, row in enumerate(rows)} | {contacts.GROUND: contacts.GROUND}
-    chosen = [(number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0]
+    chosen = [
+        (number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0
+    ]
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)

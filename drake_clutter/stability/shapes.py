@@ -65,7 +65,9 @@ def _hull_surface(corners: Floats) -> _Surface:
     member = np.full(len(planes), -1)
     for triangle in range(len(planes)):
         if member[triangle] < 0:
-            member[(np.abs(planes - planes[triangle]).max(axis=1) < _SAME_PLANE) & (member < 0)] = triangle
+            member[(np.abs(planes - planes[triangle]).max(axis=1) < _SAME_PLANE) & (member < 0)] = (
+                triangle
+            )
     faces, normals = [], []
     for index in np.unique(member):
         triangles = np.flatnonzero(member == index)
@@ -80,7 +82,9 @@ def _hull_surface(corners: Floats) -> _Surface:
     triangles = corners[hull.simplices] - inner
     volumes = np.abs(np.linalg.det(triangles))
     p_Ocm = inner + (volumes[:, None] * triangles.sum(axis=1)).sum(axis=0) / (4 * volumes.sum())
-    return _Surface(np.vstack(faces), np.array([len(face) for face in faces]), np.array(normals), p_Ocm)
+    return _Surface(
+        np.vstack(faces), np.array([len(face) for face in faces]), np.array(normals), p_Ocm
+    )
 
 
 def _ring(radius: float, z: float, sides: int) -> Floats:
@@ -138,12 +142,17 @@ def pose(object_class: ObjectClass, quaternion: Sequence[float]) -> Posed:
     if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(LEVEL_WITHIN):
         rolls = True
         up = np.array([0.0, 0.0, object_class.size[0] / 2])
-        axis, aside = object_class.size[2] / 2 * R_TO[:, 2], STRIP * np.cross([0.0, 0.0, 1.0], R_TO[:, 2])
+        axis, aside = (
+            object_class.size[2] / 2 * R_TO[:, 2],
+            STRIP * np.cross([0.0, 0.0, 1.0], R_TO[:, 2]),
+        )
         top = np.array([axis, -axis]) + up
         bottom = np.array([axis + aside, aside - axis, -axis - aside, axis - aside]) - up
     else:
         level = np.flatnonzero(np.abs(normal[:, 2]) > np.cos(LEVEL_WITHIN))
-        faces = {face: corner[surface.counts[:face].sum() :][: surface.counts[face]] for face in level}
+        faces = {
+            face: corner[surface.counts[:face].sum() :][: surface.counts[face]] for face in level
+        }
         below = [face for face in faces if normal[face, 2] < 0]
         above = [face for face in faces if normal[face, 2] > 0]
         bottom = faces[max(below, key=lambda face: _area(faces[face]))] if below else none
@@ -220,7 +229,12 @@ class Table(NamedTuple):
 
 
 def _room(rows: int, faces: int, corners: int) -> Table:
-    return Table(np.zeros(rows, POSED), np.zeros(faces + 1, np.int64), np.zeros((faces, 3)), np.zeros((corners, 3)))
+    return Table(
+        np.zeros(rows, POSED),
+        np.zeros(faces + 1, np.int64),
+        np.zeros((faces, 3)),
+        np.zeros((corners, 3)),
+    )
 
 
 class Shapes:
@@ -246,12 +260,16 @@ class Shapes:
             self.generation += 1
         known = self._row
         try:
-            return np.array([known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64)
+            return np.array(
+                [known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
+            )
         except KeyError:
             for o in objects:
                 if (o.object_class, o.X_TO.quaternion) not in known:
                     self._add(o)
-            return np.array([known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64)
+            return np.array(
+                [known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
+            )
 
     def arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
         """The table's row of each object (n,), and p_TO (n, 3) m."""
@@ -262,23 +280,49 @@ class Shapes:
         row = len(self._row)
         face = int(self.table.posed["last_face"].max())
         corner = self.table.first_corner[face]
-        last_face, last_corner = face + len(shape.surface.counts), corner + len(shape.surface.corner)
-        if row >= len(self.table.posed) or last_face >= len(self.table.normal) or last_corner > len(self.table.corner):
+        last_face, last_corner = (
+            face + len(shape.surface.counts),
+            corner + len(shape.surface.corner),
+        )
+        if (
+            row >= len(self.table.posed)
+            or last_face >= len(self.table.normal)
+            or last_corner > len(self.table.corner)
+        ):
             old = self.table
-            self.table = _room(2 * len(old.posed), 2 * max(last_face + 1, len(old.normal)), 2 * max(last_corner, len(old.corner)))
+            self.table = _room(
+                2 * len(old.posed),
+                2 * max(last_face + 1, len(old.normal)),
+                2 * max(last_corner, len(old.corner)),
+            )
             for array, earlier in zip(self.table, old, strict=True):
                 array[: len(earlier)] = earlier
         table, posed = self.table, self.table.posed[row]
         posed["fault"], posed["rolls"], posed["com"] = shape.fault, shape.rolls, shape.com
         posed["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
-        posed["lower"], posed["upper"] = shape.surface.corner.min(axis=0), shape.surface.corner.max(axis=0)
-        posed["low"], posed["high"], posed["mass"] = shape.low, shape.high, scene_object.object_class.mass
+        posed["lower"], posed["upper"] = (
+            shape.surface.corner.min(axis=0),
+            shape.surface.corner.max(axis=0),
+        )
+        posed["low"], posed["high"], posed["mass"] = (
+            shape.low,
+            shape.high,
+            scene_object.object_class.mass,
+        )
         posed["reach"] = np.linalg.norm(shape.footprint, axis=1).max()
-        for name, corners in (("bottom", shape.bottom), ("top", shape.top), ("footprint", shape.footprint)):
+        for name, corners in (
+            ("bottom", shape.bottom),
+            ("top", shape.top),
+            ("footprint", shape.footprint),
+        ):
             posed[name][: len(corners)], posed[f"{name}_count"] = corners, len(corners)
         along = np.roll(shape.footprint, -1, axis=0) - shape.footprint
-        normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
-        posed["sides"][: len(normal)] = np.column_stack([normal, (normal * shape.footprint).sum(axis=1)])
+        normal = (
+            np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+        )
+        posed["sides"][: len(normal)] = np.column_stack(
+            [normal, (normal * shape.footprint).sum(axis=1)]
+        )
         posed["first_face"], posed["last_face"] = face, last_face
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal

@@ -44,13 +44,20 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
     eye = camera.p_TC
     p_x, p_y, p_z = turned_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
-    begin, end = np.zeros(height, np.int64), np.zeros(height, np.int64)  # columns of a face, row by row
+    begin, end = (
+        np.zeros(height, np.int64),
+        np.zeros(height, np.int64),
+    )  # columns of a face, row by row
     rays = 0
     for face in range(table.posed[shape].first_face, table.posed[shape].last_face):
         first, last = table.first_corner[face], table.first_corner[face + 1]
         nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
         corner = table.corner[first]
-        k = nx * (corner[0] + p_TO[0] - eye[0]) + ny * (corner[1] + p_TO[1] - eye[1]) + nz * (corner[2] + p_TO[2] - eye[2])
+        k = (
+            nx * (corner[0] + p_TO[0] - eye[0])
+            + ny * (corner[1] + p_TO[1] - eye[1])
+            + nz * (corner[2] + p_TO[2] - eye[2])
+        )
         if k > -1e-9:
             continue  # turned away from the camera
         count = last - first
@@ -58,7 +65,12 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
             u, v = np.empty(count), np.empty(count)
         top, bottom = np.inf, -np.inf
         for c in range(count):
-            x, y, z = in_camera(camera, table.corner[first + c, 0], table.corner[first + c, 1], table.corner[first + c, 2])
+            x, y, z = in_camera(
+                camera,
+                table.corner[first + c, 0],
+                table.corner[first + c, 1],
+                table.corner[first + c, 2],
+            )
             u[c], v[c] = project(camera, x + p_x, y + p_y, z + p_z)
             top, bottom = min(top, v[c]), max(bottom, v[c])
         # Inverse depth: its slope along a row and down a column, and its value at pixel (0, 0).
@@ -69,7 +81,10 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
             # Downwards, and so the same for both faces at an edge: no ray is counted twice or lost.
             leftmost = v[c] < v[d]
             a, b = (c, d) if leftmost else (d, c)
-            first_below, last_below = max(first_row, math.ceil(v[a])), min(last_row + 1, math.ceil(v[b]))
+            first_below, last_below = (
+                max(first_row, math.ceil(v[a])),
+                min(last_row + 1, math.ceil(v[b])),
+            )
             if first_below >= last_below:
                 continue
             slope = (u[b] - u[a]) / (v[b] - v[a])
@@ -83,7 +98,10 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
             rays += last_column - first_column
             inverse, step = np.float32(start + down * row + along * first_column), np.float32(along)
             # Both are always written, and counted from 0, so that the compiler can do several pixels at a time.
-            nearest_here, hit_here = nearest[row, first_column:last_column], hit[row, first_column:last_column]
+            nearest_here, hit_here = (
+                nearest[row, first_column:last_column],
+                hit[row, first_column:last_column],
+            )
             for k in range(last_column - first_column):
                 value = inverse + step * np.float32(k)
                 nearer = value > nearest_here[k]
@@ -169,7 +187,9 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
         for row in range(windows[i, 0], windows[i, 1]):
             in_row, here = np.int16(0), hit[row, windows[i, 2] : windows[i, 3]]
             for k in range(len(here)):
-                in_row = np.int16(in_row + (here[k] == label))  # 16 bits wide: more pixels at a time
+                in_row = np.int16(
+                    in_row + (here[k] == label)
+                )  # 16 bits wide: more pixels at a time
             total += int(in_row)
         seen[i] = total
     return min(row_begin, row_end), row_end, min(column_begin, column_end), column_end
@@ -190,7 +210,12 @@ def _cover(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
         other = _window(table.posed[shapes[i]], p_T[i], camera, hit.shape)
-        apart = other[0] >= window[1] or window[0] >= other[1] or other[2] >= window[3] or window[2] >= other[3]
+        apart = (
+            other[0] >= window[1]
+            or window[0] >= other[1]
+            or other[2] >= window[3]
+            or window[2] >= other[3]
+        )
         if i == target or apart:
             continue
         _cast_at(table, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
@@ -250,12 +275,17 @@ class RayCaster:
         """
         scene[name]
         if len(scene.objects) > _MOST_COVERED:
-            raise ValueError(f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most")
+            raise ValueError(
+                f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most"
+            )
         shapes, p_T = self._shapes.arrays(scene.objects)
         arguments = (self._shapes.table, shapes, p_T, self._pinhole, scene.names.index(name))
         sets, counts = np.unique(_cover(*arguments, self._nearest, self._hit), return_counts=True)
         names = scene.names
-        members = [frozenset(names[i] for i in range(len(names)) if bits >> i & 1) for bits in sets.tolist()]
+        members = [
+            frozenset(names[i] for i in range(len(names)) if bits >> i & 1)
+            for bits in sets.tolist()
+        ]
         return dict(zip(members, counts.tolist(), strict=True))
 
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
@@ -267,6 +297,9 @@ class RayCaster:
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))
-            if share >= self.config.visibility_threshold and (mask := self._mask(index, rectangle)).any()
+            if share >= self.config.visibility_threshold
+            and (mask := self._mask(index, rectangle)).any()
         )
-        return Observation(depth, detections, self.config, scene.support), dict(zip(scene.names, shares, strict=True))
+        return Observation(depth, detections, self.config, scene.support), dict(
+            zip(scene.names, shares, strict=True)
+        )

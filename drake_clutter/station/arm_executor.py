@@ -42,7 +42,9 @@ class ArmExecutor:
     def planner(self, support: Support) -> PickPlacePlanner:
         """For a tray; kept."""
         if self._planner is None or self._planner.cell.support != support:
-            self._planner = PickPlacePlanner(self._config.cell.with_support(support), self._planner_config)
+            self._planner = PickPlacePlanner(
+                self._config.cell.with_support(support), self._planner_config
+            )
         return self._planner
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
@@ -57,7 +59,9 @@ class ArmExecutor:
         return replace(outcome, motion=done.motion, detail=str(done))
 
 
-def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: bool, config: SettleConfig) -> Outcome:
+def judged(
+    before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: bool, config: SettleConfig
+) -> Outcome:
     """What a motion of the arm has led to: what it touched is settled, and everything compared with where it should be.
 
     Args:
@@ -71,7 +75,11 @@ def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: b
     others = [o for o in put.objects if o.name != pick or not dropped]
     instability = worst_fall(others, after, config)
     if instability is None and not dropped:
-        moved = {o.name for o in before.objects if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED} | {pick}
+        moved = {
+            o.name
+            for o in before.objects
+            if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED
+        } | {pick}
         for group in touching_groups(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):
                 after = after.at(settle(group, before.support, config).poses)
@@ -82,7 +90,9 @@ def judged(before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: b
     return Outcome(result, after, instability, released=X_TO_place)
 
 
-def worst_fall(before: Sequence[SceneObject], after: Scene, config: SettleConfig) -> Instability | None:
+def worst_fall(
+    before: Sequence[SceneObject], after: Scene, config: SettleConfig
+) -> Instability | None:
     """Of the objects that did not stay where they were, the one that went furthest."""
     found = [fall for o in before if (fall := fallen(o, after[o.name].X_TO, after.support, config))]
     return max(found, key=lambda fall: fall.displacement, default=None)

@@ -43,7 +43,9 @@ def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str
     picked = nearest(objects, plan.X_TO_pick)
     X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
     lowered = np.linspace(0.0, plan.depth, math.ceil(plan.depth / _DESCENT_STEP) + 1)
-    placed = [replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()]
+    placed = [
+        replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()
+    ]
     groups = touching_groups(objects, TOUCHING_MARGIN)
 
     def near(ends: Sequence[SceneObject]) -> set[str]:
@@ -57,7 +59,9 @@ def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str
     return near([picked]), near(placed)
 
 
-def bodies_to_wake(schedule: CommandSchedule, at_pick: Set[str], at_place: Set[str], time: float) -> set[str]:
+def bodies_to_wake(
+    schedule: CommandSchedule, at_pick: Set[str], at_place: Set[str], time: float
+) -> set[str]:
     """Return the names of what may move at a time since a plan began [s].
 
     Args:
@@ -101,7 +105,9 @@ class BodySleepManager:
         self._locked_filter = None
         self._lock_all_but(root, self.awake)
 
-    def update(self, root: Context, wanted: Set[str], grasp: GraspStatus, *, must_hold: bool) -> None:
+    def update(
+        self, root: Context, wanted: Set[str], grasp: GraspStatus, *, must_hold: bool
+    ) -> None:
         """Wake what is wanted, what is held, and what still moves; lock the rest.
 
         Args:
@@ -159,7 +165,9 @@ class BodySleepManager:
                 plant.SetVelocities(context, velocities)
                 joint.Lock(context)
         scene_graph = station.scene.scene_graph
-        filters = scene_graph.collision_filter_manager(scene_graph.GetMyMutableContextFromRoot(root))
+        filters = scene_graph.collision_filter_manager(
+            scene_graph.GetMyMutableContextFromRoot(root)
+        )
         before = self._locked_filter
         self._locked_filter = filters.ApplyTransient(
             CollisionFilterDeclaration().ExcludeBetween(locked, fixed).ExcludeWithin(locked)

@@ -85,7 +85,9 @@ class ClutterStation(Diagram):
         self.cell, self.classes, self.time_step = cell, dict(objects), time_step
         self._jointed = jointed
         builder = DiagramBuilder()
-        self.scene: ScenePlant = add_scene_plant(builder, objects, cell.support, time_step, visuals=False, jointed=jointed)
+        self.scene: ScenePlant = add_scene_plant(
+            builder, objects, cell.support, time_step, visuals=False, jointed=jointed
+        )
         self.plant = plant = self.scene.plant
         graph = self.scene.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
@@ -103,7 +105,9 @@ class ClutterStation(Diagram):
         num_joints = len(self.arm.joints)
         command = builder.AddSystem(Demultiplexer(np.array([2 * num_joints, num_joints])))
         builder.ExportInput(command.get_input_port(), "command")
-        builder.Connect(command.get_output_port(0), plant.get_desired_state_input_port(self.arm.robot))
+        builder.Connect(
+            command.get_output_port(0), plant.get_desired_state_input_port(self.arm.robot)
+        )
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
@@ -111,18 +115,27 @@ class ClutterStation(Diagram):
         self.camera_scene_graph = self._add_camera_geometry(builder, objects) if visuals else None
         builder.BuildInto(self)
 
-    def _add_camera_geometry(self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]]) -> SceneGraph:
+    def _add_camera_geometry(
+        self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]]
+    ) -> SceneGraph:
         """Add the geometry that cameras see.
 
         It is that of a twin of the plant, which is never simulated, in the plant's state.
         """
-        twin, seen = MultibodyPlant(self.time_step), builder.AddNamedSystem("camera_scene_graph", SceneGraph())
+        twin, seen = (
+            MultibodyPlant(self.time_step),
+            builder.AddNamedSystem("camera_scene_graph", SceneGraph()),
+        )
         twin.RegisterAsSourceForSceneGraph(seen)
-        bodies = populated(twin, seen, objects, self.cell.support, visuals=True, jointed=self._jointed).bodies
+        bodies = populated(
+            twin, seen, objects, self.cell.support, visuals=True, jointed=self._jointed
+        ).bodies
         arm = add_work_cell(twin, seen, self.cell, compliant=True, visuals=True)
         _grasp_constraint(twin, arm, bodies, self._jointed)  # with it the states are alike
         twin.Finalize()
-        poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True))
+        poses = builder.AddNamedSystem(
+            "poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True)
+        )
         builder.Connect(self.plant.get_state_output_port(), poses.get_input_port())
         builder.Connect(poses.get_output_port(), seen.get_source_pose_port(twin.get_source_id()))
         builder.ExportOutput(seen.get_query_output_port(), "query")
@@ -194,6 +207,8 @@ def _control_positions(plant: MultibodyPlant, arm: Arm) -> None:
             motor.set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
 
 
-def _grasp_constraint(plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], jointed: str) -> GraspConstraint:
+def _grasp_constraint(
+    plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], jointed: str
+) -> GraspConstraint:
     """Return the constraint for the one object that is jointed, or for any."""
     return WeldGrasp(plant, arm, bodies[jointed]) if jointed else CompliantGrasp(plant, arm)

@@ -48,7 +48,9 @@ class CommandSchedule:
         return [name for name, start in self.starts if start <= time + 1e-9][-1]
 
 
-def build_command_schedule(plan: Plan, cell: WorkCell, contact_time: float = math.inf) -> CommandSchedule:
+def build_command_schedule(
+    plan: Plan, cell: WorkCell, contact_time: float = math.inf
+) -> CommandSchedule:
     """Return a plan's phases one after the other, with dwells at the ends of the carry.
 
     Args:
@@ -85,7 +87,9 @@ def build_command_schedule(plan: Plan, cell: WorkCell, contact_time: float = mat
         time += duration
     at = dict(starts)
     # Neighbouring parts share a time: the later sample is left a moment later.
-    t = np.concatenate([part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)])
+    t = np.concatenate(
+        [part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)]
+    )
     command = PiecewisePolynomial.FirstOrderHold(t, np.vstack(parts).T)
     descent_start = at.get("descend", at["release"])
     return CommandSchedule(command, at["grasp"], descent_start, at["release"], time, tuple(starts))

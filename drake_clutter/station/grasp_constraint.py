@@ -87,8 +87,15 @@ _LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
 """[N/m] and [N s/m]: rubber yields a little in every direction; stiff legs would tear at the seal
 with every tracking error."""
 _ANGLE = 2 * math.pi / 3
-_UPPER = np.array([[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)])
-_LOWER = np.array([[_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0] for k in (0, 1, 2)])
+_UPPER = np.array(
+    [[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)]
+)
+_LOWER = np.array(
+    [
+        [_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0]
+        for k in (0, 1, 2)
+    ]
+)
 _LEGS = [(_UPPER[k], _LOWER[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
 
 
@@ -100,7 +107,9 @@ class CompliantGrasp:
         self._cup = plant.GetBodyByName("cup", arm.tool)
         # Between any two bodies, as long as nothing is held.
         other = plant.GetBodyByName("body", arm.tool)
-        self._legs = [plant.AddDistanceConstraint(self._cup, top, other, foot, 1.0) for top, foot in _LEGS]
+        self._legs = [
+            plant.AddDistanceConstraint(self._cup, top, other, foot, 1.0) for top, foot in _LEGS
+        ]
 
     def reset(self, context: Context) -> None:
         """See `GraspConstraint`."""
@@ -111,7 +120,9 @@ class CompliantGrasp:
         X_OG = body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
         for leg, (top, foot) in zip(self._legs, _LEGS, strict=True):
             ends = self._cup.index(), top, body.index(), X_OG @ foot
-            params = DistanceConstraintParams(*ends, float(np.linalg.norm(top - foot)), _LEG_STIFFNESS, _LEG_DAMPING)
+            params = DistanceConstraintParams(
+                *ends, float(np.linalg.norm(top - foot)), _LEG_STIFFNESS, _LEG_DAMPING
+            )
             self._plant.SetDistanceConstraintParams(context, leg, params)
             self._plant.SetConstraintActiveStatus(context, leg, True)
 

@@ -134,7 +134,10 @@ class SuctionActuator:
         """Take the object that is first under the lip, if close enough and the lip seals on it."""
         station, suction = self._station, self._station.cell.gripper
         grasps = {name: self._pose_of_cup(context, name) for name in station.takeable}
-        gaps = {name: surface_under_lip(station.classes[name], X_OG, suction.cup_diameter).min() for name, X_OG in grasps.items()}
+        gaps = {
+            name: surface_under_lip(station.classes[name], X_OG, suction.cup_diameter).min()
+            for name, X_OG in grasps.items()
+        }
         if not gaps:
             return
         first = min(gaps, key=lambda name: gaps[name])

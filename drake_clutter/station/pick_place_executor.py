@@ -117,12 +117,16 @@ class PickPlaceExecutor(LeafSystem):
         self.DeclareVectorOutputPort("command", len(self._at_home), self._calc_command, of)
         self.DeclareVectorOutputPort("suction", 1, self._calc_suction, of)
         self.DeclareVectorOutputPort("finished", 2, self._calc_finished, of)
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(ExecutorStatus()), self._calc_status, of)
+        self.DeclareAbstractOutputPort(
+            "status", lambda: AbstractValue.Make(ExecutorStatus()), self._calc_status, of
+        )
 
     @staticmethod
     def AddToBuilder(builder: DiagramBuilder, *, cell: WorkCell) -> "PickPlaceExecutor":
         """Add an executor to a diagram."""
-        system: PickPlaceExecutor = builder.AddNamedSystem("pick_place_executor", PickPlaceExecutor(cell=cell))
+        system: PickPlaceExecutor = builder.AddNamedSystem(
+            "pick_place_executor", PickPlaceExecutor(cell=cell)
+        )
         return system
 
     def state(self, context: Context) -> ExecutorState:

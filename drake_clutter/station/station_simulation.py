@@ -122,7 +122,9 @@ class StationSimulation:
         classes = [(o.name, o.object_class) for o in scene.objects]
         self.station: ClutterStation = builder.AddNamedSystem(
             "clutter_station",
-            ClutterStation(self.cell, classes, time_step=TIME_STEP, jointed=jointed, visuals=visuals),
+            ClutterStation(
+                self.cell, classes, time_step=TIME_STEP, jointed=jointed, visuals=visuals
+            ),
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
         for source, target, port in (
@@ -239,7 +241,9 @@ class StationSimulation:
                 motion.append(self.sample())
         return self._result(plan, before, tracking, tuple(motion))
 
-    def _result(self, plan: Plan, before: Scene, tracking: float, motion: tuple[Frame, ...]) -> PickPlaceResult:
+    def _result(
+        self, plan: Plan, before: Scene, tracking: float, motion: tuple[Frame, ...]
+    ) -> PickPlaceResult:
         poses, status = self.station.scene.poses(self.plant_context), self.gripper.status
         place, wanted = poses[plan.pick], plan.X_TO_place
         return PickPlaceResult(
@@ -250,7 +254,11 @@ class StationSimulation:
             slip=status.slip,
             place_error=float(np.linalg.norm((place.p - wanted.p)[:2])),
             turn_error=tilt_between(self.station.classes[plan.pick], wanted, place),
-            displaced={o.name: float(np.linalg.norm(poses[o.name].p - o.X_TO.p)) for o in before.objects if o.name != plan.pick},
+            displaced={
+                o.name: float(np.linalg.norm(poses[o.name].p - o.X_TO.p))
+                for o in before.objects
+                if o.name != plan.pick
+            },
             lowered_distance=self.executor_state.lowered_distance,
             tracking=tracking,
             time=self.root.get_time(),

@@ -35,7 +35,9 @@ VERSION = 1
 _ARM = ("q", "v", "torque")
 
 
-def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell) -> int:
+def write_trajectories(
+    path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell
+) -> int:
     """Writes the moves of which there is an arm's motion, in one step; returns how many there are.
 
     Args:
@@ -47,7 +49,11 @@ def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Out
     count = 0
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
-            {"version": VERSION, "scene": scene_text(start, cell), "cell": config_yaml(cell.with_support(start.support))}
+            {
+                "version": VERSION,
+                "scene": scene_text(start, cell),
+                "cell": config_yaml(cell.with_support(start.support)),
+            }
         )
         for move, outcome in moves:
             states = [frame.arm for frame in outcome.motion if frame.arm]
@@ -55,18 +61,29 @@ def write_trajectories(path: Path, start: Scene, moves: Sequence[tuple[Move, Out
                 continue
             count += 1
             group = file.create_group(f"move_{count:04d}")
-            group.attrs.update({"pick": move.pick, "place": move.place, "result": outcome.result.value, "detail": outcome.detail})
+            group.attrs.update(
+                {
+                    "pick": move.pick,
+                    "place": move.place,
+                    "result": outcome.result.value,
+                    "detail": outcome.detail,
+                }
+            )
             arrays = {name: np.array([getattr(state, name) for state in states]) for name in _ARM}
             arrays["time"] = np.array([frame.time for frame in outcome.motion])
             arrays["suction"] = np.array([state.suction for state in states])
             poses = [[frame.poses[o.name] for o in start.objects] for frame in outcome.motion]
-            arrays["X_TO"] = np.array([[(*X.quaternion, *X.translation) for X in row] for row in poses])
+            arrays["X_TO"] = np.array(
+                [[(*X.quaternion, *X.translation) for X in row] for row in poses]
+            )
             for name, values in arrays.items():
                 group.create_dataset(name, data=values, compression="gzip", shuffle=True)
     return count
 
 
-def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[Frame, ...]]]]:
+def read_trajectories(
+    path: Path, catalogue: Catalogue
+) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[Frame, ...]]]]:
     """Return the scene at first, the cell, and the motion of each move.
 
     Raises:
@@ -75,10 +92,14 @@ def read_trajectories(path: Path, catalogue: Catalogue) -> tuple[Scene, WorkCell
     try:
         file = h5py.File(path)
     except OSError as error:
-        raise refusal(str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})") from error
+        raise refusal(
+            str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})"
+        ) from error
     with file:
         if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
-            raise InputError(f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}")
+            raise InputError(
+                f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}"
+            )
         scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
         cell = _cell(path, file.attrs).with_support(scene.support)
         joints = load_robot(cell.robot).num_joints
@@ -89,17 +110,23 @@ def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
     """Return the cell of a file; files of drake_clutter 0.1 hold the arm alone."""
     field = "cell" if "cell" in attributes else "arm"
     given = parse_yaml(str(attributes.get(field, "{}")), f"{path}:{field}")
-    return override(default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}")
+    return override(
+        default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}"
+    )
 
 
-def _move(path: Path, name: str, group: h5py.Group, scene: Scene, joints: int) -> tuple[Move, tuple[Frame, ...]]:
+def _move(
+    path: Path, name: str, group: h5py.Group, scene: Scene, joints: int
+) -> tuple[Move, tuple[Frame, ...]]:
     arrays: dict[str, NDArray[np.float64]] = {}
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM, (joints,))
     shapes |= {"time": (), "suction": (), "X_TO": (len(scene.objects), 7)}
     for field, shape in shapes.items():
         found = group.get(field)
         if not isinstance(found, h5py.Dataset) or len(found.shape) == 0 or found.shape[1:] != shape:
-            raise InputError(f"{path}:{name}.{field}; allowed is a dataset of shape {('n', *shape)}")
+            raise InputError(
+                f"{path}:{name}.{field}; allowed is a dataset of shape {('n', *shape)}"
+            )
         arrays[field] = found[()]
     lengths = {field: len(values) for field, values in arrays.items()}
     if len(set(lengths.values())) != 1:
@@ -109,6 +136,9 @@ def _move(path: Path, name: str, group: h5py.Group, scene: Scene, joints: int) -
         q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM)
         arm = ArmState(q, v, torque, bool(arrays["suction"][k]))
         rows = arrays["X_TO"][k].tolist()
-        poses = {o.name: Pose(tuple(row[4:]), tuple(row[:4])) for o, row in zip(scene.objects, rows, strict=True)}
+        poses = {
+            o.name: Pose(tuple(row[4:]), tuple(row[:4]))
+            for o, row in zip(scene.objects, rows, strict=True)
+        }
         frames.append(Frame(time, poses, arm))
     return Move(str(group.attrs["pick"]), str(group.attrs["place"])), tuple(frames)

@@ -36,7 +36,11 @@ class InfeasibleMoves:
     def __call__(self, belief: Belief, observation: Observation) -> Sequence[Move]:
         """See `ActionFilter`."""
         moves, pickable = legal_moves(observation), self.pickable(belief.objects)
-        free = [move for move in moves if move.pick in pickable and free_places(observation, move, self.config) is not None]
+        free = [
+            move
+            for move in moves
+            if move.pick in pickable and free_places(observation, move, self.config) is not None
+        ]
         risky = under_nameless(belief.objects, observation, self.empty_depth)
         worth_trying = {move for move in free if move.pick not in risky} or set(free)
         return [move for move in moves if move not in worth_trying]

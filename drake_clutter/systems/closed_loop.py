@@ -102,18 +102,26 @@ class ClosedLoop:
             tracker=None if perceive is None else tracked,
             action_filter=InfeasibleMoves(self._pickable, empty, self.config),
         )
-        self.planner_system = PlannerSystem(planner=self._planner, empty_depth=empty, latency=LATENCY)
-        self.simulation = StationSimulation(world.cell, scene, visuals=True, add_systems=self._add_systems)
+        self.planner_system = PlannerSystem(
+            planner=self._planner, empty_depth=empty, latency=LATENCY
+        )
+        self.simulation = StationSimulation(
+            world.cell, scene, visuals=True, add_systems=self._add_systems
+        )
         self.simulation.diagram.set_name("closed_loop")
         self._planning, self._start_time = 0.0, time.perf_counter()
 
     def _pickable(self, known: Sequence[SceneObject]) -> set[str]:
         return {o.name for o in known if self._planner.can_pick(o, known)}
 
-    def _add_systems(self, builder: DiagramBuilder, station: ClutterStation, executor: PickPlaceExecutor) -> None:
+    def _add_systems(
+        self, builder: DiagramBuilder, station: ClutterStation, executor: PickPlaceExecutor
+    ) -> None:
         camera = add_camera(builder, station)
         perceive = self._perceive or LabelPerception(self.scene, station, self._world)
-        perception = PerceptionSystem.AddToBuilder(builder, perceive=perceive, camera=station.cell.camera)
+        perception = PerceptionSystem.AddToBuilder(
+            builder, perceive=perceive, camera=station.cell.camera
+        )
         policy = builder.AddNamedSystem("policy_system", self.policy_system)
         planner = builder.AddNamedSystem("planner_system", self.planner_system)
         for source, output, target, input_ in (

@@ -70,13 +70,23 @@ class PerceptionSystem(LeafSystem):
         """
         super().__init__()
         self._perceive, size = perceive, (camera.width, camera.height)
-        self._depth = self.DeclareAbstractInputPort("depth_image", AbstractValue.Make(ImageDepth32F(*size)))
-        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(*size)))
-        self._poses = self.DeclareAbstractInputPort("body_poses", AbstractValue.Make([RigidTransform()]))
-        self.DeclareAbstractOutputPort("observation", lambda: AbstractValue.Make(no_observation()), self._calc_observation)
+        self._depth = self.DeclareAbstractInputPort(
+            "depth_image", AbstractValue.Make(ImageDepth32F(*size))
+        )
+        self._color = self.DeclareAbstractInputPort(
+            "color_image", AbstractValue.Make(ImageRgba8U(*size))
+        )
+        self._poses = self.DeclareAbstractInputPort(
+            "body_poses", AbstractValue.Make([RigidTransform()])
+        )
+        self.DeclareAbstractOutputPort(
+            "observation", lambda: AbstractValue.Make(no_observation()), self._calc_observation
+        )
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, *, perceive: Perceive, camera: Camera) -> "PerceptionSystem":
+    def AddToBuilder(
+        builder: DiagramBuilder, *, perceive: Perceive, camera: Camera
+    ) -> "PerceptionSystem":
         """Add a system to a diagram; arguments as of the constructor."""
         made = PerceptionSystem(perceive=perceive, camera=camera)
         system: PerceptionSystem = builder.AddNamedSystem("perception_system", made)
@@ -95,10 +105,17 @@ class LearnedPerception:
         """`noise`: what the rendered depth gets, by a seed."""
         self._detect, self._noise, self._seed = detect, noise, seed
 
-    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
+    def __call__(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        body_poses: Sequence[RigidTransform],
+    ) -> Observation:
         """See `Perceive`; the same image gets the same noise."""
         if self._noise:
-            depth = noisy_depth(depth, item_rng(self._seed, zlib.crc32(depth.tobytes())), self._noise)
+            depth = noisy_depth(
+                depth, item_rng(self._seed, zlib.crc32(depth.tobytes())), self._noise
+            )
         return self._detect(depth, color)
 
 
@@ -110,10 +127,17 @@ class LabelPerception:
         self._scene, self._detector = scene, LabelDetector(world.cell.camera)
         self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
 
-    def __call__(self, depth: NDArray[np.float32], color: NDArray[np.uint8], body_poses: Sequence[RigidTransform]) -> Observation:
+    def __call__(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        body_poses: Sequence[RigidTransform],
+    ) -> Observation:
         """See `Perceive`."""
         poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
         told = self._detector.look(self._scene.at(poses)).observation
         unobstructed = depth > told.depth - 0.01  # the arm may be in the way
         in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
-        return Observation(depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.support)
+        return Observation(
+            depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.support
+        )

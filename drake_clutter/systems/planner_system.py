@@ -34,7 +34,9 @@ class PlannerSystem(LeafSystem):
         plan: `PlannedMove`, of the latest response; with number 0 if that has no plan.
     """
 
-    def __init__(self, *, planner: PickPlacePlanner, empty_depth: NDArray[np.float32], latency: float) -> None:
+    def __init__(
+        self, *, planner: PickPlacePlanner, empty_depth: NDArray[np.float32], latency: float
+    ) -> None:
         """Make a system.
 
         Args:
@@ -50,8 +52,12 @@ class PlannerSystem(LeafSystem):
         self._received = self.DeclareDiscreteState([0.0, 0.0])
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, PERIOD / 2, self._update)
         of = {self.all_state_ticket()}
-        self.DeclareAbstractOutputPort("response", lambda: AbstractValue.Make(PlanResponse()), self._calc_response, of)
-        self.DeclareAbstractOutputPort("plan", lambda: AbstractValue.Make(PlannedMove()), self._calc_plan, of)
+        self.DeclareAbstractOutputPort(
+            "response", lambda: AbstractValue.Make(PlanResponse()), self._calc_response, of
+        )
+        self.DeclareAbstractOutputPort(
+            "plan", lambda: AbstractValue.Make(PlannedMove()), self._calc_plan, of
+        )
 
     def response(self, context: Context) -> PlanResponse:
         """Return the latest response, from the system's context."""

@@ -108,14 +108,22 @@ class PolicySystem(LeafSystem):
         super().__init__()
         self.policy, self._config, self._seed, self._rest = policy, config, seed, rest
         self._tracker, self._action_filter = tracker, action_filter
-        self._observation = self.DeclareAbstractInputPort("observation", AbstractValue.Make(no_observation()))
-        self._response = self.DeclareAbstractInputPort("response", AbstractValue.Make(PlanResponse()))
+        self._observation = self.DeclareAbstractInputPort(
+            "observation", AbstractValue.Make(no_observation())
+        )
+        self._response = self.DeclareAbstractInputPort(
+            "response", AbstractValue.Make(PlanResponse())
+        )
         self._finished = self.DeclareVectorInputPort("finished", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(PolicyState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
         of = {self.all_state_ticket()}
-        self.DeclareAbstractOutputPort("request", lambda: AbstractValue.Make(PlanRequest()), self._calc_request, of)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(PolicyState()), self._calc_state, of)
+        self.DeclareAbstractOutputPort(
+            "request", lambda: AbstractValue.Make(PlanRequest()), self._calc_request, of
+        )
+        self.DeclareAbstractOutputPort(
+            "state", lambda: AbstractValue.Make(PolicyState()), self._calc_state, of
+        )
 
     def state(self, context: Context) -> PolicyState:
         """Return the state in the system's context."""

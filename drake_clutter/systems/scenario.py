@@ -66,7 +66,9 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     from drake_clutter.perception.learned_detector import LearnedDetector  # takes PyTorch
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
-    classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(scenario.objects)
+    classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(
+        scenario.objects
+    )
     camera = scenario.world.cell.camera
     detector = LearnedDetector(SegmentationNetwork.load(path), classes, camera, support)
     noise = DepthNoise(focal_length=camera.focal_length) if camera.depth_noise else None

@@ -69,12 +69,18 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
         named |= {left[k].name: unnamed[d] for k, d in moved.items()}
         lost += [o.name for k, o in enumerate(left) if k not in moved]
         taken = {o.name for o in of_class}
-        free = (name for number in count(1) if (name := f"{object_class.name}_{number}") not in taken)
-        named |= {next(free): detection for k, detection in enumerate(unnamed) if k not in moved.values()}
+        free = (
+            name for number in count(1) if (name := f"{object_class.name}_{number}") not in taken
+        )
+        named |= {
+            next(free): detection for k, detection in enumerate(unnamed) if k not in moved.values()
+        }
     detections = tuple(replace(detection, name=name) for name, detection in named.items())
     there = [SceneObject(d.name, d.object_class, d.X_TO) for d in detections]
     unseen = (o for o in known if o.name not in named and o.name not in lost)
-    lost += [o.name for o in unseen if any(penetration(o, other) > IN_EACH_OTHER for other in there)]
+    lost += [
+        o.name for o in unseen if any(penetration(o, other) > IN_EACH_OTHER for other in there)
+    ]
     return Tracked(replace(observation, detections=detections), tuple(lost))
 
 
@@ -98,19 +104,29 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
             continue
         e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
         for_it = np.count_nonzero(e.seen)
-        if for_it >= max(1, observation.camera.visibility_threshold * e.alone) and for_it >= STILL * (for_it + e.past):
+        if for_it >= max(
+            1, observation.camera.visibility_threshold * e.alone
+        ) and for_it >= STILL * (for_it + e.past):
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
 
     def no_better(detection: Detection) -> bool:
         size = np.count_nonzero(detection.mask)
-        within = (np.count_nonzero(d.mask & detection.mask) for d in still.values() if np.count_nonzero(d.mask) > MORE * size)
-        return bool(size) and (explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within))
+        within = (
+            np.count_nonzero(d.mask & detection.mask)
+            for d in still.values()
+            if np.count_nonzero(d.mask) > MORE * size
+        )
+        return bool(size) and (
+            explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within)
+        )
 
     kept = [d for d in observation.detections if d.name in familiar or d.sure or not no_better(d)]
     taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
     steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
-    return replace(observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady)))
+    return replace(
+        observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady))
+    )
 
 
 def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> tuple[str, ...]:
@@ -147,7 +163,9 @@ def in_true_names(
     )
 
 
-def _matched(known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float) -> dict[int, int]:
+def _matched(
+    known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float
+) -> dict[int, int]:
     """Indices of the seen by those of the known, no further apart than `within`, m."""
     if not known or not seen:
         return {}
@@ -167,4 +185,7 @@ def _gone(known: SceneObject, observation: Observation) -> bool:
     for detection in observation.detections:
         others |= detection.mask
     taken = np.count_nonzero(e.seen & others[e.window])
-    return bool(taken > TAKEN * as_expected and as_expected >= observation.camera.visibility_threshold * e.alone)
+    return bool(
+        taken > TAKEN * as_expected
+        and as_expected >= observation.camera.visibility_threshold * e.alone
+    )

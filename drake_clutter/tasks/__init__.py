@@ -2,5 +2,10 @@
 
 import gymnasium
 
-gymnasium.register("ClutterGeneration-v0", entry_point="drake_clutter.tasks.generation:ClutterGeneration")
-gymnasium.register("ClutterExploration-v0", entry_point="drake_clutter.tasks.clutter_exploration:ClutterExploration")
+gymnasium.register(
+    "ClutterGeneration-v0", entry_point="drake_clutter.tasks.generation:ClutterGeneration"
+)
+gymnasium.register(
+    "ClutterExploration-v0",
+    entry_point="drake_clutter.tasks.clutter_exploration:ClutterExploration",
+)

@@ -69,7 +69,9 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             config: the world; None: the default one, in the cell that the scenes were made with.
         """
         if not isinstance(scenes, SceneSet):
-            scenes = load_scene_set(shipped_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue())
+            scenes = load_scene_set(
+                shipped_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue()
+            )
         self._config = config or ClutterConfig(cell=scenes.cell)
         self._privileged, self.scenes = privileged, scenes
         self._max_moves = max_moves or self._config.exploration.max_moves
@@ -92,27 +94,38 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.MultiDiscrete([n, n])
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[GraphObservation, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[GraphObservation, dict[str, Any]]:
         """A scene at rest, and the first look at it."""
         super().reset(seed=seed)
         number = None if options is None else options.get("scene")
         if number is None:
             return self._begin_anew(), {}
         if not 0 <= number < len(self.scenes.scenes):
-            raise InputError(f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them")
+            raise InputError(
+                f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them"
+            )
         return self.begin(self.scenes.settled(number, self.grammar, self._config)), {}
 
     def _begin_anew(self) -> GraphObservation:
         """With a scene that stands and hides something where its stacks are put now."""
         for _ in range(_TRIES):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
-            scene = lay_anew(self.scenes.derivation(index, self.grammar), self.grammar, self._config, self.np_random)
+            scene = lay_anew(
+                self.scenes.derivation(index, self.grammar),
+                self.grammar,
+                self._config,
+                self.np_random,
+            )
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
                 observation = self.begin(scene)
                 if self.task.end is None:
                     return observation
         most = self._nodes - 1
-        raise InputError(f"{self.scenes.name}: of {_TRIES} scenes none stands and hides something, with at most {most} objects")
+        raise InputError(
+            f"{self.scenes.name}: of {_TRIES} scenes none stands and hides something, with at most {most} objects"
+        )
 
     def begin(self, scene: Scene) -> GraphObservation:
         """Starts an episode on a scene at rest, and looks.
@@ -121,7 +134,9 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             InputError: it has more objects than there is room for.
         """
         if len(scene.objects) >= self._nodes:
-            raise InputError(f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
+            raise InputError(
+                f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}"
+            )
         self.backend, self._refused = self._start_backend(scene, self.np_random), 0
         self.task = ExplorationTask(
             scene,
@@ -162,13 +177,21 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             nodes=self._nodes,
         )
 
-    def step(self, action: Any) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: Any
+    ) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out; one that is not allowed changes nothing, but counts towards the number of moves."""
         x, y = (int(v) for v in action)
         names = self.objects
         if not self._allowed[x, y]:
             self._refused += 1
-            return self.observe(), 0.0, False, self._spent, {"end": EpisodeEnd.OUT_OF_MOVES} if self._spent else {}
+            return (
+                self.observe(),
+                0.0,
+                False,
+                self._spent,
+                {"end": EpisodeEnd.OUT_OF_MOVES} if self._spent else {},
+            )
         move = Move(names[x - 1], names[y - 1] if y else TRAY)
         outcome = self.backend.step(move)
         if outcome.result is not MoveResult.COLLAPSED:

@@ -46,7 +46,9 @@ _DIRECTIONS = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
 
 def _overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
     """(n, n) m, by which two outlines overlap seen from above; negative: the gap between them."""
-    along = np.array([[(p := o.corners_T[:, :2] @ _DIRECTIONS.T).min(axis=0), p.max(axis=0)] for o in objects])
+    along = np.array(
+        [[(p := o.corners_T[:, :2] @ _DIRECTIONS.T).min(axis=0), p.max(axis=0)] for o in objects]
+    )
     lower, upper = along[:, 0], along[:, 1]
     overlap = np.minimum(upper[:, None], upper[None]) - np.maximum(lower[:, None], lower[None])
     return np.asarray(overlap.min(axis=2))
@@ -80,7 +82,10 @@ def exploration_graph(
     kind, feature = np.zeros(room, np.int8), np.zeros((room, len(FEATURES)), np.float32)
     allowed = np.zeros((room, room), np.int8)
     kind[0] = numbers[TRAY]
-    edge, edge_kind = np.zeros((room * (room - 1) // 2, 2), np.int16), np.zeros(room * (room - 1) // 2, np.int8)
+    edge, edge_kind = (
+        np.zeros((room * (room - 1) // 2, 2), np.int16),
+        np.zeros(room * (room - 1) // 2, np.int8),
+    )
     if count:
         bounds = np.array([o.bounds_T for o in objects])
         low, high = bounds[:, 0, 2], bounds[:, 1, 2]
@@ -95,7 +100,10 @@ def exploration_graph(
             detection = seen.get(o.name)
             share = 0.0
             if detection is not None:
-                share = min(1.0, np.count_nonzero(detection.mask) * pixel[k] ** 2 / float(extent[0] * extent[1]))
+                share = min(
+                    1.0,
+                    np.count_nonzero(detection.mask) * pixel[k] ** 2 / float(extent[0] * extent[1]),
+                )
             picks = sum(move.pick == o.name for move in history)
             kind[k + 1] = numbers[o.object_class.name]
             # Of a rotation's two, always the same, also when a component that should be 0 is a little off.

@@ -168,7 +168,9 @@ class FeasibilityStudy:
             return replace(row, result=found.reason.value, about=found.about, number=found.number)
         carry = found.phases[1].trajectory
         ends = carry.vector_values([0.0, carry.end_time()]).T
-        nearest = min((phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance)
+        nearest = min(
+            (phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance
+        )
         return replace(
             row,
             result=PLANNED,
@@ -179,10 +181,16 @@ class FeasibilityStudy:
             manipulability=float(robot.manipulability(ends).min()),
         )
 
-    def noise(self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]) -> list[NoiseRow]:
+    def noise(
+        self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]
+    ) -> list[NoiseRow]:
         """Some of the planned moves, planned from wrong poses: do the plans hold where the objects really are?"""
         planned = [row for row in rows if row.result == PLANNED]
-        rng, planner, found = self._rng(number, 1_000_000), self.planner(scene.support), list[NoiseRow]()
+        rng, planner, found = (
+            self._rng(number, 1_000_000),
+            self.planner(scene.support),
+            list[NoiseRow](),
+        )
         for k in sorted(rng.permutation(len(planned))[:NOISY_MOVES].tolist()):
             row = planned[k]
             for error in NOISE:
@@ -190,7 +198,11 @@ class FeasibilityStudy:
                 picked = next(o for o in believed if o.name == row.pick)
                 X_TO = Pose((row.place_x, row.place_y, row.place_z), picked.X_TO.quaternion)
                 plan = planner.plan(believed, row.pick, X_TO)
-                result = "no plan" if isinstance(plan, NoPlan) else self._holds(plan, scene, planner, error)
+                result = (
+                    "no plan"
+                    if isinstance(plan, NoPlan)
+                    else self._holds(plan, scene, planner, error)
+                )
                 found.append(NoiseRow(self._setup, name, row.pick, row.place, error, result))
         return found
 
@@ -209,7 +221,9 @@ class FeasibilityStudy:
             if phase.name == "carry":
                 around.hold(plan.pick, X_OG)
             else:
-                around.put_one(plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place)
+                around.put_one(
+                    plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place
+                )
             for at in sampled(phase.trajectory):
                 for here in around.close(at, 0.0):
                     # The cup is pressed on; what the object leaves or comes to it may graze by as much as it is misjudged.
@@ -224,7 +238,12 @@ def _misjudged(o: SceneObject, error: float, rng: np.random.Generator) -> SceneO
     half = math.radians(rng.normal(0.0, 500 * error)) / 2
     w, i, j, k = o.X_TO.quaternion
     c, s = math.cos(half), math.sin(half)
-    turned = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)  # about the vertical, on the left
+    turned = (
+        c * w - s * k,
+        c * i - s * j,
+        c * j + s * i,
+        c * k + s * w,
+    )  # about the vertical, on the left
     px, py, pz = o.X_TO.translation
     return replace(o, X_TO=Pose((px + x, py + y, pz), turned))
 
@@ -243,7 +262,9 @@ def below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
     found = []
     for other in objects:
         other_lower, other_upper = other.bounds_T
-        overlap: NDArray[np.float64] = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
+        overlap: NDArray[np.float64] = (
+            np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
+        )
         if other is not picked and overlap.min() > 0 and other_upper[2] < lower[2] + 0.004:
             found.append(other.name)
     return found

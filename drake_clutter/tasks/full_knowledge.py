@@ -82,7 +82,9 @@ class _State:
     @property
     def key(self) -> tuple[frozenset[str], tuple[tuple[float, ...], ...]]:
         """Equal for states that differ by less than 1 mm."""
-        return self.known, tuple(tuple(round(v, 3) for v in o.X_TO.translation) for o in self.scene.objects)
+        return self.known, tuple(
+            tuple(round(v, 3) for v in o.X_TO.translation) for o in self.scene.objects
+        )
 
 
 class _OutOfBudgetError(Exception):
@@ -131,7 +133,9 @@ class FullKnowledgeSearch:
             InputError: the scene has more objects than the search takes.
         """
         if len(scene.objects) > MOST_OBJECTS:
-            raise InputError(f"objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most, for a full-knowledge search")
+            raise InputError(
+                f"objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most, for a full-knowledge search"
+            )
         self._failed = failed
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
@@ -163,7 +167,13 @@ class FullKnowledgeSearch:
             pass
         if plan is not None:
             return Solution(Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
-        return Solution(Solvability.UNSOLVABLE if exhausted else Solvability.UNDECIDED, (), at_least, (), budget - self._left)
+        return Solution(
+            Solvability.UNSOLVABLE if exhausted else Solvability.UNDECIDED,
+            (),
+            at_least,
+            (),
+            budget - self._left,
+        )
 
     def _state(self, scene: Scene, known: frozenset[str], rng: Mapping[str, Any]) -> _State:
         observation, _ = self._rays.observe(scene)
@@ -176,10 +186,19 @@ class FullKnowledgeSearch:
             for name in hidden:
                 needed[name], involved = self._needed(scene, name, carried)
                 # Tagged, as an object may be hidden itself and be before another.
-                moved_first.add_edges_from((("hidden", name), ("moved", other)) for other in involved)
+                moved_first.add_edges_from(
+                    (("hidden", name), ("moved", other)) for other in involved
+                )
             for together in nx.connected_components(moved_first):
                 at_least += max(needed[name] for role, name in together if role == "hidden")
-        return _State(scene, observation, known, rng, at_least, frozenset(n for role, n in moved_first if role == "moved"))
+        return _State(
+            scene,
+            observation,
+            known,
+            rng,
+            at_least,
+            frozenset(n for role, n in moved_first if role == "moved"),
+        )
 
     def _carried(self, scene: Scene) -> dict[str, frozenset[str]]:
         """What must be moved before each object can be, itself included: everything that stands on nothing else, by name."""
@@ -189,12 +208,16 @@ class FullKnowledgeSearch:
         found = {}
         for name in scene.names:
             carried = {name}
-            while more := {other for other, below in supports.items() if below <= carried} - carried:
+            while (
+                more := {other for other, below in supports.items() if below <= carried} - carried
+            ):
                 carried |= more
             found[name] = frozenset(carried)
         return found
 
-    def _needed(self, scene: Scene, name: str, carried: Mapping[str, frozenset[str]]) -> tuple[int, frozenset[str]]:
+    def _needed(
+        self, scene: Scene, name: str, carried: Mapping[str, frozenset[str]]
+    ) -> tuple[int, frozenset[str]]:
         """Moves without which a hidden object stays hidden, and what may have to be moved for it."""
         rays: Counter[int] = Counter()
         involved: frozenset[str] = frozenset()
@@ -209,7 +232,9 @@ class FullKnowledgeSearch:
                 return moves, involved
         return 0, involved  # out of the frame, see `never_found`
 
-    def never_found(self, scene: Scene, known: Collection[str], fixed: Collection[str]) -> tuple[str, ...]:
+    def never_found(
+        self, scene: Scene, known: Collection[str], fixed: Collection[str]
+    ) -> tuple[str, ...]:
         """What is out of the camera's frame, or stays hidden behind objects that can never be moved.
 
         Args:
@@ -233,7 +258,9 @@ class FullKnowledgeSearch:
         self._reached: dict[Any, int] = {}
         return self._deeper(start, 0, limit, only_blockers)
 
-    def _deeper(self, state: _State, depth: int, limit: int, only_blockers: bool) -> list[Move] | None:
+    def _deeper(
+        self, state: _State, depth: int, limit: int, only_blockers: bool
+    ) -> list[Move] | None:
         if not state.at_least:
             return []
         if self._reached.get(state.key, limit + 1) <= depth:

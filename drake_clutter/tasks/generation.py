@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from drake_clutter.catalogue import ObjectClass, load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, SceneGrammar
-from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, OBJECT_SLOT, OPEN_SLOT, PRIMITIVE, TRAY
+from drake_clutter.grammar.graph import (
+    DUMMY,
+    END,
+    NON_TERMINAL_KINDS,
+    OBJECT_SLOT,
+    OPEN_SLOT,
+    PRIMITIVE,
+    TRAY,
+)
 from drake_clutter.scenes.interfaces import CannotJudge, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
@@ -69,7 +77,9 @@ class GraphVocabulary:
     @staticmethod
     def of(grammar: SceneGrammar) -> "GraphVocabulary":
         """That of a grammar."""
-        return GraphVocabulary((TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY, *grammar.classes), (PRIMITIVE, *Orientation))
+        return GraphVocabulary(
+            (TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY, *grammar.classes), (PRIMITIVE, *Orientation)
+        )
 
 
 def most_edges(nodes: int) -> int:
@@ -80,7 +90,9 @@ def most_edges(nodes: int) -> int:
 class PartialScene:
     """A derivation under way, and what is known of its finished stacks."""
 
-    def __init__(self, grammar: SceneGrammar, task: GenerationTask, config: ClutterConfig, judge: FastJudge) -> None:
+    def __init__(
+        self, grammar: SceneGrammar, task: GenerationTask, config: ClutterConfig, judge: FastJudge
+    ) -> None:
         """Starts from the tray; `judge` is asked about every stack."""
         vocabulary = GraphVocabulary.of(grammar)
         self._grammar, self._task, self._config, self._judge = grammar, task, config, judge
@@ -89,7 +101,9 @@ class PartialScene:
         self._edge_number = {kind: k for k, kind in enumerate(vocabulary.edge_kinds, start=1)}
         self.graph = ClutterGraph()
         self.rules: list[str] = []
-        self.origins: dict[int, NDArray[np.float64]] = {}  # of the objects of finished stacks, m, over the tray's centre
+        self.origins: dict[
+            int, NDArray[np.float64]
+        ] = {}  # of the objects of finished stacks, m, over the tray's centre
         self.hidden = 0
         self.fault: StackFault | None = None
         self._look()
@@ -130,7 +144,11 @@ class PartialScene:
             for at in level:
                 if self.graph.kind(at) in NON_TERMINAL_KINDS:
                     return []
-                edges += [kind["kind"] for child, kind in above[at].items() if self.graph.kind(child) != END]
+                edges += [
+                    kind["kind"]
+                    for child, kind in above[at].items()
+                    if self.graph.kind(child) != END
+                ]
             level = list(dict.fromkeys(child for at in level for child in above[at]))
         return [] if PRIMITIVE in edges else bottom
 
@@ -147,7 +165,9 @@ class PartialScene:
             self.fault = StackFault.HELD_DOWN
         else:
             shares = self._judge.rays.visible_shares(scene.objects).values()
-            self.hidden += sum(share < self._config.cell.camera.visibility_threshold for share in shares)
+            self.hidden += sum(
+                share < self._config.cell.camera.visibility_threshold for share in shares
+            )
 
     def worth(self, hidden: int) -> float:
         """Of the derived graph, if its scene is stable and hides that many objects."""
@@ -172,14 +192,20 @@ class PartialScene:
         kind[:count] = [self._node_number[k] for k in self.graph.kinds()]
         for node, p_TO in self.origins.items():
             flags[node, 0], position[node] = 1, p_TO
-        for column, (pattern, match) in enumerate(zip(self._grammar.patterns, self._matches, strict=True)):
+        for column, (pattern, match) in enumerate(
+            zip(self._grammar.patterns, self._matches, strict=True)
+        ):
             if match is not None and column > 0:  # the tray is the tray
                 flags[match[pattern.rewritten], column] = 1
         ends, edge_kind = np.zeros((edges, 2), np.int16), np.zeros(edges, np.int8)
         e = 0
         for parent, children in self.graph.nx._adj.items():
             for child, data in children.items():
-                ends[e, 0], ends[e, 1], edge_kind[e] = parent, child, self._edge_number[data["kind"]]
+                ends[e, 0], ends[e, 1], edge_kind[e] = (
+                    parent,
+                    child,
+                    self._edge_number[data["kind"]],
+                )
                 e += 1
         remaining = np.array([(self._task.nodes - count) / 25], np.float32)
         return {
@@ -249,17 +275,27 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(self.grammar.rules))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[GraphObservation, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[GraphObservation, dict[str, Any]]:
         """The start graph: the tray."""
         super().reset(seed=seed)
         self.partial = PartialScene(self.grammar, self.task, self._config, self._judge)
         return self.partial.observe(), {"action_mask": self.partial.mask.astype(np.int8)}
 
-    def step(self, action: int) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: int
+    ) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Applies a rule."""
         partial, earned = self.partial, self.task.hidden_reward * self.partial.hidden
         if not partial.mask[action]:
-            return partial.observe(), 0.0, partial.finished, False, {"action_mask": partial.mask.astype(np.int8)}
+            return (
+                partial.observe(),
+                0.0,
+                partial.finished,
+                False,
+                {"action_mask": partial.mask.astype(np.int8)},
+            )
         partial.apply(int(action))
         info: dict[str, Any] = {"action_mask": partial.mask.astype(np.int8)}
         worth = self.task.hidden_reward * partial.hidden

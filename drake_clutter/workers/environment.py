@@ -6,7 +6,12 @@ from contextlib import contextmanager
 
 IN_FLIGHT_PER_WORKER = 4
 """Items that are sent to each worker before the first of their results is read."""
-ONE_THREAD_EACH = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
+ONE_THREAD_EACH = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "0",
+}
 """Environment variables of a worker process.
 
 More threads than cores slow each other down, and the rounding of a sum depends on the number of threads. Mesa's software

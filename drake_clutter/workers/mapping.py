@@ -48,10 +48,16 @@ def map_ordered(
         return map_on_ray(make_worker, items, workers, ray_address)
     if fresh_after is not None:
         return map_in_fresh_processes(make_worker, items, workers, fresh_after)
-    return _map_here(make_worker, items) if workers == 1 else map_in_processes(make_worker, items, workers)
+    return (
+        _map_here(make_worker, items)
+        if workers == 1
+        else map_in_processes(make_worker, items, workers)
+    )
 
 
-def _map_here(make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item]) -> Generator[Result, None, None]:
+def _map_here(
+    make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item]
+) -> Generator[Result, None, None]:
     worker: Callable[[Item], Result] | None = None
     for item in items:
         if worker is None:

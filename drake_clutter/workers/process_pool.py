@@ -28,14 +28,18 @@ def map_in_processes(
     """See `drake_clutter.workers.mapping.map_ordered`."""
     gc.collect()  # a renderer that is left for one of the pool's threads to collect can abort the process
     # A forked copy of a process that runs threads (VTK, torch) can hang: the processes are started afresh.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(make_worker,))
+    pool = ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=_begin, initargs=(make_worker,)
+    )
     remaining = iter(items)
     futures: deque[Future[Result]] = deque()
     done = 0
     try:
         while True:
             for item in islice(remaining, workers * IN_FLIGHT_PER_WORKER - len(futures)):
-                with environment(ONE_THREAD_EACH):  # a process starts, and copies it, when an item finds none idle
+                with environment(
+                    ONE_THREAD_EACH
+                ):  # a process starts, and copies it, when an item finds none idle
                     futures.append(pool.submit(_work, item))
             if not futures:
                 break
@@ -49,13 +53,18 @@ def map_in_processes(
         ) from error
     finally:
         if futures:  # left early
-            for process in list((pool._processes or {}).values()):  # from Python 3.14: pool.terminate_workers()
+            for process in list(
+                (pool._processes or {}).values()
+            ):  # from Python 3.14: pool.terminate_workers()
                 process.terminate()
         pool.shutdown(cancel_futures=True)
 
 
 def map_in_fresh_processes(
-    make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int, fresh_after: int
+    make_worker: Callable[[], Callable[[Item], Result]],
+    items: Iterable[Item],
+    workers: int,
+    fresh_after: int,
 ) -> Generator[Result, None, None]:
     """See `drake_clutter.workers.mapping.map_ordered`."""
     remaining = iter(items)
@@ -66,7 +75,9 @@ def map_in_fresh_processes(
 def _begin(make_worker: Callable[[], Callable[[Any], Any]]) -> None:
     global _make_worker
     _make_worker = make_worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one ends the others
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches every process; the first one ends the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

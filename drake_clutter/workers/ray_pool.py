@@ -32,7 +32,9 @@ class _Actor:
     def __init__(self, make_worker: bytes, folder: str) -> None:
         self._make_worker = make_worker
         self._worker: Callable[[Any], Any] | None = None
-        with suppress(OSError):  # where the machines share the folder, relative paths in the items are right here, too
+        with suppress(
+            OSError
+        ):  # where the machines share the folder, relative paths in the items are right here, too
             os.chdir(folder)
 
     def ready(self) -> None:
@@ -58,11 +60,19 @@ class _Job:
 
 
 def map_on_ray(
-    make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int, address: str
+    make_worker: Callable[[], Callable[[Item], Result]],
+    items: Iterable[Item],
+    workers: int,
+    address: str,
 ) -> Generator[Result, None, None]:
     """See `drake_clutter.workers.mapping.map_ordered`."""
     with _connection(address) as ray:
-        options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": -1, "runtime_env": {"env_vars": ONE_THREAD_EACH}}
+        options = {
+            "num_cpus": 1,
+            "max_restarts": -1,
+            "max_task_retries": -1,
+            "runtime_env": {"env_vars": ONE_THREAD_EACH},
+        }
         actor_class = ray.remote(**options)(_Actor)
         factory = ray.cloudpickle.dumps(make_worker)
         actors = [actor_class.remote(factory, os.getcwd()) for _ in range(workers)]
@@ -80,7 +90,9 @@ def _connection(address: str) -> Iterator[Any]:
         with environment(_SHORT_WAIT):
             import ray
     except ModuleNotFoundError as error:
-        raise InputError(f'--ray {address}: Ray is not installed; pip install "drake-clutter[scale]"') from error
+        raise InputError(
+            f'--ray {address}: Ray is not installed; pip install "drake-clutter[scale]"'
+        ) from error
     if ray.is_initialized():
         yield ray
         return
@@ -108,7 +120,9 @@ def _map(ray: Any, actors: list[Any], items: Iterable[Any]) -> Generator[Any, No
     in_order: deque[_Job] = deque()  # read, not yet yielded
     waiting: deque[_Job] = deque()  # those of them that no actor works on
     idle: list[Any] = []
-    busy: dict[Any, tuple[Any, _Job | None]] = {actor.ready.remote(): (actor, None) for actor in actors}
+    busy: dict[Any, tuple[Any, _Job | None]] = {
+        actor.ready.remote(): (actor, None) for actor in actors
+    }
     while True:
         for item in islice(remaining, len(actors) * IN_FLIGHT_PER_WORKER - len(in_order)):
             in_order.append(_Job(ray.cloudpickle.dumps(item)))

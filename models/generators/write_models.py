@@ -12,7 +12,9 @@ ROBOTS = Path(__file__).parents[1] / "robots"
 
 def main() -> None:
     """Write a file for each arm."""
-    texts = {"iiwa14": iiwa14_sdf(), "ur10": ur10_sdf()} | {arm.name: ur_sdf(arm) for arm in E_SERIES}
+    texts = {"iiwa14": iiwa14_sdf(), "ur10": ur10_sdf()} | {
+        arm.name: ur_sdf(arm) for arm in E_SERIES
+    }
     for name, text in texts.items():
         (ROBOTS / f"{name}.sdf").write_text(text, encoding="utf-8")
 
