@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import drake_clutter
+
 ROOT = Path(__file__).resolve().parent.parent
+VERSIONED = f"drake_clutter-{drake_clutter.__version__}"
 WHERE = "from drake_clutter.resources import shipped_path as s; print(s('sdf_assets/catalogue.yaml')); print(s('models'))"
 
 
@@ -62,7 +65,7 @@ def test_the_wheel_holds_one_package(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.partition("/")[0] for name in names} == {
         "drake_clutter",
-        "drake_clutter-0.1.0.dist-info",
+        f"{VERSIONED}.dist-info",
     }
     for folder in ("models", "sdf_assets"):
         paths = (path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file())
@@ -78,9 +81,7 @@ def test_the_wheel_holds_one_package(wheel: Path) -> None:
 
 def test_the_lock_satisfies_the_wheel(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        metadata = Parser().parsestr(
-            archive.read("drake_clutter-0.1.0.dist-info/METADATA").decode()
-        )
+        metadata = Parser().parsestr(archive.read(f"{VERSIONED}.dist-info/METADATA").decode())
     locked = {
         line.partition("==")[0].lower()
         for line in (ROOT / "requirements.lock").read_text().splitlines()

@@ -1,0 +1,85 @@
+"""The public API: `drake_clutter/__init__.py` imports these names when they are first used."""
+
+# ruff: noqa: I001 - in the order of the documentation
+
+from .files import InputError as InputError
+
+# Objects, scenes and files of scenes.
+from .catalogue import (
+    Catalogue as Catalogue,
+    ObjectClass as ObjectClass,
+    load_catalogue as load_catalogue,
+)
+from .scenes.scene import Pose as Pose, Scene as Scene, SceneObject as SceneObject
+from .scenes.scene_file import load_scene as load_scene, save_scene as save_scene
+from .scenes.scene_set import SceneSet as SceneSet, load_scene_set as load_scene_set
+from .export.folder import ExportFormat as ExportFormat, export_scene as export_scene
+
+# The scene grammar.
+from .grammar.graph import ClutterGraph as ClutterGraph
+from .grammar.grammar import NodeBudget as NodeBudget, SceneGrammar as SceneGrammar
+from .grammar.rules import ProductionRule as ProductionRule
+from .scenes.layout import LayoutFailure as LayoutFailure, lay_out as lay_out
+
+# The simulated world and the work cell.
+from .config import ClutterConfig as ClutterConfig, load_config as load_config
+from .cell.work_cell import (
+    WorkCell as WorkCell,
+    default_cell as default_cell,
+    load_cell as load_cell,
+)
+from .robots.robot_model import RobotModel as RobotModel, load_robot as load_robot
+
+# Judges: is a scene stable, and what does the camera see of it?
+from .scenes.interfaces import SceneJudge as SceneJudge, Verdict as Verdict
+from .simulation.fallback import FastOrDrakeJudge as FastOrDrakeJudge
+from .simulation.judge import DrakeJudge as DrakeJudge
+from .stability.judge import FastJudge as FastJudge
+
+# Scene generation.
+from .agents.generation import (
+    GenerationAgent as GenerationAgent,
+    SceneGenerator as SceneGenerator,
+    make_generation_agent as make_generation_agent,
+)
+from .tasks.generation import (
+    ClutterGeneration as ClutterGeneration,
+    GenerationTask as GenerationTask,
+)
+
+# Exploration.
+from .scenes.interfaces import (
+    Detection as Detection,
+    Move as Move,
+    MoveResult as MoveResult,
+    Observation as Observation,
+    Outcome as Outcome,
+    PickPlaceCommand as PickPlaceCommand,
+)
+from .scenes.placement import resolve_placement as resolve_placement
+from .tasks.belief import Belief as Belief, Decision as Decision, Policy as Policy
+from .tasks.episode import Backend as Backend, run_episode as run_episode
+from .tasks.exploration import ExplorationTask as ExplorationTask
+from .tasks.clutter_exploration import ClutterExploration as ClutterExploration
+from .tasks.full_knowledge import FullKnowledgeSearch as FullKnowledgeSearch
+from .agents.backends import backends as backends
+from .agents.exploration import make_explorers as make_explorers
+
+# The arm: plans and their simulation.
+from .planning.plan import NoPlan as NoPlan, Plan as Plan
+from .planning.planner import PickPlacePlanner as PickPlacePlanner
+from .planning.planner_config import PlannerConfig as PlannerConfig
+from .station.arm_executor import ArmExecutor as ArmExecutor
+from .station.clutter_station import ClutterStation as ClutterStation
+from .station.station_simulation import StationSimulation as StationSimulation
+from .station.trajectory_file import (
+    read_trajectories as read_trajectories,
+    write_trajectories as write_trajectories,
+)
+from .tasks.feasibility import FeasibilityStudy as FeasibilityStudy
+
+# The closed loop.
+from .systems.closed_loop import ClosedLoop as ClosedLoop
+from .systems.scenario import Scenario as Scenario
+
+__version__: str
