@@ -22,14 +22,14 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 
 from drake_clutter.files import InputError, refusal, shown
 from drake_clutter.resources import shipped_path
-from drake_clutter.validation import Between, Model, Text, allowed, validate
-from drake_clutter.yaml_text import read_yaml
+from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
+from drake_clutter.yaml_io import read_yaml
 
 CATALOGUE_FILE = "catalogue.yaml"
 _CYLINDER_SIDES = 32
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _NONE: Any = Field(default_factory=dict)
-_Size = Annotated[float, Between(3, 1000)]
+_Size = Annotated[float, InRange(3, 1000)]
 _GRAMMAR_WORDS = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
 
 
@@ -56,7 +56,7 @@ class PairArrangement(Enum):
     STANDING = "standing"
 
 
-class Label(Model):
+class Label(StrictModel):
     """How the texture of a class is drawn. Colors are sRGB hex strings.
 
     Attributes:
@@ -75,11 +75,11 @@ class Label(Model):
 def _class_name(name: str) -> str:
     if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
         words = ", ".join(sorted(_GRAMMAR_WORDS))
-        raise allowed(f"a name of lower-case letters, digits and _, and none of {words}")
+        raise allowed_error(f"a name of lower-case letters, digits and _, and none of {words}")
     return name
 
 
-class ClassEntry(Model):
+class ClassEntry(StrictModel):
     """One class as it stands in `catalogue.yaml`.
 
     Attributes:
@@ -96,36 +96,40 @@ class ClassEntry(Model):
 
     shape: Shape
     size_mm: tuple[_Size, _Size, _Size] | None = None
-    mass_g: Annotated[float, Between(1e-6, 20_000)]
+    mass_g: Annotated[float, InRange(1e-6, 20_000)]
     source: str = ""
     pairs: tuple[PairArrangement, ...] = ()
     only_rest: Rest | None = None
-    mesh: Text | None = None
+    mesh: NonEmptyText | None = None
     label: Label = Label()
 
     @field_validator("size_mm")
     @classmethod
     def _round(cls, size: tuple[float, ...] | None, info: ValidationInfo) -> Any:
         if size and info.data.get("shape") is Shape.CYLINDER and size[0] != size[1]:
-            raise allowed("diameter, diameter, height: a cylinder's first two sizes are equal")
+            raise allowed_error(
+                "diameter, diameter, height: a cylinder's first two sizes are equal"
+            )
         return size
 
     @field_validator("pairs")
     @classmethod
     def _once(cls, pairs: tuple[PairArrangement, ...]) -> tuple[PairArrangement, ...]:
         if len(set(pairs)) != len(pairs):
-            raise allowed("each arrangement once")
+            raise allowed_error("each arrangement once")
         return pairs
 
     @model_validator(mode="after")
     def _size_or_mesh(self) -> Self:
         is_mesh = self.shape is Shape.MESH
         if is_mesh == (self.mesh is None) or is_mesh == (self.size_mm is not None):
-            raise allowed("`mesh` and no `size_mm` for a mesh, `size_mm` and no `mesh` for others")
+            raise allowed_error(
+                "`mesh` and no `size_mm` for a mesh, `size_mm` and no `mesh` for others"
+            )
         return self
 
 
-class CatalogueFile(Model):
+class CatalogueFile(StrictModel):
     """The schema of `catalogue.yaml`.
 
     Attributes:

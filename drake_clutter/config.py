@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.validation import (
-    Between,
+    InRange,
     NonNegative,
     config_class,
-    load_typed,
-    override,
+    load_config_as,
+    override_config,
     to_plain,
 )
 
@@ -32,7 +32,7 @@ class LayoutConfig:
     max_stack_height: NonNegative = 0.50
     lying_gap: NonNegative = 0.002
     standing_gap: NonNegative = 0.050
-    placement_tries: Annotated[int, Between(1)] = 100
+    placement_tries: Annotated[int, InRange(1)] = 100
 
 
 @config_class
@@ -57,16 +57,16 @@ class SettleConfig:
             calm_tilt_deg, ends it too: light objects under heavy ones chatter, and are never calm.
     """
 
-    time_step: Annotated[float, Between(1e-4, 0.02)] = 0.002
+    time_step: Annotated[float, InRange(1e-4, 0.02)] = 0.002
     jitter: NonNegative = 0.001
     max_displacement: NonNegative = 0.010
     max_tilt_deg: NonNegative = 8.0
-    max_time: Annotated[float, Between(0.1, 60.0)] = 2.0
+    max_time: Annotated[float, InRange(0.1, 60.0)] = 2.0
     rest_drift: NonNegative = 0.0025
     calm_speed: NonNegative = 0.0003
     calm_displacement: NonNegative = 0.001
     calm_tilt_deg: NonNegative = 0.3
-    calm_samples: Annotated[int, Between(1)] = 4
+    calm_samples: Annotated[int, InRange(1)] = 4
     still_displacement: NonNegative = 0.0005
 
 
@@ -82,9 +82,9 @@ class ExplorationConfig:
         release_height: Above its support, at which a placed object is let go [m].
     """
 
-    max_moves: Annotated[int, Between(1)] = 10
+    max_moves: Annotated[int, InRange(1)] = 10
     detection_reward: NonNegative = 1.0
-    collapse_penalty: Annotated[float, Between(-1e300, 0.0)] = -1.0
+    collapse_penalty: Annotated[float, InRange(-1e300, 0.0)] = -1.0
     clearance: NonNegative = 0.010
     release_height: NonNegative = 0.001
 
@@ -107,8 +107,8 @@ class ClutterConfig:
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> ClutterConfig:
-    """Return the simulated world, see `load_typed`."""
-    return load_typed(ClutterConfig(), path, settings, upgrade)
+    """Return the simulated world, see `load_config_as`."""
+    return load_config_as(ClutterConfig(), path, settings, upgrade)
 
 
 def upgrade(given: Any) -> Any:
@@ -151,7 +151,7 @@ def _with_complete_cells(given: Any) -> Any:
         return given
     made = {key: _with_complete_cells(value) for key, value in given.items()}
     if isinstance(cell := given.get("cell"), dict):
-        made["cell"] = to_plain(override(default_cell(), cell, "cell"))
+        made["cell"] = to_plain(override_config(default_cell(), cell, "cell"))
     return made
 
 

@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from drake_clutter.files import refusal, shown
-from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
+from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 Schema = TypeVar("Schema")
 
@@ -39,7 +39,7 @@ _POSE_FIELDS = {
     "yaw": ("rpy_deg", 2),
 }
 """Components of a pose that a setting may name."""
-_KINDS = {
+_TYPE_DESCRIPTIONS = {
     "bool": "true or false",
     "string": "a text",
     "float": "a number",
@@ -50,7 +50,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class Between:
+class InRange:
     """Annotation of an int or float: finite, between two values, and of that type.
 
     Attributes:
@@ -80,12 +80,12 @@ class Between:
         )
 
 
-def allowed(what: str) -> PydanticCustomError:
+def allowed_error(what: str) -> PydanticCustomError:
     """Return the error that a validator raises; `what` says what is allowed."""
     return PydanticCustomError("allowed", "{what}", {"what": what})
 
 
-def refused(what: str) -> PydanticCustomError:
+def rejected_error(what: str) -> PydanticCustomError:
     """Return the error that a validator raises.
 
     Args:
@@ -94,19 +94,19 @@ def refused(what: str) -> PydanticCustomError:
     return PydanticCustomError("refused", "{what}", {"what": what})
 
 
-Finite = Annotated[float, Between(-math.inf, math.inf)]
+Finite = Annotated[float, InRange(-math.inf, math.inf)]
 """Any finite number."""
-NonNegative = Annotated[float, Between(0.0, math.inf)]
+NonNegative = Annotated[float, InRange(0.0, math.inf)]
 """A finite number that is not negative."""
-Positive = Annotated[float, Between(1e-12, math.inf)]
+Positive = Annotated[float, InRange(1e-12, math.inf)]
 """A finite number above zero."""
-Share = Annotated[float, Between(0.0, 1.0)]
+Fraction = Annotated[float, InRange(0.0, 1.0)]
 """A number from 0 to 1."""
-Whole = Annotated[int, Between(-math.inf, math.inf)]
+Integer = Annotated[int, InRange(-math.inf, math.inf)]
 """Any whole number."""
 Flag = Annotated[bool, Strict()]
 """True or false."""
-Text = Annotated[str, Field(strict=True, min_length=1)]
+NonEmptyText = Annotated[str, Field(strict=True, min_length=1)]
 """A text that is not empty."""
 Vector3 = tuple[Finite, Finite, Finite]
 """Three finite numbers."""
@@ -158,11 +158,11 @@ def with_current_names(schema: type, given: Any) -> Any:
 def config_class(cls: type[Schema]) -> type[Schema]:
     """Return a class as a frozen, validated dataclass that takes no field but those declared."""
     config = ConfigDict(extra="forbid")
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
-    return cast(type[Schema], made)
+    decorated: Any = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
+    return cast(type[Schema], decorated)
 
 
-class Model(BaseModel):
+class StrictModel(BaseModel):
     """Base of what is read from files: frozen, and no field but those that are declared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,))
@@ -199,30 +199,30 @@ def validate(schema: type[Schema], given: Any, source: str) -> Schema:
 def _message(schema: Any, error: ErrorDetails) -> str:
     kind, loc = error["type"], error["loc"]
     if kind in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
-        owner, node = _place(schema, loc[:-1])
+        owner, node = _locate(schema, loc[:-1])
         names = ", ".join(node.get("properties", {}))
-        return f"{_joined(owner, loc[-1])}: is unknown; allowed are {names}"
+        return f"{_field_path(owner, loc[-1])}: is unknown; allowed are {names}"
     if kind in ("missing", "missing_argument"):
-        owner, node = _place(schema, loc[:-1])
+        owner, node = _locate(schema, loc[:-1])
         if "prefixItems" in node:
-            return _line(owner, error["input"], _list(node))
+            return _value_message(owner, error["input"], _describe_list(node))
         needed = ", ".join(node.get("required", {}))
-        return f"{_joined(owner, loc[-1])}: is missing; needed are {needed}"
-    field, node = _place(schema, loc)
+        return f"{_field_path(owner, loc[-1])}: is missing; needed are {needed}"
+    field, node = _locate(schema, loc)
     if kind == "refused":
         return f"{field}.{error['msg']}"
     if kind in ("union_tag_not_found", "union_tag_invalid"):
         tag = error["input"].get(node["discriminator"]["propertyName"])
-        field = _joined(field, node["discriminator"]["propertyName"])
-        return _line(field, tag, f"one of {', '.join(node['discriminator']['mapping'])}")
-    return _line(field, error["input"], _allowed(error, node))
+        field = _field_path(field, node["discriminator"]["propertyName"])
+        return _value_message(field, tag, f"one of {', '.join(node['discriminator']['mapping'])}")
+    return _value_message(field, error["input"], _describe_allowed(error, node))
 
 
-def _line(field: str, value: Any, what: str) -> str:
+def _value_message(field: str, value: Any, what: str) -> str:
     return f"{field}{': ' if field else ''}{shown(value)}; allowed is {what}"
 
 
-def _allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
+def _describe_allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
     kind = error["type"]
     if kind in ("literal_error", "enum"):
         values = [str(value) for value in node.get("enum", [node.get("const")])]
@@ -233,11 +233,11 @@ def _allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
     if kind == "too_short" and node.get("type") == "object":
         return "a mapping of at least one entry"
     if kind in ("list_type", "tuple_type", "too_long", "too_short"):
-        return _list(node)
-    return _KINDS.get(kind.split("_")[0], error["msg"])
+        return _describe_list(node)
+    return _TYPE_DESCRIPTIONS.get(kind.split("_")[0], error["msg"])
 
 
-def _list(node: Mapping[str, Any]) -> str:
+def _describe_list(node: Mapping[str, Any]) -> str:
     if "prefixItems" not in node:
         return "a list of at least one entry" if node.get("minItems") else "a list"
     items = node["prefixItems"]
@@ -245,34 +245,34 @@ def _list(node: Mapping[str, Any]) -> str:
     return f"a list of {len(items)} {what}"
 
 
-def _place(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
+def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
     """Return how a place of a document is named, and its part of the schema's JSON schema."""
     document = _json_schema(schema)
-    field, node = "", _resolved(document, document)
+    field, node = "", _resolve_reference(document, document)
     for part in loc:
         if part == "[key]":  # of a mapping with a key that is not allowed
             break
         if "discriminator" in node:  # the part is a member of the union, which no file names
-            node = _resolved(document, {"$ref": node["discriminator"]["mapping"][part]})
+            node = _resolve_reference(document, {"$ref": node["discriminator"]["mapping"][part]})
             continue
-        field = _joined(field, part)
+        field = _field_path(field, part)
         if isinstance(part, int):
             items = node.get("prefixItems", ())
             below = items[part] if part < len(items) else node.get("items")
         else:
             below = node.get("properties", {}).get(part) or node.get("additionalProperties")
-        node = _resolved(document, below)
+        node = _resolve_reference(document, below)
     return field, node
 
 
-def _joined(field: str, part: int | str) -> str:
+def _field_path(field: str, part: int | str) -> str:
     if isinstance(part, int):
         return f"{field}[{part}]"
     name = str(part) if str(part).isprintable() and len(str(part)) <= 40 else shown(part)
     return f"{field}.{name}" if field else name
 
 
-def _resolved(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
+def _resolve_reference(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
     while isinstance(node, dict) and ("$ref" in node or "anyOf" in node):
         reference = node.get("$ref", "").rsplit("/", 1)[-1]
         node = document["$defs"][reference] if reference else node["anyOf"][0]
@@ -286,14 +286,14 @@ def to_plain(value: Any) -> Any:
 
 def config_yaml(config: Any) -> str:
     """Return a config as YAML, every field written out."""
-    return yaml_text(to_plain(config), width=100)
+    return to_yaml(to_plain(config), width=100)
 
 
-def load_typed(
+def load_config_as(
     defaults: Schema,
     path: Path | None = None,
     settings: Sequence[str] = (),
-    convert: Callable[[Any], Any] = lambda given: given,
+    upgrade: Callable[[Any], Any] = lambda given: given,
 ) -> Schema:
     """Return a config: the defaults, over them a file's fields, over those single fields.
 
@@ -302,7 +302,7 @@ def load_typed(
         path: A YAML file.
         settings: Fields as text, such as "layout.stack_gap=0.02"; x, y, z, roll, pitch and yaw
             name a pose's components, numbers a list's.
-        convert: Turns what older versions wrote into today's fields.
+        upgrade: Turns what older versions wrote into today's fields.
 
     Raises:
         InputError: The file cannot be read, an unknown field, or a value that is not allowed.
@@ -310,10 +310,10 @@ def load_typed(
     config = defaults
     if path is not None:
         given = read_yaml(path, "a mapping of config fields")
-        config = override(config, convert({} if given is None else given), str(path))
+        config = override_config(config, upgrade({} if given is None else given), str(path))
     for setting in settings:
         given = _parse_setting(setting, config)
-        config = override(config, convert(given), f"--set {setting}")
+        config = override_config(config, upgrade(given), f"--set {setting}")
     return config
 
 
@@ -325,31 +325,31 @@ def _parse_setting(setting: str, config: Any) -> Any:
     value = parse_yaml(text, f"--set {setting}", "FIELD=VALUE with a YAML value")
     parts = name.split(".")
     for depth in range(len(parts) - 1, -1, -1):
-        owner, part = _at(config, parts[:depth]), parts[depth]
-        if part in _POSE_FIELDS and {"translation", "rpy_deg"} <= _fields(owner).keys():
+        owner, part = _get_nested(config, parts[:depth]), parts[depth]
+        if part in _POSE_FIELDS and {"translation", "rpy_deg"} <= _field_values(owner).keys():
             part, index = _POSE_FIELDS[part]
-            value = _replaced(getattr(owner, part), index, value)
+            value = _with_item(getattr(owner, part), index, value)
         if isinstance(owner, tuple) and part.isdecimal() and int(part) < len(owner):
-            value = _replaced(owner, int(part), _merged(owner[int(part)], value))
+            value = _with_item(owner, int(part), _merge(owner[int(part)], value))
         else:
             value = {**(owner if isinstance(owner, dict) else {}), part: value}
     return value
 
 
-def _replaced(values: tuple[Any, ...], index: int, value: Any) -> list[Any]:
+def _with_item(values: tuple[Any, ...], index: int, value: Any) -> list[Any]:
     return [value if k == index else old for k, old in enumerate(values)]
 
 
-def _at(config: Any, parts: Sequence[str]) -> Any:
+def _get_nested(config: Any, parts: Sequence[str]) -> Any:
     for part in parts:
         if isinstance(config, tuple):
             config = dict(enumerate(config)).get(int(part) if part.isdecimal() else -1)
         else:
-            config = (config if isinstance(config, dict) else _fields(config)).get(part)
+            config = (config if isinstance(config, dict) else _field_values(config)).get(part)
     return config
 
 
-def _fields(config: Any) -> dict[str, Any]:
+def _field_values(config: Any) -> dict[str, Any]:
     """Return the fields of a model or dataclass by name; none of anything else."""
     if isinstance(config, BaseModel):
         return dict(config)
@@ -358,7 +358,7 @@ def _fields(config: Any) -> dict[str, Any]:
     return {}
 
 
-def override(defaults: Schema, given: Any, source: str) -> Schema:
+def override_config(defaults: Schema, given: Any, source: str) -> Schema:
     """Return a config with the fields of a document over its own.
 
     A list, and a part of another kind, replaces the whole. So does what is given with another
@@ -368,18 +368,18 @@ def override(defaults: Schema, given: Any, source: str) -> Schema:
     Raises:
         InputError: The first field that cannot be used.
     """
-    return validate(type(defaults), _merged(defaults, given), source)
+    return validate(type(defaults), _merge(defaults, given), source)
 
 
-def _merged(config: Any, given: Any) -> Any:
+def _merge(config: Any, given: Any) -> Any:
     if not isinstance(given, dict):
         return given
     if isinstance(config, dict):
-        return {key: _merged(config.get(key), value) for key, value in given.items()}
-    fields = _fields(config)
+        return {key: _merge(config.get(key), value) for key, value in given.items()}
+    fields = _field_values(config)
     given = with_current_names(type(config), given)
     if given.get("kind", fields.get("kind")) != fields.get("kind"):
         return given
     if len(given) > 1 and given.get("model", fields.get("model")) != fields.get("model"):
         return given
-    return {**fields, **{key: _merged(fields.get(key), value) for key, value in given.items()}}
+    return {**fields, **{key: _merge(fields.get(key), value) for key, value in given.items()}}

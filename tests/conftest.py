@@ -38,7 +38,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.validation import load_typed
+from drake_clutter.validation import load_config_as
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
@@ -77,7 +77,7 @@ def tray(side: float) -> Support:
 
 def cell_with(*settings: str) -> WorkCell:
     """The default cell with some fields changed, such as "robot.base.x=-0.8"."""
-    return load_typed(DEFAULT_CELL, settings=settings)
+    return load_config_as(DEFAULT_CELL, settings=settings)
 
 
 def world_with(*settings: str) -> ClutterConfig:

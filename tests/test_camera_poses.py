@@ -34,7 +34,7 @@ from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.belief import legal_moves
-from drake_clutter.validation import load_typed
+from drake_clutter.validation import load_config_as
 
 CELL = load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml"))
 CAMERA = CELL.camera
@@ -334,7 +334,7 @@ def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
 )
 def test_a_camera_that_sees_nothing_of_the_support_is_refused(setting: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
-        load_typed(DEFAULT_CELL, settings=[setting])
+        load_config_as(DEFAULT_CELL, settings=[setting])
     assert "\n" not in str(raised.value)
 
 
@@ -357,8 +357,8 @@ def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
 
 
 def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
-    scenario = load_typed(
-        Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], convert=upgrade
+    scenario = load_config_as(
+        Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], upgrade=upgrade
     )
     assert not scenario.world.cell.camera.depth_noise
     assert scenario.world.cell.camera.pose == DEFAULT_CELL.camera.pose

@@ -33,7 +33,7 @@ from drake_clutter.systems.station_camera import empty_depth
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.validation import load_typed
+from drake_clutter.validation import load_config_as
 
 COVERED = scene_of(
     resting("gelatin_box", xy=(0.05, 0.0)),
@@ -261,7 +261,7 @@ def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
     (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
-    told = load_typed(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade)
+    told = load_config_as(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade)
     cell = told.world.cell
     assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == (
         (-0.65, 0.0, 0.3),

@@ -13,7 +13,7 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.clearance import ClearanceScene
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.robot_plant import links_in_place
-from drake_clutter.validation import override, to_plain
+from drake_clutter.validation import override_config, to_plain
 
 _LINK = """
   <link name="{name}">
@@ -52,7 +52,7 @@ def arm(folder: Path, kind: str, axis: str, length: float) -> RobotSpec:
 
 def among_posts(spec: RobotSpec, p_TF: tuple[float, float, float]) -> WorkCell:
     post = {"name": "post", "pose": {"translation": list(p_TF)}, "box": [0.1, 0.1, 0.6]}
-    return override(DEFAULT_CELL, {"robot": to_plain(spec), "fixtures": [post]}, "cell")
+    return override_config(DEFAULT_CELL, {"robot": to_plain(spec), "fixtures": [post]}, "cell")
 
 
 @pytest.mark.parametrize("name", CELLS)

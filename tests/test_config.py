@@ -10,7 +10,7 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig, load_config, upgrade
 from drake_clutter.files import InputError
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.validation import config_yaml, load_typed
+from drake_clutter.validation import config_yaml, load_config_as
 
 
 def config_file(folder: Path, text: str) -> Path:
@@ -71,7 +71,7 @@ def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
 )
 def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"world\.yaml: .*allowed"):
-        load_typed(Scenario(), config_file(tmp_path, text), convert=upgrade)
+        load_config_as(Scenario(), config_file(tmp_path, text), upgrade=upgrade)
 
 
 def test_two_cameras_are_read_back(tmp_path: Path) -> None:

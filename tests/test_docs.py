@@ -22,8 +22,8 @@ from drake_clutter.cli import app
 from drake_clutter.config import load_config, upgrade
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.validation import load_typed, to_plain, validate
-from drake_clutter.yaml_text import parse_yaml
+from drake_clutter.validation import load_config_as, to_plain, validate
+from drake_clutter.yaml_io import parse_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -114,7 +114,7 @@ def test_yaml_loads(page: Path, folder: Path) -> None:
         elif "objects" in fields and "version" in fields:
             load_scene(path, load_catalogue())
         elif "agent" in fields:
-            load_typed(Scenario(), path)
+            load_config_as(Scenario(), path)
         elif fields <= {"layout", "settle", "exploration", "cell"}:
             load_config(path)
         else:
@@ -180,7 +180,7 @@ def test_training_scripts_parse(page: Path) -> None:
         if "settings" in given:
             training = getattr(module, name.title().replace("_", ""))
             config = ROOT / given["config"] if given["config"] else None
-            load_typed(training(), config, given["settings"] or [], upgrade)
+            load_config_as(training(), config, given["settings"] or [], upgrade)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -12,7 +12,7 @@ PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
     0: {
         *("assets", "catalogue", "files", "learning", "records", "resources", "seeding"),
-        *("statistics", "validation", "workers", "yaml_text"),
+        *("statistics", "validation", "workers", "yaml_io"),
     },
     1: {"cell", "config", "grammar"},
     2: {"robots", "scenes", "stability"},
@@ -22,7 +22,7 @@ FLOORS = {
     6: {"station"},
     7: {"agents"},
     8: {"systems"},
-    9: {"cli", "commands", "doctor", "reports"},
+    9: {"cli", "commands", "installation_check", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(

@@ -15,8 +15,8 @@ from drake_clutter.config import upgrade
 from drake_clutter.files import InputError
 from drake_clutter.grammar.graph import OBJECT_SLOT
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.validation import load_typed
-from drake_clutter.yaml_text import yaml_text
+from drake_clutter.validation import load_config_as
+from drake_clutter.yaml_io import to_yaml
 
 
 def places(value: Any, at: Path_ = ()) -> Iterator[Path_]:
@@ -149,10 +149,10 @@ def test_any_value_anywhere_in_a_config_loads_or_is_refused(
             document = changed(document, path, value)
         except (KeyError, IndexError, TypeError):
             continue
-    fuzzed.write_text(yaml_text(document))
+    fuzzed.write_text(to_yaml(document))
     message = f"{fuzzed}: "
     try:
-        load_typed(Scenario(), fuzzed, convert=upgrade)
+        load_config_as(Scenario(), fuzzed, upgrade=upgrade)
     except InputError as refusal:
         message = str(refusal)
     assert message.startswith(f"{fuzzed}: ")

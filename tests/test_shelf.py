@@ -18,7 +18,7 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.station.arm_executor import ArmExecutor
-from drake_clutter.validation import load_typed
+from drake_clutter.validation import load_config_as
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_the_arm_reaches_in_or_says_why_not(
     shelf: ClutterConfig, board: float, result: MoveResult
 ) -> None:
     """Under the high board a box is moved; a low one leaves the arm no room."""
-    world = load_typed(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
+    world = load_config_as(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
     picked = resting("pudding_box", xy=(-0.05, 0.1))
     scene = Scene((picked, resting("cracker_box", xy=(0.1, -0.2))), world.cell.support)
     X_TO_place = picked.X_TO.moved((0.02, -0.12, 0.001))

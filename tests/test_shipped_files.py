@@ -13,8 +13,8 @@ from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_h
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.validation import load_typed, override
-from drake_clutter.yaml_text import parse_yaml, yaml_text
+from drake_clutter.validation import load_config_as, override_config
+from drake_clutter.yaml_io import parse_yaml, to_yaml
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "training/configs").glob("*.yaml"))
@@ -47,13 +47,15 @@ def name_of(path: Path) -> str:
 @pytest.mark.parametrize("path", CELLS, ids=name_of)
 def test_cells(path: Path, tmp_path: Path) -> None:
     cell = load_cell(path)
-    (tmp_path / "cell.yaml").write_text(yaml_text(cell.model_dump(mode="json")))
+    (tmp_path / "cell.yaml").write_text(to_yaml(cell.model_dump(mode="json")))
     assert load_cell(tmp_path / "cell.yaml") == cell
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=name_of)
 def test_training_configs(path: Path) -> None:
-    assert load_typed(script_config(path.stem), path, convert=upgrade) != script_config(path.stem)
+    assert load_config_as(script_config(path.stem), path, upgrade=upgrade) != script_config(
+        path.stem
+    )
 
 
 @pytest.mark.parametrize("path", CHECKPOINTS, ids=name_of)
@@ -61,7 +63,7 @@ def test_checkpoints_and_their_configs(path: Path) -> None:
     given = upgrade(load_checkpoint(path).about["config"])
     if "detector" in path.stem:
         del given["layout"]  # of version 0.1; a detector has no use for it
-    config = override(script_config(path.stem), given, str(path))
+    config = override_config(script_config(path.stem), given, str(path))
     assert (config.cell if "detector" in path.stem else config.world.cell) == DEFAULT_CELL
 
 
@@ -94,11 +96,11 @@ def test_results(path: Path) -> None:
         if not isinstance(value, dict):
             continue
         if key == "scenario":
-            assert override(Scenario(), upgrade(value), str(path)).world.cell == DEFAULT_CELL
+            assert override_config(Scenario(), upgrade(value), str(path)).world.cell == DEFAULT_CELL
         elif key in ("arm", "cell"):
-            assert override(DEFAULT_CELL, upgrade_cell(value), str(path)) == DEFAULT_CELL
+            assert override_config(DEFAULT_CELL, upgrade_cell(value), str(path)) == DEFAULT_CELL
         else:
             of_training = "learning" in value
             default: Any = script_config("sg") if of_training else ClutterConfig()
-            config = override(default, upgrade(value), str(path))
+            config = override_config(default, upgrade(value), str(path))
             assert (config.world if of_training else config).cell == DEFAULT_CELL

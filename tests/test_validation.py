@@ -16,28 +16,28 @@ from drake_clutter.config import load_config
 from drake_clutter.files import InputError
 from drake_clutter.resources import shipped_path
 from drake_clutter.validation import (
-    Between,
     Finite,
     Flag,
-    Model,
+    Fraction,
+    InRange,
+    Integer,
+    NonEmptyText,
     NonNegative,
     Positive,
-    Share,
-    Text,
+    StrictModel,
     Vector3,
-    Whole,
     config_class,
     config_yaml,
-    load_typed,
-    override,
+    load_config_as,
+    override_config,
     renamed_fields,
     to_plain,
     validate,
 )
-from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
+from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 
-class Cup(Model):
+class Cup(StrictModel):
     """One member of a union."""
 
     kind: Literal["cup"] = "cup"
@@ -45,14 +45,14 @@ class Cup(Model):
     rims: tuple[Vector3, ...] = ()
 
 
-class Jaws(Model):
+class Jaws(StrictModel):
     """The other one."""
 
     kind: Literal["jaws"] = "jaws"
-    width: Annotated[float, Between(0.01, 0.2)]
+    width: Annotated[float, InRange(0.01, 0.2)]
 
 
-class Lamp(Model):
+class Lamp(StrictModel):
     """An entry of a collection by names."""
 
     pose: PoseSpec = PoseSpec()
@@ -66,11 +66,11 @@ class Room:
     tool: Annotated[Cup | Jaws, Field(discriminator="kind")] = Cup()
     lamps: dict[str, Lamp] = field(default_factory=lambda: {"main": Lamp()})
     shelf: tuple[Lamp, ...] = ()
-    name: Text = "room"
+    name: NonEmptyText = "room"
     lit: Flag = True
-    seats: Annotated[int, Between(1, 8)] = 2
-    storey: Whole = 0
-    share: Share = 0.5
+    seats: Annotated[int, InRange(1, 8)] = 2
+    storey: Integer = 0
+    share: Fraction = 0.5
     height: Finite | None = None
     door: Literal["left", "right"] = "left"
     steps: tuple[Positive, ...] = (1.0, 2.0)
@@ -146,7 +146,7 @@ def test_a_misuse_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "room.yaml"
     path.write_text(text + "\n")
     with pytest.raises(InputError) as refused:
-        load_typed(Room(), path)
+        load_config_as(Room(), path)
     line = str(refused.value)
     assert line.startswith(f"{path}: ")
     assert message in line
@@ -174,7 +174,7 @@ LONG = "x" * 5000
 )
 def test_a_long_value_is_cut(given: Any) -> None:
     with pytest.raises(InputError, match="room: ") as refused:
-        override(Room(), given, "room")
+        override_config(Room(), given, "room")
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) <= 310
 
@@ -208,7 +208,7 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
 )
 def test_a_broken_setting(setting: str, message: str) -> None:
     with pytest.raises(InputError) as refused:
-        load_typed(Room(), settings=[setting])
+        load_config_as(Room(), settings=[setting])
     assert message in str(refused.value)
 
 
@@ -221,7 +221,7 @@ def test_settings_change_one_field_each() -> None:
         "tool.radius=2E-2",
         "name=1e",
     ]
-    made = load_typed(two, settings=settings)
+    made = load_config_as(two, settings=settings)
     pose = PoseSpec(rpy_deg=(0.0, 0.0, 90.0))
     assert made.lamps == {"main": Lamp(power=2.0), "side": Lamp(power=0.001, pose=pose)}
     assert (made.steps, made.tool, made.name) == ((1.0, 5.0), Cup(radius=0.02), "1e")
@@ -230,7 +230,7 @@ def test_settings_change_one_field_each() -> None:
 def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> None:
     two = Room(lamps={"main": Lamp(power=2.0), "side": Lamp(power=3.0)})
     given = {"lamps": {"new": {"power": 4.0}, "side": {"pose": {"translation": [1, 2, 3]}}}}
-    made = override(two, given, "room")
+    made = override_config(two, given, "room")
     pose = PoseSpec(translation=(1.0, 2.0, 3.0))
     assert list(made.lamps.items()) == [
         ("new", Lamp(power=4.0)),
@@ -239,23 +239,23 @@ def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> No
 
 
 def test_another_kind_is_not_merged_with_the_one_before() -> None:
-    assert override(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(
+    assert override_config(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(
         width=0.1
     )
-    assert override(Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room").tool == Cup(
-        radius=0.5
-    )
+    assert override_config(
+        Room(tool=Cup(radius=0.5)), {"tool": {"kind": "cup"}}, "room"
+    ).tool == Cup(radius=0.5)
 
 
 @pytest.mark.parametrize("name", ["ur5e", "iiwa14"])
 def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path) -> None:
     path = shipped_path(f"models/cells/{name}_epick_tray.yaml")
     file = tmp_path / "config.yaml"
-    file.write_text(yaml_text({"cell": read_yaml(path, "a cell")}))
+    file.write_text(to_yaml({"cell": read_yaml(path, "a cell")}))
     config = load_config(file)
     assert config.cell.robot == load_cell(path).robot
     other = "package://drake_clutter_models/robots/ur3e.sdf"
-    changed = load_typed(config, settings=[f"cell.robot.model={other}"]).cell.robot
+    changed = load_config_as(config, settings=[f"cell.robot.model={other}"]).cell.robot
     assert changed == config.cell.robot.model_copy(update={"model": other})
 
 
@@ -265,14 +265,14 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     )
     assert validate(Room, to_plain(room), "room") == room
     (tmp_path / "room.yaml").write_text(config_yaml(room))
-    assert load_typed(Room(), tmp_path / "room.yaml") == room
+    assert load_config_as(Room(), tmp_path / "room.yaml") == room
 
 
 def test_numbers_with_an_exponent_are_numbers() -> None:
     text = "[1e-3, 1E5, -2.e+1, .5e2, 1e-05, +1e3, 1.5e3]"
     assert parse_yaml(text, "") == [0.001, 1e5, -20.0, 50.0, 1e-5, 1e3, 1500.0]
     texts = ["1e-3", "e3", "1e", "1e3x", "1e-05", "-1E5", "yes", "12", "1:30", "", "a: b", "ö"]
-    assert parse_yaml(yaml_text(texts), "") == texts
+    assert parse_yaml(to_yaml(texts), "") == texts
     assert parse_yaml("[e3, 1e, 1e3x, '1e3']", "") == ["e3", "1e", "1e3x", "1e3"]
 
 
@@ -330,7 +330,7 @@ def test_yaml_is_read_in_one_place() -> None:
         for path in files
         if "yaml.safe_load" in path.read_text() or "yaml.load(" in path.read_text()
     }
-    assert users == {"yaml_text.py"}
+    assert users == {"yaml_io.py"}
 
 
 @config_class
@@ -347,8 +347,8 @@ class _Holder:
 def test_earlier_names_of_fields_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text("settle: {rest_drift: 0.5}\n")
-    assert load_typed(_Holder(), path).settle.max_rest_displacement == 0.5
-    assert load_typed(_Holder(), None, ["settle.rest_drift=0.7"]) == _Holder(_Renamed(0.7))
+    assert load_config_as(_Holder(), path).settle.max_rest_displacement == 0.5
+    assert load_config_as(_Holder(), None, ["settle.rest_drift=0.7"]) == _Holder(_Renamed(0.7))
     assert validate(_Holder, {"settle": {"rest_drift": 0.5}}, "a") == _Holder(_Renamed(0.5))
     assert to_plain(_Holder()) == {"settle": {"max_rest_displacement": 0.0025}}
     both = {"settle": {"rest_drift": 0.5, "max_rest_displacement": 0.4}}

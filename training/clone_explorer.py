@@ -19,7 +19,7 @@ from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.validation import Between, config_class, load_typed
+from drake_clutter.validation import InRange, config_class, load_config_as
 
 
 @config_class
@@ -33,7 +33,7 @@ class CloneExplorer(ExplorerTraining):
     """
 
     teacher: str = "training/checkpoints/teacher.safetensors"
-    evaluate_every: Annotated[int, Between(1)] = 5
+    evaluate_every: Annotated[int, InRange(1)] = 5
     learning: CloningConfig = field(default_factory=CloningConfig)
 
 
@@ -52,7 +52,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_typed(CloneExplorer(), config, settings or [], upgrade)
+    given = load_config_as(CloneExplorer(), config, settings or [], upgrade)
     one_thread_per_operation()
     chosen = device_of(device)
     environment = given.environment()

@@ -27,7 +27,7 @@ from drake_clutter.perception.segmentation_learning import (
     example,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import Between, Flag, config_class, load_typed
+from drake_clutter.validation import Flag, InRange, config_class, load_config_as
 
 CHECKPOINT = "detector.safetensors"
 
@@ -47,13 +47,13 @@ class TrainDetector:
     """
 
     images: str = "runs/images"
-    held_out: Annotated[int, Between(0)] = 200
+    held_out: Annotated[int, InRange(0)] = 200
     objects: str = "pantry14"
     catalogue: str = ""
     looks_at_color: Flag = False
     warm_start: str = ""
-    seed: Annotated[int, Between(0)] = 0
-    evaluate_every: Annotated[int, Between(1)] = 250
+    seed: Annotated[int, InRange(0)] = 0
+    evaluate_every: Annotated[int, InRange(1)] = 250
     learning: SegmentationConfig = field(default_factory=SegmentationConfig)
     cell: WorkCell = field(default_factory=default_cell)
 
@@ -74,7 +74,7 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
 ) -> None:
     """Trains, evaluates as it goes, and writes detector.safetensors."""
-    given = load_typed(TrainDetector(), config, settings or [], upgrade)
+    given = load_config_as(TrainDetector(), config, settings or [], upgrade)
     torch.set_num_threads(threads)
     chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
     classes = [

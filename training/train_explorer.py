@@ -20,7 +20,7 @@ from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, told_in_one_line
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.validation import Between, Flag, config_class, load_typed
+from drake_clutter.validation import Flag, InRange, config_class, load_config_as
 
 
 @config_class
@@ -36,7 +36,7 @@ class TrainExplorer(ExplorerTraining):
 
     privileged: Flag = True
     warm_start: str = ""
-    evaluate_every: Annotated[int, Between(1)] = 15_000
+    evaluate_every: Annotated[int, InRange(1)] = 15_000
     learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
 
 
@@ -55,7 +55,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_typed(TrainExplorer(), config, settings or [], upgrade)
+    given = load_config_as(TrainExplorer(), config, settings or [], upgrade)
     one_thread_per_operation()
     environment = given.environment(privileged=given.privileged)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))

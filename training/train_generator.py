@@ -23,7 +23,7 @@ from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
-from drake_clutter.validation import Between, NonNegative, config_class, load_typed
+from drake_clutter.validation import InRange, NonNegative, config_class, load_config_as
 
 CHECKPOINT = "generator.safetensors"
 
@@ -44,11 +44,11 @@ class TrainGenerator:
 
     objects: str = "ycb7"
     catalogue: str = ""
-    seed: Annotated[int, Between(0)] = 0
+    seed: Annotated[int, InRange(0)] = 0
     warm_start: str = ""
-    evaluate_every: Annotated[int, Between(1)] = 32_000
-    evaluation_scenes: Annotated[int, Between(1)] = 256
-    save_every: Annotated[int, Between(1)] = 64_000
+    evaluate_every: Annotated[int, InRange(1)] = 32_000
+    evaluation_scenes: Annotated[int, InRange(1)] = 256
+    save_every: Annotated[int, InRange(1)] = 64_000
     sampling_temperature: NonNegative = 0.0
     task: GenerationTask = field(default_factory=GenerationTask)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
@@ -95,7 +95,7 @@ def main(
     ] = PARTS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
-    given = load_typed(TrainGenerator(), config, settings or [], upgrade)
+    given = load_config_as(TrainGenerator(), config, settings or [], upgrade)
     chosen = device_of(device)
     one_thread_per_operation()
     classes = load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(

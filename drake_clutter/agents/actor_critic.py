@@ -22,7 +22,7 @@ from drake_clutter.learning.checkpoint import (
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import InRange, NonNegative, config_class
 
 
 @config_class
@@ -41,17 +41,17 @@ class ActorCriticConfig:
         width: of the network.
     """
 
-    steps: Annotated[int, Between(1)] = 150_000
-    episodes: Annotated[int, Between(1)] = 96
-    passes: Annotated[int, Between(1)] = 4
-    batch: Annotated[int, Between(1)] = 256
-    discount: Annotated[float, Between(0.0, 1.0)] = 0.95
-    trace: Annotated[float, Between(0.0, 1.0)] = 0.9
-    clip: Annotated[float, Between(1e-06)] = 0.2
+    steps: Annotated[int, InRange(1)] = 150_000
+    episodes: Annotated[int, InRange(1)] = 96
+    passes: Annotated[int, InRange(1)] = 4
+    batch: Annotated[int, InRange(1)] = 256
+    discount: Annotated[float, InRange(0.0, 1.0)] = 0.95
+    trace: Annotated[float, InRange(0.0, 1.0)] = 0.9
+    clip: Annotated[float, InRange(1e-06)] = 0.2
     entropy: NonNegative = 0.01
     value: NonNegative = 0.5
     learning_rate: NonNegative = 1e-3
-    width: Annotated[int, Between(1)] = 32
+    width: Annotated[int, InRange(1)] = 32
 
 
 class ActorCritic:

@@ -30,7 +30,7 @@ from drake_clutter.learning.checkpoint import (
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import GraphObservation
-from drake_clutter.validation import Between, Flag, NonNegative, config_class
+from drake_clutter.validation import Flag, InRange, NonNegative, config_class
 
 
 @config_class
@@ -45,13 +45,13 @@ class CloningConfig:
         width: of the network.
     """
 
-    rounds: Annotated[int, Between(1)] = 40
-    episodes: Annotated[int, Between(1)] = 100
+    rounds: Annotated[int, InRange(1)] = 40
+    episodes: Annotated[int, InRange(1)] = 100
     dagger: Flag = True
-    updates: Annotated[int, Between(1)] = 400
-    batch: Annotated[int, Between(1)] = 128
+    updates: Annotated[int, InRange(1)] = 400
+    batch: Annotated[int, InRange(1)] = 128
     learning_rate: NonNegative = 1e-3
-    width: Annotated[int, Between(1)] = 32
+    width: Annotated[int, InRange(1)] = 32
 
 
 class Cloning:

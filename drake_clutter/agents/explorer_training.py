@@ -11,7 +11,7 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.validation import Between, config_class
+from drake_clutter.validation import InRange, config_class
 
 CHECKPOINT = "explorer.safetensors"
 
@@ -30,11 +30,11 @@ class ExplorerTraining:
 
     scenes: str = "training/scenes/train_sg_star.json"
     catalogue: str = ""
-    seed: Annotated[int, Between(0)] = 0
+    seed: Annotated[int, InRange(0)] = 0
     fidelity: str = "equilibrium"
-    max_moves: Annotated[int, Between(1)] = 20
-    most_objects: Annotated[int, Between(1, 64)] = 24
-    evaluation_episodes: Annotated[int, Between(1)] = 200
+    max_moves: Annotated[int, InRange(1)] = 20
+    most_objects: Annotated[int, InRange(1, 64)] = 24
+    evaluation_episodes: Annotated[int, InRange(1)] = 200
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
     def environment(self, *, privileged: bool = False) -> ClutterExploration:

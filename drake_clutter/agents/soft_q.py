@@ -28,7 +28,7 @@ from drake_clutter.learning.checkpoint import (
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import InRange, NonNegative, config_class
 
 PARTS = 2
 """Of an update, that are worked on side by side; always so many, so that the number of threads changes no result."""
@@ -55,19 +55,19 @@ class SoftQConfig:
         width: of the network.
     """
 
-    steps: Annotated[int, Between(1)] = 640_000
-    environments: Annotated[int, Between(1)] = 32
-    batch: Annotated[int, Between(1)] = 128
-    segment: Annotated[int, Between(1)] = 8
-    trace: Annotated[float, Between(0.0, 1.0)] = 0.95
-    steps_per_update: Annotated[int, Between(1)] = 4
-    replay: Annotated[int, Between(1)] = 100_000
-    warm_up: Annotated[int, Between(0)] = 4_000
+    steps: Annotated[int, InRange(1)] = 640_000
+    environments: Annotated[int, InRange(1)] = 32
+    batch: Annotated[int, InRange(1)] = 128
+    segment: Annotated[int, InRange(1)] = 8
+    trace: Annotated[float, InRange(0.0, 1.0)] = 0.95
+    steps_per_update: Annotated[int, InRange(1)] = 4
+    replay: Annotated[int, InRange(1)] = 100_000
+    warm_up: Annotated[int, InRange(0)] = 4_000
     learning_rate: NonNegative = 1e-3
-    halve_every: Annotated[int, Between(1)] = 128_000
-    temperature: Annotated[float, Between(1e-06)] = 0.25
-    target_rate: Annotated[float, Between(0.0, 1.0)] = 0.005
-    width: Annotated[int, Between(1)] = 32
+    halve_every: Annotated[int, InRange(1)] = 128_000
+    temperature: Annotated[float, InRange(1e-06)] = 0.25
+    target_rate: Annotated[float, InRange(0.0, 1.0)] = 0.005
+    width: Annotated[int, InRange(1)] = 32
 
 
 class Episode(NamedTuple):

@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform
 from drake_clutter.cell.pinhole import FARTHEST, NEAREST, Floats, Pinhole
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.support import Support
-from drake_clutter.validation import Between, Flag, Model
+from drake_clutter.validation import Flag, InRange, StrictModel
 
 D435_FOV_Y_DEG = 42.5
 """Vertical field of view of the color stream of an Intel RealSense D435 [deg] (data sheet)."""
@@ -38,7 +38,7 @@ def pixel_grid(shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.stack([column, row], axis=-1)
 
 
-class Camera(Model):
+class Camera(StrictModel):
     """A pinhole camera at a pose.
 
     The defaults are the color stream of an Intel RealSense D435 at 640 x 480 (vertical field of view 42.5 deg, data sheet).
@@ -53,10 +53,10 @@ class Camera(Model):
     """
 
     pose: PoseSpec
-    width: Annotated[int, Between(16, 4096)] = 640
-    height: Annotated[int, Between(16, 4096)] = 480
-    fov_y_deg: Annotated[float, Between(1.0, 170.0)] = D435_FOV_Y_DEG
-    visibility_threshold: Annotated[float, Between(0.0, 1.0)] = 0.30
+    width: Annotated[int, InRange(16, 4096)] = 640
+    height: Annotated[int, InRange(16, 4096)] = 480
+    fov_y_deg: Annotated[float, InRange(1.0, 170.0)] = D435_FOV_Y_DEG
+    visibility_threshold: Annotated[float, InRange(0.0, 1.0)] = 0.30
     depth_noise: Flag = True
 
     @staticmethod

@@ -6,12 +6,12 @@ from pydantic import model_validator
 
 from drake_clutter.cell.model_file import MaybeModelFile
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Model, Share, Text, allowed
+from drake_clutter.validation import Fraction, InRange, NonEmptyText, StrictModel, allowed_error
 
-Extent = Annotated[float, Between(0.001, 10.0)]
+Extent = Annotated[float, InRange(0.001, 10.0)]
 
 
-class Fixture(Model):
+class Fixture(StrictModel):
     """A box, or a model of a file, that does not move.
 
     Attributes:
@@ -22,14 +22,14 @@ class Fixture(Model):
         color: Red, green, blue and opacity, 0 to 1; None: it is not drawn.
     """
 
-    name: Text
+    name: NonEmptyText
     pose: PoseSpec = PoseSpec()
     box: tuple[Extent, Extent, Extent] | None = None
     model: MaybeModelFile = ""
-    color: tuple[Share, Share, Share, Share] | None = None
+    color: tuple[Fraction, Fraction, Fraction, Fraction] | None = None
 
     @model_validator(mode="after")
     def _box_or_model(self) -> Self:
         if (self.box is None) == (self.model == ""):
-            raise allowed("either a box or a model")
+            raise allowed_error("either a box or a model")
         return self

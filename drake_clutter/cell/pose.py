@@ -6,10 +6,10 @@ from functools import lru_cache
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_clutter.validation import Model, Vector3
+from drake_clutter.validation import StrictModel, Vector3
 
 
-class PoseSpec(Model):
+class PoseSpec(StrictModel):
     """A pose X_AB.
 
     Attributes:

@@ -7,10 +7,17 @@ from pydrake.math import RigidTransform
 
 from drake_clutter.cell.model_file import ModelFile
 from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.validation import Between, Finite, Model, Positive, Text, refused
+from drake_clutter.validation import (
+    Finite,
+    InRange,
+    NonEmptyText,
+    Positive,
+    StrictModel,
+    rejected_error,
+)
 
 
-class JointLimits(Model):
+class JointLimits(StrictModel):
     """Limits of each joint, in the order of the joints; None: as the model file has them.
 
     Attributes:
@@ -28,7 +35,7 @@ class JointLimits(Model):
     torque: tuple[Positive, ...] | None = None
 
 
-class RobotSpec(Model):
+class RobotSpec(StrictModel):
     """Which robot, and where.
 
     Attributes:
@@ -44,14 +51,14 @@ class RobotSpec(Model):
     """
 
     model: ModelFile
-    base_link: Text
-    tool_frame: Text
+    base_link: NonEmptyText
+    tool_frame: NonEmptyText
     base: PoseSpec
     home: Annotated[tuple[Finite, ...], Field(min_length=1)]
     limits: JointLimits
     ik: Literal["ur", "numerical"] = "numerical"
     payload: Positive
-    pedestal_side: Annotated[float, Between(0.0, 1.0)] = 0.0
+    pedestal_side: Annotated[float, InRange(0.0, 1.0)] = 0.0
 
     @field_validator("limits")
     @classmethod
@@ -61,7 +68,7 @@ class RobotSpec(Model):
         for name, values in limits:
             if joints and values is not None and len(values) != joints:
                 found = f"{name}: {len(values)} values"
-                raise refused(f"{found}; allowed are {joints}, as robot.home has")
+                raise rejected_error(f"{found}; allowed are {joints}, as robot.home has")
         return limits
 
     @property

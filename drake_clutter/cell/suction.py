@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 from drake_clutter.catalogue import ObjectClass
 from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
 from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, NoGrasp, Payload
-from drake_clutter.validation import Between, Model
+from drake_clutter.validation import InRange, StrictModel
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ _DIRECTIONS = np.array(
 )
 
 
-class SuctionGripper(Model):
+class SuctionGripper(StrictModel):
     """The EPick with a cup of one and a half bellows on an extension tube.
 
     Attributes:
@@ -60,15 +60,15 @@ class SuctionGripper(Model):
     """
 
     kind: Literal["suction"] = "suction"
-    cup_diameter: Annotated[float, Between(0.005, 0.1)] = 0.025
-    cup_length: Annotated[float, Between(0.005, 0.1)] = 0.020
-    extension: Annotated[float, Between(0.01, 0.5)] = 0.100
-    stroke: Annotated[float, Between(0.001, 0.05)] = 0.006
-    stiffness: Annotated[float, Between(100.0, 1e5)] = 2_000.0
-    vacuum: Annotated[float, Between(0.01, 1.0)] = 0.8
-    friction: Annotated[float, Between(0.01, 10.0)] = 0.5
-    unevenness: Annotated[float, Between(0.0, 0.01)] = 0.001
-    safety: Annotated[float, Between(1.0, 100.0)] = 1.5
+    cup_diameter: Annotated[float, InRange(0.005, 0.1)] = 0.025
+    cup_length: Annotated[float, InRange(0.005, 0.1)] = 0.020
+    extension: Annotated[float, InRange(0.01, 0.5)] = 0.100
+    stroke: Annotated[float, InRange(0.001, 0.05)] = 0.006
+    stiffness: Annotated[float, InRange(100.0, 1e5)] = 2_000.0
+    vacuum: Annotated[float, InRange(0.01, 1.0)] = 0.8
+    friction: Annotated[float, InRange(0.01, 10.0)] = 0.5
+    unevenness: Annotated[float, InRange(0.0, 0.01)] = 0.001
+    safety: Annotated[float, InRange(1.0, 100.0)] = 1.5
 
     @property
     def pull(self) -> float:

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.validation import Between, Model
+from drake_clutter.validation import InRange, StrictModel
 
-Side = Annotated[float, Between(0.1, 2.0)]
+Side = Annotated[float, InRange(0.1, 2.0)]
 
 
-class Support(Model):
+class Support(StrictModel):
     """A tray, or a shelf board.
 
     Attributes:
@@ -26,11 +26,11 @@ class Support(Model):
     """
 
     size: tuple[Side, Side]
-    wall_height: Annotated[float, Between(0.0, 1.0)] = 0.025
-    wall_thickness: Annotated[float, Between(0.001, 0.1)] = 0.008
+    wall_height: Annotated[float, InRange(0.0, 1.0)] = 0.025
+    wall_thickness: Annotated[float, InRange(0.001, 0.1)] = 0.008
     walls: tuple[Literal["+x", "-x", "+y", "-y"], ...] = ("+x", "-x", "+y", "-y")
-    floor_thickness: Annotated[float, Between(0.001, 0.1)] = 0.010
-    floor_height: Annotated[float, Between(0.0, 2.0)] = 0.0
+    floor_thickness: Annotated[float, InRange(0.001, 0.1)] = 0.010
+    floor_height: Annotated[float, InRange(0.0, 2.0)] = 0.0
 
     @property
     def half_size(self) -> NDArray[np.float64]:

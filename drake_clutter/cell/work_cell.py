@@ -16,8 +16,14 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
 from drake_clutter.resources import shipped_path
-from drake_clutter.validation import Model, Text, load_typed, refused, validate
-from drake_clutter.yaml_text import read_yaml
+from drake_clutter.validation import (
+    NonEmptyText,
+    StrictModel,
+    load_config_as,
+    rejected_error,
+    validate,
+)
+from drake_clutter.yaml_io import read_yaml
 
 GripperSpec = SuctionGripper
 """Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
@@ -27,7 +33,7 @@ _RESERVED = ("tray", "camera", "pedestal", "robot", "gripper")
 """Names of what stands in a cell besides fixtures."""
 
 
-class WorkCell(Model):
+class WorkCell(StrictModel):
     """Everything that stands in the cell but the objects.
 
     Attributes:
@@ -41,7 +47,7 @@ class WorkCell(Model):
     robot: RobotSpec
     gripper: GripperSpec
     support: Support
-    cameras: Annotated[dict[Text, Camera], Field(min_length=1)]
+    cameras: Annotated[dict[NonEmptyText, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()
 
     @field_validator("fixtures")
@@ -51,7 +57,7 @@ class WorkCell(Model):
         for fixture in fixtures:
             if fixture.name in taken:
                 what = f"names that differ, also from {', '.join(taken)}"
-                raise refused(f"{fixture.name}: is taken; allowed are {what}")
+                raise rejected_error(f"{fixture.name}: is taken; allowed are {what}")
             taken.append(fixture.name)
         return fixtures
 
@@ -61,14 +67,14 @@ class WorkCell(Model):
         cls, cameras: dict[str, Camera], info: ValidationInfo
     ) -> dict[str, Camera]:
         if unfit := [name for name in cameras if not name.isidentifier()]:
-            raise refused(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
+            raise rejected_error(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
         if taken := [name for name in cameras if name in _RESERVED and name != "camera"]:
-            raise refused(
+            raise rejected_error(
                 f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED)}"
             )
         name, camera = next(iter(cameras.items()))
         if "support" in info.data and not camera.sees(info.data["support"]):
-            raise refused(
+            raise rejected_error(
                 f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image"
             )
         return cameras
@@ -148,7 +154,7 @@ def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
     """
     given = read_yaml(path, "a mapping with robot, gripper, support and cameras")
     cell = validate(WorkCell, _with_paths(given, path.parent), str(path))
-    return load_typed(cell, settings=settings)
+    return load_config_as(cell, settings=settings)
 
 
 def _with_paths(given: Any, folder: Path) -> Any:

@@ -12,9 +12,9 @@ from drake_clutter.cli.output import out_console, plain
 
 def doctor(as_json: JsonOption = False) -> None:
     """Check Drake, EGL, solvers, torch and cores, and report how to mend what is missing."""
-    from drake_clutter.doctor import checks
+    from drake_clutter.installation_check import run_checks
 
-    found = checks()
+    found = run_checks()
     if as_json:
         print(json.dumps([dataclasses.asdict(check) for check in found], indent=2))
     else:

@@ -39,24 +39,24 @@ def _load_scenario(
     from drake_clutter.config import upgrade
     from drake_clutter.scenes.scene_file import load_scene
     from drake_clutter.systems.scenario import Scenario
-    from drake_clutter.validation import load_typed
+    from drake_clutter.validation import load_config_as
 
     names = [_in_scenario(setting) for setting in settings or ()]
     which_scene = [name for name in names if name.startswith(("scene=", "catalogue="))]
-    base, named = Scenario(), load_typed(Scenario(), file, which_scene, upgrade)
+    base, named = Scenario(), load_config_as(Scenario(), file, which_scene, upgrade)
     if named.scene:
         refuse_support(names)
         catalogue = load_catalogue(Path(named.catalogue) if named.catalogue else None)
         base = replace(
             base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell)
         )
-    scenario = load_typed(base, file, convert=upgrade)
+    scenario = load_config_as(base, file, upgrade=upgrade)
     if cell is not None:
         given = load_cell(cell)
         if named.scene:  # the objects stand on its support
             given = given.with_support(base.world.cell.support)
         scenario = replace(scenario, world=replace(scenario.world, cell=given))
-    scenario = load_typed(scenario, settings=names, convert=upgrade)
+    scenario = load_config_as(scenario, settings=names, upgrade=upgrade)
     check_cell(scenario.world.cell, base.world.cell, cell or file)
     return scenario
 

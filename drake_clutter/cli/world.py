@@ -75,13 +75,13 @@ def load_world(
     """
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import ClutterConfig, upgrade
-    from drake_clutter.validation import load_typed
+    from drake_clutter.validation import load_config_as
 
     default = ClutterConfig() if of_scenes is None else ClutterConfig(cell=of_scenes)
     base = default if cell is None else replace(default, cell=load_cell(cell))
-    world = load_typed(base, config, convert=upgrade)
-    world = load_typed(
-        world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade
+    world = load_config_as(base, config, upgrade=upgrade)
+    world = load_config_as(
+        world, settings=[in_world(setting) for setting in settings or ()], upgrade=upgrade
     )
     check_cell(world.cell, default.cell, cell or config)
     return world
@@ -103,13 +103,13 @@ def load_scene_and_world(
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import ClutterConfig, upgrade
     from drake_clutter.scenes.scene_file import load_scene
-    from drake_clutter.validation import load_typed
+    from drake_clutter.validation import load_config_as
 
     file = load_scene(scene, load_catalogue(catalogue))
     of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
-    world = load_typed(replace(ClutterConfig(), cell=of_scene), config, convert=upgrade)
-    world = load_typed(
-        world, settings=[in_world(setting) for setting in settings or ()], convert=upgrade
+    world = load_config_as(replace(ClutterConfig(), cell=of_scene), config, upgrade=upgrade)
+    world = load_config_as(
+        world, settings=[in_world(setting) for setting in settings or ()], upgrade=upgrade
     )
     check_cell(world.cell, file.cell, cell or config)
     return replace(file, scene=replace(file.scene, support=world.cell.support)), world

@@ -24,8 +24,8 @@ from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
-from drake_clutter.validation import Model, Text, to_plain, validate
-from drake_clutter.yaml_text import read_yaml
+from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
+from drake_clutter.yaml_io import read_yaml
 
 Report = Callable[[Step], None]
 
@@ -154,9 +154,9 @@ def plan_only(
     return plans
 
 
-class _MoveEntry(Model):
-    pick: Text
-    place: Text
+class _MoveEntry(StrictModel):
+    pick: NonEmptyText
+    place: NonEmptyText
 
 
 def read_moves(path: Path) -> list[Move]:

@@ -31,16 +31,16 @@ from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
 from drake_clutter.validation import (
     Finite,
-    Model,
-    Text,
+    NonEmptyText,
+    StrictModel,
     Vector3,
-    allowed,
-    load_typed,
+    allowed_error,
+    load_config_as,
     to_plain,
     validate,
 )
 from drake_clutter.workers.mapping import map_ordered
-from drake_clutter.yaml_text import read_yaml
+from drake_clutter.yaml_io import read_yaml
 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
 HEIGHTS, SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
@@ -159,7 +159,7 @@ def _cell(path: Path, default: WorkCell) -> WorkCell:
     given = read_yaml(path, "a mapping of a cell's fields")
     robot = given.get("robot") if isinstance(given, dict) else None
     if not isinstance(robot, dict) or "model" not in robot:
-        return load_typed(default, path, convert=upgrade_cell)
+        return load_config_as(default, path, upgrade=upgrade_cell)
     cell = load_cell(path)
     load_robot(cell.robot)
     return cell
@@ -169,8 +169,8 @@ def _moved(cell: WorkCell, base: PoseSpec) -> WorkCell:
     return cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": base})})
 
 
-class _TargetEntry(Model):
-    name: Text
+class _TargetEntry(StrictModel):
+    name: NonEmptyText
     translation: Vector3
     quaternion: tuple[Finite, Finite, Finite, Finite]
 
@@ -179,7 +179,7 @@ class _TargetEntry(Model):
     def _normalized(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
         norm = math.hypot(*quaternion)
         if not 1e-9 < norm < math.inf:
-            raise allowed("w, x, y, z that are not all zero")
+            raise allowed_error("w, x, y, z that are not all zero")
         return tuple(value / norm for value in quaternion)
 
 

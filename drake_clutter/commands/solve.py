@@ -9,7 +9,7 @@ from drake_clutter.files import write_json, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
-from drake_clutter.yaml_text import yaml_text
+from drake_clutter.yaml_io import to_yaml
 
 
 def solve(
@@ -53,7 +53,7 @@ def solve(
     }
     if solution.plan:
         moves = [{"pick": move.pick, "place": move.place} for move in solution.plan]
-        write_text(out / "moves.yaml", yaml_text(moves))
+        write_text(out / "moves.yaml", to_yaml(moves))
         task = carry_out(scene, solution.plan, seed, config, report)
         fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
         write_episode(

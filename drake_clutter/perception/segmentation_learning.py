@@ -31,7 +31,7 @@ from drake_clutter.perception.segmentation import (
     points,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import Between, NonNegative, config_class
+from drake_clutter.validation import InRange, NonNegative, config_class
 
 RISING = 0.1
 """Share of the steps in which the learning rate rises."""
@@ -50,8 +50,8 @@ class SegmentationConfig:
         vote_weight: of a vote's error, per m, against the classes' cross entropy.
     """
 
-    steps: Annotated[int, Between(1)] = 5000
-    batch: Annotated[int, Between(1)] = 8
+    steps: Annotated[int, InRange(1)] = 5000
+    batch: Annotated[int, InRange(1)] = 8
     learning_rate: NonNegative = 3e-3
     weight_decay: NonNegative = 1e-4
     vote_weight: NonNegative = 5.0

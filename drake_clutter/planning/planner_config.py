@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from drake_clutter.validation import Between, Flag, NonNegative, config_class
+from drake_clutter.validation import Flag, InRange, NonNegative, config_class
 
 
 @config_class
@@ -28,9 +28,9 @@ class PlannerConfig:
     rise: NonNegative = 0.020
     lip_gap: NonNegative = 0.0005
     grasp_spacing: NonNegative = 0.012
-    grasps: Annotated[int, Between(0)] = 9
-    yaws: Annotated[int, Between(0)] = 12
-    attempts: Annotated[int, Between(0)] = 400
+    grasps: Annotated[int, InRange(0)] = 9
+    yaws: Annotated[int, InRange(0)] = 12
+    attempts: Annotated[int, InRange(0)] = 400
     least_acceleration: NonNegative = 0.3
     time_limit: NonNegative = 600.0
     descent: NonNegative = 0.0

@@ -18,19 +18,19 @@ from drake_clutter.scenes.geometry import PENETRATION_ALLOWED, deepest_penetrati
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.validation import (
-    Between,
     Finite,
     Flag,
-    Model,
-    Share,
-    Text,
+    Fraction,
+    InRange,
+    Integer,
+    NonEmptyText,
+    StrictModel,
     Vector3,
-    Whole,
-    allowed,
+    allowed_error,
     to_plain,
     validate,
 )
-from drake_clutter.yaml_text import parse_yaml, read_yaml, yaml_text
+from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 VERSION = 2
 _QUATERNION_TOLERANCE = 1e-3  # a hand-written 0.7071 is close enough, and is normalized
@@ -59,7 +59,7 @@ class SceneFile:
         return self.scene.at(self.verdict.settled) if self.verdict else self.scene
 
 
-class _PoseEntry(Model):
+class _PoseEntry(StrictModel):
     translation: Vector3
     quaternion: tuple[Finite, Finite, Finite, Finite]
 
@@ -68,7 +68,7 @@ class _PoseEntry(Model):
     def _normalized(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
         norm = math.sqrt(sum(value * value for value in quaternion))
         if abs(norm - 1) > _QUATERNION_TOLERANCE:
-            raise allowed(f"w, x, y, z of length 1 (this one's is {norm:.6g})")
+            raise allowed_error(f"w, x, y, z of length 1 (this one's is {norm:.6g})")
         if abs(norm - 1) > 1e-12:
             return tuple(value / norm for value in quaternion)
         return quaternion
@@ -78,71 +78,71 @@ class _PoseEntry(Model):
         return Pose(self.translation, self.quaternion)
 
 
-class _ObjectEntry(Model):
-    name: Text
-    object_class: Annotated[Text, Field(alias="class")]
+class _ObjectEntry(StrictModel):
+    name: NonEmptyText
+    object_class: Annotated[NonEmptyText, Field(alias="class")]
     X_TO: _PoseEntry
-    node: Whole | None = None
+    node: Integer | None = None
 
     @field_validator("name")
     @classmethod
     def _not_the_tray(cls, name: str) -> str:
         if name == TRAY:
-            raise allowed(f"any name but {TRAY}")
+            raise allowed_error(f"any name but {TRAY}")
         return name
 
 
-class _NodeEntry(Model):
-    id: Whole
-    kind: Text
+class _NodeEntry(StrictModel):
+    id: Integer
+    kind: NonEmptyText
 
 
-class _EdgeEntry(Model):
-    parent: Whole
-    child: Whole
-    kind: Text
+class _EdgeEntry(StrictModel):
+    parent: Integer
+    child: Integer
+    kind: NonEmptyText
 
 
-class _GraphEntry(Model):
+class _GraphEntry(StrictModel):
     nodes: tuple[_NodeEntry, ...]
     edges: tuple[_EdgeEntry, ...]
 
 
-class _InstabilityEntry(Model):
+class _InstabilityEntry(StrictModel):
     reason: InstabilityReason
-    object: Text
+    object: NonEmptyText
     displacement: Finite
     tilt: Finite
 
 
-class _VerdictEntry(Model):
+class _VerdictEntry(StrictModel):
     stable: Flag
     settled: dict[str, _PoseEntry]
-    visible_share: dict[str, Share]
-    hidden: tuple[Text, ...]
+    visible_share: dict[str, Fraction]
+    hidden: tuple[NonEmptyText, ...]
     instability: _InstabilityEntry | None = None
 
 
-class _TrayEntry(Model):
+class _TrayEntry(StrictModel):
     side: Side
 
 
-class _Document(Model):
+class _Document(StrictModel):
     """A scene file; one of version 1 has a tray and no cell."""
 
-    version: Annotated[int, Between(1, VERSION)]
+    version: Annotated[int, InRange(1, VERSION)]
     objects: Annotated[tuple[_ObjectEntry, ...], Field(min_length=1)]
     tray: _TrayEntry | None = None
     cell: WorkCell | None = None
     graph: _GraphEntry | None = None
-    derivation: tuple[Text, ...] = ()
-    seed: Whole | None = None
+    derivation: tuple[NonEmptyText, ...] = ()
+    seed: Integer | None = None
     verdict: _VerdictEntry | None = None
 
     @model_validator(mode="after")
     def _tray_or_cell(self) -> Self:
         if self.tray is not None and self.cell is not None:
-            raise allowed("a tray or a cell, which has one")
+            raise allowed_error("a tray or a cell, which has one")
         return self
 
     @property
@@ -345,4 +345,4 @@ def save_scene(path: Path, scene: Scene, cell: WorkCell, verdict: Verdict | None
 
 def scene_text(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> str:
     """Return what a scene file holds, see `save_scene`."""
-    return yaml_text(scene_fields(scene, cell, verdict))
+    return to_yaml(scene_fields(scene, cell, verdict))

@@ -28,8 +28,8 @@ from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import scene_from_text, scene_text
-from drake_clutter.validation import config_yaml, override
-from drake_clutter.yaml_text import parse_yaml
+from drake_clutter.validation import config_yaml, override_config
+from drake_clutter.yaml_io import parse_yaml
 
 VERSION = 1
 _ARM = ("q", "v", "torque")
@@ -110,7 +110,7 @@ def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
     """Return the cell of a file; files of drake_clutter 0.1 hold the arm alone."""
     field = "cell" if "cell" in attributes else "arm"
     given = parse_yaml(str(attributes.get(field, "{}")), f"{path}:{field}")
-    return override(
+    return override_config(
         default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}"
     )
 

@@ -13,7 +13,7 @@ from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
 from drake_clutter.systems.perception_system import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
-from drake_clutter.validation import Between, config_class
+from drake_clutter.validation import InRange, config_class
 
 
 @config_class
@@ -36,11 +36,11 @@ class Scenario:
     catalogue: str = ""
     generator: str = "sg-star"
     objects: str = "ycb7"
-    nodes: Annotated[int, Between(3, 1000)] = 25
+    nodes: Annotated[int, InRange(3, 1000)] = 25
     agent: str = "student"
     perception: str = "labels"
-    max_moves: Annotated[int, Between(1)] = 20
-    seed: Annotated[int, Between(0)] = 0
+    max_moves: Annotated[int, InRange(1)] = 20
+    seed: Annotated[int, InRange(0)] = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
 

@@ -25,7 +25,7 @@ from drake_clutter.scenes.interfaces import CannotJudge, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.validation import Between, Flag, NonNegative, config_class
+from drake_clutter.validation import Flag, InRange, NonNegative, config_class
 
 MOST_IN_A_STACK = 0.6
 """Of a balanced scene's objects."""
@@ -46,10 +46,10 @@ class GenerationTask:
         margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
     """
 
-    nodes: Annotated[int, Between(3, 1000)] = 25
+    nodes: Annotated[int, InRange(3, 1000)] = 25
     hidden_reward: NonNegative = 0.5
     balance_reward: NonNegative = 0.5
-    instability_reward: Annotated[float, Between(-1e300, 0.0)] = -1.0
+    instability_reward: Annotated[float, InRange(-1e300, 0.0)] = -1.0
     must_come_apart: Flag = True
     margin: NonNegative = 0.003
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 _PROBE_TIMEOUT = 120.0  # s; the first rendering on a machine compiles shaders
-_NEEDED_MEMORY = 4.0  # GiB
+_MIN_MEMORY = 4.0  # GiB
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,23 @@ class Check:
     remedy: str = ""
 
 
-class MissingError(RuntimeError):
+class ProbeError(RuntimeError):
     """What a probe found is not enough; the message is the finding."""
 
 
-def checks() -> list[Check]:
+def run_checks() -> list[Check]:
     """Looks at everything; takes some seconds."""
     return [
-        _tried(probe_drake, "pip install drake; on Debian: apt-get install libglib2.0-0"),
-        _tried(probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"),
-        _tried(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
-        _tried(probe_torch, "needed by the learned agents: pip install 'drake-clutter[train]'"),
-        _tried(
+        _run_probe(probe_drake, "pip install drake; on Debian: apt-get install libglib2.0-0"),
+        _run_probe(
+            probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+        ),
+        _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
+        _run_probe(probe_torch, "needed by the learned agents: pip install 'drake-clutter[train]'"),
+        _run_probe(
             probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"
         ),
-        _tried(probe_machine, f"use fewer workers; one may take {_NEEDED_MEMORY:g} GiB"),
+        _run_probe(probe_machine, f"use fewer workers; one may take {_MIN_MEMORY:g} GiB"),
     ]
 
 
@@ -91,7 +93,7 @@ def probe_rendering() -> str:
     engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(0.1, 9.0)), image)
     depth = float(image.data[24, 32, 0])
     if abs(depth - 2.0) > 0.001:
-        raise MissingError(f"a face 2 m ahead is rendered at {depth:g} m")
+        raise ProbeError(f"a face 2 m ahead is rendered at {depth:g} m")
     return "VTK over EGL renders"
 
 
@@ -104,7 +106,7 @@ def probe_solvers() -> str:
         name for name, solver in solvers.items() if not (solver.available() and solver.enabled())
     ]
     if missing:
-        raise MissingError(f"{', '.join(missing)} not available")
+        raise ProbeError(f"{', '.join(missing)} not available")
     return ", ".join(solvers)
 
 
@@ -132,7 +134,7 @@ def probe_assets() -> str:
         if not object_class.sdf_path.is_file()
     ]
     if unbuilt:
-        raise MissingError(
+        raise ProbeError(
             f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}"
         )
     return f"{len(catalogue.classes)} object classes in {shipped_path('sdf_assets')}"
@@ -142,18 +144,18 @@ def probe_machine() -> str:
     """Cores that this process may use, and memory."""
     cores = len(os.sched_getaffinity(0))
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    found = f"{cores} cores, {memory:.1f} GiB of memory"
-    if memory < _NEEDED_MEMORY:
-        raise MissingError(found)
-    return found
+    detail = f"{cores} cores, {memory:.1f} GiB of memory"
+    if memory < _MIN_MEMORY:
+        raise ProbeError(detail)
+    return detail
 
 
-def _tried(probe: Callable[[], str], remedy: str) -> Check:
+def _run_probe(probe: Callable[[], str], remedy: str) -> Check:
     """Runs a probe, which is a function of this module, in a new Python process."""
     name = probe.__name__.removeprefix("probe_")
-    code = f"from drake_clutter import doctor; print(doctor.{probe.__name__}())"
+    code = f"from drake_clutter import installation_check; print(installation_check.{probe.__name__}())"
     try:
-        run = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code],
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -162,19 +164,19 @@ def _tried(probe: Callable[[], str], remedy: str) -> Check:
         )
     except subprocess.TimeoutExpired:
         return Check(name, False, f"no answer in {_PROBE_TIMEOUT:g} s", remedy)
-    if run.returncode == 0:
-        return Check(name, True, _last_line(run.stdout))
-    if run.returncode < 0:
+    if process.returncode == 0:
+        return Check(name, True, _last_line(process.stdout))
+    if process.returncode < 0:
         return Check(
             name,
             False,
-            f"died of {signal.Signals(-run.returncode).name} {_last_line(run.stderr)}".rstrip(),
+            f"died of {signal.Signals(-process.returncode).name} {_last_line(process.stderr)}".rstrip(),
             remedy,
         )
     return Check(
         name,
         False,
-        _last_line(run.stderr).removeprefix("drake_clutter.doctor.MissingError: "),
+        _last_line(process.stderr).removeprefix("drake_clutter.installation_check.MissingError: "),
         remedy,
     )
 

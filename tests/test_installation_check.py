@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from drake_clutter import doctor
-from drake_clutter.doctor import Check
+from drake_clutter import installation_check
+from drake_clutter.installation_check import Check
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def torch_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_this_machine_is_fit() -> None:
-    found = {check.name: check for check in doctor.checks()}
+    found = {check.name: check for check in installation_check.run_checks()}
     assert list(found) == ["drake", "rendering", "solvers", "torch", "assets", "machine"]
     assert [check for check in found.values() if not check.ok] == []
     assert all(check.detail and not check.remedy for check in found.values())
@@ -26,22 +26,22 @@ def test_this_machine_is_fit() -> None:
 
 def test_a_broken_library_is_a_finding(torch_is: Path) -> None:
     torch_is.write_text("raise ImportError('broken')")
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
         "torch", False, "ImportError: broken", "mend it"
     )
 
 
 def test_a_crash_is_a_finding(torch_is: Path) -> None:
     torch_is.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
         "torch", False, "died of SIGSEGV", "mend it"
     )
 
 
 def test_a_hang_is_a_finding(torch_is: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch_is.write_text("import time\ntime.sleep(60)")
-    monkeypatch.setattr(doctor, "_PROBE_TIMEOUT", 1.0)
-    assert doctor._tried(doctor.probe_torch, "mend it") == Check(
+    monkeypatch.setattr(installation_check, "_PROBE_TIMEOUT", 1.0)
+    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
         "torch", False, "no answer in 1 s", "mend it"
     )
 
@@ -50,6 +50,7 @@ def test_missing_models_are_a_finding(tmp_path: Path, monkeypatch: pytest.Monkey
     catalogue = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
     monkeypatch.setattr("drake_clutter.catalogue.load_catalogue", lambda: catalogue)
     with pytest.raises(
-        doctor.MissingError, match="1 of 1 object classes have no model, the first is crate"
+        installation_check.ProbeError,
+        match="1 of 1 object classes have no model, the first is crate",
     ):
-        doctor.probe_assets()
+        installation_check.probe_assets()

@@ -11,7 +11,7 @@ import yaml
 
 from drake_clutter.files import refusal, shown
 
-_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
+_EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 """Numbers such as 1e-3, which YAML 1.1 takes as a text."""
 
 
@@ -19,17 +19,17 @@ class _Loader(yaml.CSafeLoader):
     """Reads 1e-3 as a number, and refuses a key that stands twice in a mapping."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        own = node.value  # without what a merge key adds
-        made: dict[Any, Any] = super().construct_mapping(node, deep=deep)
-        if len(made) < len(node.value):
+        own_items = node.value  # without what a merge key adds
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
+        if len(mapping) < len(node.value):
             seen = set[Any]()
-            for key_node, _ in own:
+            for key_node, _ in own_items:
                 key = self.construct_object(key_node, deep=True)
                 if key in seen:
                     problem = f"{shown(key)} is there twice in a mapping"
                     raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
                 seen.add(key)
-        return made
+        return mapping
 
     def construct_whole_mapping(self, node: yaml.MappingNode) -> dict[Any, Any]:
         return self.construct_mapping(node, deep=True)
@@ -46,10 +46,10 @@ class _Dumper(yaml.CSafeDumper):
 _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_whole_mapping)
 _Loader.add_constructor("tag:yaml.org,2002:seq", _Loader.construct_whole_sequence)
 for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_NUMBER, list("-+.0123456789"))
 
 
-def yaml_text(document: Any, width: int = 160) -> str:
+def to_yaml(document: Any, width: int = 160) -> str:
     """Return a plain document as YAML that `parse_yaml` reads back.
 
     Args:
