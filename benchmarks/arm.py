@@ -23,7 +23,7 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.attempts import NEAR, REPORTED
 from drake_clutter.planning.paths import sampled, smooth, timed
@@ -39,7 +39,7 @@ from drake_clutter.station.station_simulation import PickPlaceResult, StationSim
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 Result = TypeVar("Result")
 
@@ -380,5 +380,5 @@ if __name__ == "__main__":
     app.command()(moves)
     app.command()(parts)
     app.command()(holds)
-    with told_in_one_line():
+    with cli_error_handler():
         app()

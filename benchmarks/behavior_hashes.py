@@ -35,9 +35,9 @@ import behavior_backends as backends
 import typer
 from behavior_backends import Case, Line, hash_of
 
-from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.resources import git_commit
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 RECORD = Path(__file__).parent / "results" / "behavior_hashes.json"
 EXPLORERS, GENERATORS = ("student", "largest-clear"), ("random", "sg-star")
@@ -55,14 +55,14 @@ class Backend:
         scenes: as of `Case`, by turns.
         count: of cases.
         agents: likewise by turns.
-        fresh_after: cases, after which a process is replaced; None: never.
+        max_items_per_process: cases, after which a process is replaced; None: never.
     """
 
     play: Callable[[Case], list[Line]]
     scenes: tuple[str, ...]
     count: int
     agents: tuple[str, ...] = EXPLORERS
-    fresh_after: int | None = None
+    max_items_per_process: int | None = None
 
     def cases(self) -> list[Case]:
         """All of it, in order."""
@@ -78,9 +78,13 @@ BACKENDS = {
     "generation": Backend(backends.generation, GENERATORS, 200, agents=("",)),
     "settle": Backend(backends.settle, LARGE, 30),
     "images": Backend(backends.images, MIXED, 30),
-    "arm": Backend(backends.arm, MIXED, 30, fresh_after=EPISODES),
-    "closed-loop-labels": Backend(backends.closed_loop_labels, MIXED, 15, fresh_after=EPISODES),
-    "closed-loop-depth": Backend(backends.closed_loop_depth, MIXED, 15, fresh_after=EPISODES),
+    "arm": Backend(backends.arm, MIXED, 30, max_items_per_process=EPISODES),
+    "closed-loop-labels": Backend(
+        backends.closed_loop_labels, MIXED, 15, max_items_per_process=EPISODES
+    ),
+    "closed-loop-depth": Backend(
+        backends.closed_loop_depth, MIXED, 15, max_items_per_process=EPISODES
+    ),
 }
 """By name, the quickest first."""
 
@@ -167,8 +171,10 @@ def main(
             continue
         recorded, entries = record["backends"].get(name, []), list[Entry]()
         cases, start = backend.cases()[:count], time.perf_counter()
-        fresh = backend.fresh_after
-        made = map_ordered(partial(Player, name), cases, workers=workers, fresh_after=fresh)
+        fresh = backend.max_items_per_process
+        made = map_ordered(
+            partial(Player, name), cases, workers=workers, max_items_per_process=fresh
+        )
         for case, played in zip(cases, made, strict=True):
             entries.append({**named(case), "hash": played.hash, "moves": [*played.lines]})
             found = "" if write else difference(case, played, recorded)
@@ -190,5 +196,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -18,7 +18,7 @@ from drake_clutter.config import load_config
 from drake_clutter.files import InputError, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import config_yaml
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
 """Stability rate and mean hidden objects of RG by nodes (Table I)."""

@@ -15,7 +15,7 @@ from drake_clutter.grammar import NodeBudget, SceneGrammar, uniform_choice
 from drake_clutter.scenes.geometry import deepest_penetration
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.seeding import item_rng
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 ROUNDING = 1e-9
 """m; objects that touch may overlap by this much."""

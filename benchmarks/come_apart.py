@@ -18,7 +18,7 @@ from rich.table import Table
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
@@ -87,5 +87,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

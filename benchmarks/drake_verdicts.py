@@ -20,7 +20,7 @@ from rich.progress import track
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.records import recorded
+from drake_clutter.records import resume_jsonl
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outcome
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene
@@ -29,7 +29,7 @@ from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import config_yaml
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -141,7 +141,7 @@ def _records(
     def make(done: int) -> Iterator[Any]:
         return map_ordered(make_worker, items[done:], workers=pool.workers, ray_address=pool.ray)
 
-    return islice(recorded(path, head, make), 1 + len(items))
+    return islice(resume_jsonl(path, head, make), 1 + len(items))
 
 
 def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:

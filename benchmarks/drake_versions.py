@@ -26,8 +26,8 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.explore import explore
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import told_in_one_line, write_json
-from drake_clutter.resources import shipped_path
+from drake_clutter.files import cli_error_handler, write_json
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
@@ -45,7 +45,7 @@ app = typer.Typer(no_args_is_help=True)
 
 
 def _frozen(number: int, config: ClutterConfig) -> Scene:
-    held = load_scene_set(shipped_path(f"training/scenes/{EPISODES[0]}.json"), load_catalogue())
+    held = load_scene_set(resource_path(f"training/scenes/{EPISODES[0]}.json"), load_catalogue())
     return held.settled(number, held.grammar, config)
 
 
@@ -149,5 +149,5 @@ def compare(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         app()

@@ -15,9 +15,9 @@ from generator_training import timed
 from rich.console import Console
 from rich.table import Table
 
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.perception.ray_detector import RayDetector
-from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.resources import git_commit, resource_path
 from drake_clutter.tasks import clutter_exploration
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import SteppedBackend
@@ -38,7 +38,7 @@ PARTS: dict[str, tuple[Any, str]] = {
 def measured(privileged: bool, episodes: int, seconds: dict[str, float]) -> dict[str, Any]:
     """Random moves that are allowed, until the episodes are over; the same ones whenever this is measured."""
     environment, draw = (
-        ClutterExploration(shipped_path(SCENES), privileged=privileged),
+        ClutterExploration(resource_path(SCENES), privileged=privileged),
         np.random.default_rng(0),
     )
     moves, told = 0, hashlib.sha256()
@@ -92,5 +92,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -19,7 +19,7 @@ from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Replay, SoftQConfig, SoftQLearner
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
 
@@ -111,5 +111,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

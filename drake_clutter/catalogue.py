@@ -20,8 +20,8 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from drake_clutter.files import InputError, refusal, shown
-from drake_clutter.resources import shipped_path
+from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.resources import resource_path
 from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
 from drake_clutter.yaml_io import read_yaml
 
@@ -307,7 +307,7 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     Raises:
         InputError: the catalogue is missing or broken; the message names file, field and what is allowed.
     """
-    shipped = shipped_path("sdf_assets")
+    shipped = resource_path("sdf_assets")
     folders = (
         (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
     )
@@ -317,7 +317,7 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
         path = asset_folder / CATALOGUE_FILE
         if not path.is_file():
             what = f"no such file; a catalogue is a folder that holds {CATALOGUE_FILE}"
-            raise refusal(str(path), what)
+            raise input_error(str(path), what)
         read = validate(CatalogueFile, read_yaml(path, "a catalogue"), str(path))
         for name, entry in read.classes.items():
             if name in classes:
@@ -327,7 +327,7 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
                 what = f"a list, without repeats, of {', '.join(classes)}"
-                found = f"object_sets.{set_name}: {shown(unknown or list(members))}"
-                raise refusal(str(path), f"{found}; allowed is {what}")
+                found = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
+                raise input_error(str(path), f"{found}; allowed is {what}")
             object_sets[set_name] = members
     return Catalogue(classes, object_sets, folders)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-_LONGEST_MESSAGE = 300
+MAX_MESSAGE_LENGTH = 300
 """Characters after the name of the file; a longer message is cut."""
 
 
@@ -19,7 +19,7 @@ class InputError(ValueError):
     """A file, option or value that a user gave and that cannot be used; the message says what is allowed."""
 
 
-def refusal(source: str, message: str) -> InputError:
+def input_error(source: str, message: str) -> InputError:
     """Return the error for a misuse, in one line of bounded length.
 
     Args:
@@ -27,11 +27,11 @@ def refusal(source: str, message: str) -> InputError:
         message: Field, value and what is allowed.
     """
     line = " ".join(message.split())
-    short = line if len(line) <= _LONGEST_MESSAGE else f"{line[: _LONGEST_MESSAGE - 4]} ..."
+    short = line if len(line) <= MAX_MESSAGE_LENGTH else f"{line[: MAX_MESSAGE_LENGTH - 4]} ..."
     return InputError(f"{source}: {short}")
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a value for a message, at most 80 characters long."""
     short = reprlib.Repr()
     short.maxlevel, short.maxstring, short.maxother = 2, 40, 40
@@ -43,7 +43,7 @@ def shown(value: Any) -> str:
 
 
 @contextmanager
-def told_in_one_line() -> Iterator[None]:
+def cli_error_handler() -> Iterator[None]:
     """A user's mistake is one line and exit code 2; an interruption, exit code 130."""
     try:
         yield
@@ -56,7 +56,7 @@ def told_in_one_line() -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`; renames it to `path` when the block ends without an error."""
     # The random part keeps two processes apart; the suffix stays, for writers that choose a format by it.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
@@ -69,7 +69,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Writes `text` to `path` in one step."""
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -78,15 +78,15 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-def output_directory(path: Path, *, may_hold: frozenset[str] = frozenset()) -> Path:
+def prepare_output_directory(path: Path, *, allowed_entries: frozenset[str] = frozenset()) -> Path:
     """Makes an output folder.
 
     Args:
         path: the folder; made, with its parents, if it is not there.
-        may_hold: names that may already be inside, e.g. from an earlier run that is now resumed.
+        allowed_entries: names that may already be inside, e.g. from an earlier run that is now resumed.
 
     Raises:
-        InputError: not a folder, not writable, or holding something else than `may_hold`.
+        InputError: not a folder, not writable, or holding something else than `allowed_entries`.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -98,14 +98,16 @@ def output_directory(path: Path, *, may_hold: frozenset[str] = frozenset()) -> P
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"--out {path}: is not writable; give a folder that you may write")
-    strangers = sorted(entry.name for entry in path.iterdir() if entry.name not in may_hold)
-    if strangers:
+    unexpected_entries = sorted(
+        entry.name for entry in path.iterdir() if entry.name not in allowed_entries
+    )
+    if unexpected_entries:
         raise InputError(
-            f"--out {path}: is not empty (holds {strangers[0]}); give a folder that is new or empty"
+            f"--out {path}: is not empty (holds {unexpected_entries[0]}); give a folder that is new or empty"
         )
     return path
 
 
-def sha256_of(path: Path) -> str:
+def file_sha256(path: Path) -> str:
     """The hash of a file's bytes, in hexadecimal digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -125,7 +125,7 @@ def probe_torch() -> str:
 def probe_assets() -> str:
     """Every shipped object class has a model."""
     from drake_clutter.catalogue import load_catalogue
-    from drake_clutter.resources import shipped_path
+    from drake_clutter.resources import resource_path
 
     catalogue = load_catalogue()
     unbuilt = [
@@ -137,7 +137,7 @@ def probe_assets() -> str:
         raise ProbeError(
             f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}"
         )
-    return f"{len(catalogue.classes)} object classes in {shipped_path('sdf_assets')}"
+    return f"{len(catalogue.classes)} object classes in {resource_path('sdf_assets')}"
 
 
 def probe_machine() -> str:

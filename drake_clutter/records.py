@@ -10,11 +10,11 @@ from drake_clutter.files import InputError
 from drake_clutter.resources import git_commit
 
 
-def recorded(
+def resume_jsonl(
     path: Path,
-    asked: Mapping[str, Any],
-    make: Callable[[int], Iterable[Any]],
-    upgrade: Callable[[Any], Any] = lambda head: head,
+    header: Mapping[str, Any],
+    make_records: Callable[[int], Iterable[Any]],
+    upgrade_header: Callable[[Any], Any] = lambda head: head,
 ) -> Generator[Any, None, None]:
     """The head of a file, its records, and then those that it lacks, each added to it as soon as it is made.
 
@@ -23,14 +23,14 @@ def recorded(
 
     Args:
         path: the file; made, with its folders, if it is not there.
-        asked: all that decides what the records are.
-        make: told how many records are there, makes those that follow.
-        upgrade: Turns the head that an older version wrote into today's form.
+        header: all that decides what the records are.
+        make_records: told how many records are there, makes those that follow.
+        upgrade_header: Turns the head that an older version wrote into today's form.
 
     Raises:
         InputError: the file holds records of something else, or another run is adding to it.
     """
-    asked = json.loads(json.dumps(asked))
+    header = json.loads(json.dumps(header))
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
         try:
@@ -45,19 +45,19 @@ def recorded(
             lines.pop()
             file.truncate(len("".join(lines).encode()))
         if not lines:
-            lines = [json.dumps({**asked, "commit": git_commit()}) + "\n"]
+            lines = [json.dumps({**header, "commit": git_commit()}) + "\n"]
             file.write(lines[0])
             file.flush()
-        head, *records = map(json.loads, lines)
-        upgraded = upgrade(head)
-        differing = ", ".join(key for key, value in asked.items() if upgraded.get(key) != value)
+        written_header, *records = map(json.loads, lines)
+        upgraded = upgrade_header(written_header)
+        differing = ", ".join(key for key, value in header.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(
                 f"{path}: holds records of something else ({differing}); give the same options or another folder"
             )
-        yield head
+        yield written_header
         yield from records
-        for record in make(len(records)):
+        for record in make_records(len(records)):
             file.write(json.dumps(record) + "\n")
             file.flush()
             yield record

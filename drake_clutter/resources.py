@@ -7,8 +7,8 @@ _PACKAGE_DIR = Path(__file__).resolve().parent
 _INSTALLED_DATA_DIR = _PACKAGE_DIR / "_shipped"
 
 
-def shipped_path(relative: str) -> Path:
-    """Absolute path of a shipped file or folder, e.g. ``shipped_path("models/robots/ur10.sdf")``.
+def resource_path(relative_path: str) -> Path:
+    """Absolute path of a shipped file or folder, e.g. ``resource_path("models/robots/ur10.sdf")``.
 
     A wheel holds `models/`, `sdf_assets/` and `training/` inside the package; a checkout holds them beside it.
 
@@ -16,9 +16,11 @@ def shipped_path(relative: str) -> Path:
         FileNotFoundError: nothing of that name is shipped.
     """
     root = _INSTALLED_DATA_DIR if _INSTALLED_DATA_DIR.is_dir() else _PACKAGE_DIR.parent
-    path = root / relative
+    path = root / relative_path
     if not path.exists():
-        raise FileNotFoundError(f"{relative} is not shipped with drake_clutter (looked in {root})")
+        raise FileNotFoundError(
+            f"{relative_path} is not shipped with drake_clutter (looked in {root})"
+        )
     return path
 
 
@@ -30,10 +32,10 @@ def git_commit() -> str:
     results = (":(top,exclude)training/results", ":(top,exclude)benchmarks/results")
     try:
         commit = _git("describe", "--always")
-        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", *results)
+        modified_files = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", *results)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return f"{commit}-dirty" if changed else commit
+    return f"{commit}-dirty" if modified_files else commit
 
 
 def _git(*arguments: str) -> str:

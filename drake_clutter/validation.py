@@ -25,7 +25,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
-from drake_clutter.files import refusal, shown
+from drake_clutter.files import format_value, input_error
 from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 Schema = TypeVar("Schema")
@@ -192,7 +192,7 @@ def validate(schema: type[Schema], given: Any, source: str) -> Schema:
     try:
         validated: Schema = _adapter(cast(Hashable, schema)).validate_python(given)
     except ValidationError as error:
-        raise refusal(source, _message(schema, error.errors(include_url=False)[0])) from None
+        raise input_error(source, _message(schema, error.errors(include_url=False)[0])) from None
     return validated
 
 
@@ -219,7 +219,7 @@ def _message(schema: Any, error: ErrorDetails) -> str:
 
 
 def _value_message(field: str, value: Any, what: str) -> str:
-    return f"{field}{': ' if field else ''}{shown(value)}; allowed is {what}"
+    return f"{field}{': ' if field else ''}{format_value(value)}; allowed is {what}"
 
 
 def _describe_allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
@@ -268,7 +268,7 @@ def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, An
 def _field_path(field: str, part: int | str) -> str:
     if isinstance(part, int):
         return f"{field}[{part}]"
-    name = str(part) if str(part).isprintable() and len(str(part)) <= 40 else shown(part)
+    name = str(part) if str(part).isprintable() and len(str(part)) <= 40 else format_value(part)
     return f"{field}.{name}" if field else name
 
 
@@ -321,7 +321,9 @@ def _parse_setting(setting: str, config: Any) -> Any:
     """Return FIELD=VALUE as nested mappings, with the rest of a list or collection."""
     name, equals, text = setting.partition("=")
     if not equals or not name:
-        raise refusal(f"--set {setting}", "allowed is FIELD=VALUE, such as layout.stack_gap=0.02")
+        raise input_error(
+            f"--set {setting}", "allowed is FIELD=VALUE, such as layout.stack_gap=0.02"
+        )
     value = parse_yaml(text, f"--set {setting}", "FIELD=VALUE with a YAML value")
     parts = name.split(".")
     for depth in range(len(parts) - 1, -1, -1):

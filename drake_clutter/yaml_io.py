@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from drake_clutter.files import refusal, shown
+from drake_clutter.files import format_value, input_error
 
 _EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 """Numbers such as 1e-3, which YAML 1.1 takes as a text."""
@@ -26,7 +26,7 @@ class _Loader(yaml.CSafeLoader):
             for key_node, _ in own_items:
                 key = self.construct_object(key_node, deep=True)
                 if key in seen:
-                    problem = f"{shown(key)} is there twice in a mapping"
+                    problem = f"{format_value(key)} is there twice in a mapping"
                     raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
                 seen.add(key)
         return mapping
@@ -74,10 +74,10 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         what = f"cannot be read ({error.strerror}); allowed is {allowed_content}"
-        raise refusal(str(path), what) from error
+        raise input_error(str(path), what) from error
     except UnicodeDecodeError as error:
         what = f"is not YAML ({error.reason}); allowed is {allowed_content}"
-        raise refusal(str(path), what) from error
+        raise input_error(str(path), what) from error
     return parse_yaml(text, str(path), allowed_content)
 
 
@@ -97,6 +97,6 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         why = f"{line}{error.problem}"
-        raise refusal(source, f"is not YAML ({why}); allowed is {allowed_content}") from error
+        raise input_error(source, f"is not YAML ({why}); allowed is {allowed_content}") from error
     except Exception as error:  # constructors raise many kinds for a bad date, number or nesting
-        raise refusal(source, f"is not YAML ({error}); allowed is {allowed_content}") from error
+        raise input_error(source, f"is not YAML ({error}); allowed is {allowed_content}") from error

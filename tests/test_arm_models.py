@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 import iiwa14
 from drake_clutter.cell.primitives import Rod
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from ur_e_series import E_SERIES, UR3E, UR5E
 from ur_family import UrArm, ur_sdf
 
@@ -27,13 +27,13 @@ OUTLINES = {"ur3e": outlines(UR3E), "ur5e": outlines(UR5E), "iiwa14": iiwa14.OUT
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_file_is_what_the_module_writes(name: str) -> None:
-    assert shipped_path(f"models/robots/{name}.sdf").read_text() == MODELS[name]
+    assert resource_path(f"models/robots/{name}.sdf").read_text() == MODELS[name]
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_inertia_is_physical(name: str) -> None:
     plant = MultibodyPlant(0.0)
-    (instance,) = Parser(plant).AddModels(str(shipped_path(f"models/robots/{name}.sdf")))
+    (instance,) = Parser(plant).AddModels(str(resource_path(f"models/robots/{name}.sdf")))
     for index in plant.GetBodyIndices(instance):
         assert plant.get_body(index).default_spatial_inertia().IsPhysicallyValid()
 
@@ -53,7 +53,7 @@ def test_masses_and_limits_are_the_published_ones(
 ) -> None:
     """Masses of the moving links [kg], torques [N m] and speeds [deg/s] of the joints."""
     plant = MultibodyPlant(0.0)
-    (instance,) = Parser(plant).AddModels(str(shipped_path(f"models/robots/{name}.sdf")))
+    (instance,) = Parser(plant).AddModels(str(resource_path(f"models/robots/{name}.sdf")))
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
     assert sum(body.default_mass() for body in bodies[1:]) == pytest.approx(moving)
     plant.WeldFrames(plant.world_frame(), bodies[0].body_frame())

@@ -25,7 +25,7 @@ from drake_clutter.assets.textures import draw_texture
 from drake_clutter.catalogue import ObjectClass, Rest, Shape, load_catalogue
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 
 CLASSES = load_catalogue().classes
 EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
@@ -81,7 +81,7 @@ def user_class(folder: Path, text: str) -> Path:
 def test_shipped_model(entry: ObjectClass) -> None:
     plant, contacts = plant_of(
         f"package://drake_clutter_objects/{entry.name}/model.sdf",
-        shipped_path("sdf_assets/package.xml"),
+        resource_path("sdf_assets/package.xml"),
     )
     body = plant.GetBodyByName("body")
     assert body.default_mass() == pytest.approx(entry.mass, rel=1e-9)

@@ -26,7 +26,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.perception.pose_fit import PoseFitter, pose_error
 from drake_clutter.perception.segmentation import Window
 from drake_clutter.reports.detections_picture import SIDE, detections_picture
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.placement import has_clear_top, seen_through
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.unseen import unseen_blocks
@@ -36,7 +36,7 @@ from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import load_config_as
 
-CELL = load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml"))
+CELL = load_cell(resource_path("models/cells/ur10_tilted_camera.yaml"))
 CAMERA = CELL.camera
 RAYS = RayCaster(CAMERA)
 OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))

@@ -14,12 +14,12 @@ from drake_clutter.cli import app
 from drake_clutter.cli.run import _load_scenario
 from drake_clutter.cli.world import load_world
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.station.trajectory_file import read_trajectories
 from drake_clutter.validation import config_yaml, to_plain, validate
 
-UR5E = shipped_path("models/cells/ur5e_epick_tray.yaml")
+UR5E = resource_path("models/cells/ur5e_epick_tray.yaml")
 SCENE = scene_of(
     resting("gelatin_box", xy=(-0.1, 0.1)), resting("pudding_box", xy=(0.15, -0.1)), side=0.6
 )
@@ -182,7 +182,7 @@ def test_commands_that_need_no_arm_check_the_cell_too(
 def test_a_model_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Options name it from the folder of the command; what is written has its absolute path."""
     monkeypatch.chdir(tmp_path)
-    Path("arm.sdf").write_text(shipped_path("models/robots/ur10.sdf").read_text())
+    Path("arm.sdf").write_text(resource_path("models/robots/ur10.sdf").read_text())
     world = load_world(None, None, ["robot.model=arm.sdf"])
     assert world.cell.robot.model == str(tmp_path / "arm.sdf")
 

@@ -19,7 +19,7 @@ from drake_clutter.files import InputError
 from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.visibility import RayCaster
@@ -242,7 +242,7 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
 def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfig) -> None:
-    cell = load_cell(shipped_path(f"models/cells/{robot}_epick_tray.yaml"))
+    cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
     loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record=True)
     task = run_episode(loop, largest_clear, max_moves=1)
     (step,) = task.steps

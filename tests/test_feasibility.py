@@ -25,7 +25,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.planning.tool_kinematics import downwards
 from drake_clutter.reports import feasibility_report
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.robots.ur_kinematics import jacobian, manipulability
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
@@ -278,7 +278,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     names = ["iiwa14_epick_tray", "ur5e_epick_tray", "ur10e_epick_tray"]
     for name in names:
         option = "--cell" if name == names[-1] else "--arm"
-        arguments += [option, str(shipped_path(f"models/cells/{name}.yaml"))]
+        arguments += [option, str(resource_path(f"models/cells/{name}.yaml"))]
     told = CliRunner().invoke(app, arguments)
     assert told.exit_code == 0, told.output
     setups = json.loads((out / "summary.json").read_text())["setups"]

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from drake_clutter.files import InputError, output_directory, replacing, write_json, write_text
+from drake_clutter.files import (
+    InputError,
+    atomic_write,
+    prepare_output_directory,
+    write_json,
+    write_text,
+)
 
 
 def test_text_and_json(tmp_path: Path) -> None:
@@ -30,7 +36,7 @@ def test_what_json_cannot_say_leaves_the_old_file(value: object, tmp_path: Path)
 
 def test_a_failure_midway_leaves_nothing(tmp_path: Path) -> None:
     def fail() -> None:
-        with replacing(tmp_path / "a.png") as temporary:
+        with atomic_write(tmp_path / "a.png") as temporary:
             assert temporary.parent == tmp_path
             assert temporary.suffix == ".png"
             temporary.write_text("half")
@@ -44,7 +50,7 @@ def test_a_failure_midway_leaves_nothing(tmp_path: Path) -> None:
 def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     write_text(path, "old")
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
@@ -53,45 +59,47 @@ def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
 
 def test_two_writers_do_not_share_a_temporary_file(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
-    with replacing(path) as first, replacing(path) as second:
+    with atomic_write(path) as first, atomic_write(path) as second:
         assert first != second
         first.write_text("first")
         second.write_text("second")
     assert path.read_text() == "first"  # the outer block ends last
 
 
-def test_output_directory_makes_what_is_missing(tmp_path: Path) -> None:
+def test_prepare_output_directory_makes_what_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b"
-    assert output_directory(path) == path
+    assert prepare_output_directory(path) == path
     assert path.is_dir()
-    assert output_directory(path) == path
+    assert prepare_output_directory(path) == path
 
 
-def test_output_directory_may_hold_what_an_earlier_run_left(tmp_path: Path) -> None:
+def test_prepare_output_directory_may_hold_what_an_earlier_run_left(tmp_path: Path) -> None:
     (tmp_path / "scenes").mkdir()
     (tmp_path / "summary.json").touch()
     assert (
-        output_directory(tmp_path, may_hold=frozenset({"scenes", "summary.json", "more"}))
+        prepare_output_directory(
+            tmp_path, allowed_entries=frozenset({"scenes", "summary.json", "more"})
+        )
         == tmp_path
     )
     with pytest.raises(InputError, match=r"is not empty \(holds summary\.json\)"):
-        output_directory(tmp_path, may_hold=frozenset({"scenes"}))
+        prepare_output_directory(tmp_path, allowed_entries=frozenset({"scenes"}))
     with pytest.raises(InputError, match="give a folder that is new or empty"):
-        output_directory(tmp_path)
+        prepare_output_directory(tmp_path)
 
 
-def test_output_directory_refuses_a_file(tmp_path: Path) -> None:
+def test_prepare_output_directory_refuses_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(InputError, match=f"--out {path}: is a file"):
-            output_directory(path)
+            prepare_output_directory(path)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_output_directory_refuses_what_may_not_be_written(tmp_path: Path) -> None:
+def test_prepare_output_directory_refuses_what_may_not_be_written(tmp_path: Path) -> None:
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     with pytest.raises(InputError, match="is not writable"):
-        output_directory(locked)
+        prepare_output_directory(locked)
     with pytest.raises(InputError, match="cannot be made"):
-        output_directory(locked / "below")
+        prepare_output_directory(locked / "below")

@@ -27,7 +27,7 @@ from drake_clutter.scenes.scene_file import scene_fields
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 
 def job(nodes: int = 10, seed: int = 5) -> GenerationJob:

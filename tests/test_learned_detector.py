@@ -8,7 +8,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.segmentation import SegmentationNetwork
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.systems.scenario import DETECTORS
@@ -16,7 +16,7 @@ from drake_clutter.systems.scenario import DETECTORS
 
 @pytest.fixture(scope="module", params=DETECTORS)
 def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
-    network = SegmentationNetwork.load(shipped_path(DETECTORS[request.param]))
+    network = SegmentationNetwork.load(resource_path(DETECTORS[request.param]))
     return LearnedDetector(
         network, CATALOGUE.object_set("ycb7"), config.cell.camera, config.cell.support
     )

@@ -15,7 +15,7 @@ from drake_clutter.planning.paths import dynamics_plant, torques
 from drake_clutter.planning.plan import NoPlan, Phase, Plan, PlanFailure
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
 
@@ -36,7 +36,7 @@ def cell_of(name: str) -> WorkCell:
     if name == "tilted ur10":  # its joints keep no tool vertical by linear relations
         base = "robot.base.x=-0.7", "robot.base.z=0.4", "robot.base.pitch=10"
         return cell_with(*base, "robot.pedestal_side=0")
-    return load_cell(shipped_path(f"models/cells/{name}_epick_tray.yaml"))
+    return load_cell(resource_path(f"models/cells/{name}_epick_tray.yaml"))
 
 
 def place_of(o: SceneObject, x: float, y: float, turn: float) -> Pose:

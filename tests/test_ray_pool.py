@@ -30,7 +30,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 Drawn = tuple[int, NDArray[np.float64]]
 Found = TypeVar("Found")

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.robot import JointLimits, RobotSpec
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.robots import ur_kinematics as kinematics
 from drake_clutter.robots.numerical_ik import NumericalInverseKinematics
 from drake_clutter.robots.robot_model import RobotModel, load_robot
@@ -23,12 +23,12 @@ from drake_clutter.robots.robot_plant import add_robot, unmeeting_links
 
 Floats = NDArray[np.float64]
 
-CELLS = sorted(path.name.split("_")[0] for path in shipped_path("models/cells").glob("*.yaml"))
+CELLS = sorted(path.name.split("_")[0] for path in resource_path("models/cells").glob("*.yaml"))
 URS = [name for name in CELLS if name.startswith("ur")]
 
 
 def robot(name: str) -> RobotModel:
-    return load_robot(load_cell(shipped_path(f"models/cells/{name}_epick_tray.yaml")).robot)
+    return load_robot(load_cell(resource_path(f"models/cells/{name}_epick_tray.yaml")).robot)
 
 
 def drawn(arm: RobotModel, count: int, seed: int = 0) -> Floats:
@@ -306,7 +306,7 @@ def test_the_closed_form_serves_a_ur_with_other_base_and_tool_frames(tmp_path: P
 
 def test_motors_are_in_the_order_of_the_joints_whatever_the_file_s(tmp_path: Path) -> None:
     own = robot("iiwa14").spec
-    text = shipped_path("models/robots/iiwa14.sdf").read_text()
+    text = resource_path("models/robots/iiwa14.sdf").read_text()
     joints = re.findall(r"    <joint .*?</joint>\n", text, re.DOTALL)
     for joint in joints:
         text = text.replace(joint, "")

@@ -28,7 +28,7 @@ from drake_clutter.perception.segmentation_learning import (
     SegmentationLearner,
     example,
 )
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose
 
 CAMERA = Camera.over(1.6, width=160, height=120)
@@ -159,7 +159,7 @@ def test_shapes(looks_at_color: bool, tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_of_something_else_is_refused() -> None:
-    student = shipped_path("training/checkpoints/student.safetensors")
+    student = resource_path("training/checkpoints/student.safetensors")
     with pytest.raises(
         InputError,
         match=r"student\.safetensors: is a checkpoint of a student; allowed is one of a detector",

@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from test_robot_model import CELLS
 
 from drake_clutter.cell.work_cell import WorkCell, load_cell
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import RobotModel, load_robot
 from drake_clutter.robots.robot_plant import add_robot, filter_collisions
 
@@ -25,7 +25,7 @@ OBJECTS = 0.30
 
 
 def cell_of(name: str) -> WorkCell:
-    return load_cell(shipped_path(f"models/cells/{name}_epick_tray.yaml"))
+    return load_cell(resource_path(f"models/cells/{name}_epick_tray.yaml"))
 
 
 def view(cell: WorkCell) -> Convex:

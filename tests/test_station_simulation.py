@@ -18,7 +18,7 @@ from drake_clutter.planning.plan import Plan
 from drake_clutter.planning.planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports import recording
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.plant import pose_of
@@ -116,7 +116,7 @@ def test_one_plan_after_the_other() -> None:
 
 
 def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
-    cell = load_cell(shipped_path("models/cells/iiwa14_epick_tray.yaml"))
+    cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
     result = StationSimulation(cell, SCENE).execute(planned(cell), record=True)
     assert result.poses["pudding_box"].p[:2] == pytest.approx([0.0, -0.2], abs=0.005)
     assert result.tracking < 0.02

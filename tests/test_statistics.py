@@ -2,7 +2,7 @@
 
 import pytest
 
-from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
+from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -30,8 +30,8 @@ def test_mean_interval() -> None:
     assert mean_interval([]) is None
 
 
-def test_ratio_interval() -> None:
+def test_bootstrap_ratio_interval() -> None:
     """A ratio that is the same in every scene is known for sure; else it lies within."""
-    assert ratio_interval([1, 2, 3], [2, 4, 6]) == (0.5, 0.5)
-    low, high = ratio_interval([1, 2, 3, 0], [2, 2, 3, 2])
+    assert bootstrap_ratio_interval([1, 2, 3], [2, 4, 6]) == (0.5, 0.5)
+    low, high = bootstrap_ratio_interval([1, 2, 3, 0], [2, 2, 3, 2])
     assert 0 < low < 6 / 9 < high <= 1

@@ -8,7 +8,7 @@ from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run import play as play_loop
 from drake_clutter.commands.run import scene_of
 from drake_clutter.config import ClutterConfig
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
@@ -16,7 +16,7 @@ from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd
 
-WORLD = ClutterConfig(cell=load_cell(shipped_path("models/cells/ur10_tilted_camera.yaml")))
+WORLD = ClutterConfig(cell=load_cell(resource_path("models/cells/ur10_tilted_camera.yaml")))
 SCENARIO = Scenario(generator="random", nodes=8, agent="largest-clear", max_moves=4, world=WORLD)
 
 

@@ -14,7 +14,7 @@ from drake_clutter.agents.evaluation import EpisodeResult
 from drake_clutter.agents.generation import GenerationJob
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.records import recorded
+from drake_clutter.records import resume_jsonl
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.simulation.judge import DrakeJudge
@@ -240,17 +240,17 @@ def test_records_are_made_once(tmp_path: Path) -> None:
             made.append(k)
             yield k
 
-    first = recorded(path, {"seed": 1}, make)
+    first = resume_jsonl(path, {"seed": 1}, make)
     assert next(first)["seed"] == 1
     assert [next(first), next(first)] == [0, 1]
     with pytest.raises(InputError, match="another run is adding to it"):
-        next(recorded(path, {"seed": 1}, make))
+        next(resume_jsonl(path, {"seed": 1}, make))
     first.close()
     path.write_text(path.read_text()[:-1])
-    assert list(recorded(path, {"seed": 1}, make))[1:] == [0, 1, 2]
-    assert list(recorded(path, {"seed": 1}, make))[1:] == [0, 1, 2]
+    assert list(resume_jsonl(path, {"seed": 1}, make))[1:] == [0, 1, 2]
+    assert list(resume_jsonl(path, {"seed": 1}, make))[1:] == [0, 1, 2]
     assert made == [0, 1, 1, 2]
     with pytest.raises(
         InputError, match=r"records\.jsonl: holds records of something else \(seed\)"
     ):
-        next(recorded(path, {"seed": 2}, make))
+        next(resume_jsonl(path, {"seed": 2}, make))

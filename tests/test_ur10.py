@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_clutter.cell.primitives import Rod
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.robots.ur_kinematics import (
     JOINTS,
     forward_kinematics,
@@ -27,14 +27,14 @@ OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
 @pytest.fixture(scope="module")
 def plant() -> MultibodyPlant:
     made = MultibodyPlant(0.001)
-    Parser(made).AddModels(str(shipped_path("models/robots/ur10.sdf")))
+    Parser(made).AddModels(str(resource_path("models/robots/ur10.sdf")))
     made.WeldFrames(made.world_frame(), made.GetFrameByName("base"))
     made.Finalize()
     return made
 
 
 def test_the_file_is_what_is_written() -> None:
-    assert shipped_path("models/robots/ur10.sdf").read_text() == ur10_sdf()
+    assert resource_path("models/robots/ur10.sdf").read_text() == ur10_sdf()
 
 
 def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:

@@ -14,7 +14,7 @@ from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.config import load_config
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.validation import (
     Finite,
     Flag,
@@ -249,7 +249,7 @@ def test_another_kind_is_not_merged_with_the_one_before() -> None:
 
 @pytest.mark.parametrize("name", ["ur5e", "iiwa14"])
 def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path) -> None:
-    path = shipped_path(f"models/cells/{name}_epick_tray.yaml")
+    path = resource_path(f"models/cells/{name}_epick_tray.yaml")
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml({"cell": read_yaml(path, "a cell")}))
     config = load_config(file)

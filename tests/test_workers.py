@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drake_clutter.seeding import item_rng
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 
 class Noisy:
@@ -71,7 +71,9 @@ def make_thread_setting() -> Callable[[int], str | None]:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_processes_are_replaced_by_fresh_ones(workers: int, tmp_path: Path) -> None:
     done = list(
-        map_ordered(partial(CountsFactories, tmp_path), range(5), workers=workers, fresh_after=2)
+        map_ordered(
+            partial(CountsFactories, tmp_path), range(5), workers=workers, max_items_per_process=2
+        )
     )
     first, last = done[: 2 * workers], done[2 * workers :]
     assert len(done) == 5

@@ -16,7 +16,7 @@ from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.config import upgrade
-from drake_clutter.files import InputError, told_in_one_line
+from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.validation import InRange, config_class, load_config_as
@@ -77,5 +77,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -28,9 +28,9 @@ from rich.table import Table
 from drake_clutter.agents.exploration import TRAINED
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import upgrade_head
-from drake_clutter.files import InputError, sha256_of, told_in_one_line, write_json
+from drake_clutter.files import InputError, cli_error_handler, file_sha256, write_json
 from drake_clutter.learning.shipped import checkpoint_path
-from drake_clutter.records import recorded
+from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene, SceneObject
@@ -44,7 +44,7 @@ from drake_clutter.tasks.arm_ceiling import ArmCeiling
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 HERE = Path(__file__).parent
 EPISODES_OF_A_PROCESS = 10
@@ -167,16 +167,18 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     )
     scenario.pop("seed")  # each episode's own: the scene's number
     asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": scenario}
-    asked |= {"weights": [sha256_of(file) for file in networks]}
+    asked |= {"weights": [file_sha256(file) for file in networks]}
     commit = git_commit()
 
     def play(done: int) -> Iterator[dict[str, Any]]:
         missing = [Asked(row, row.first + k) for k in range(done, count)]
-        made = map_ordered(Player, missing, workers=workers, fresh_after=EPISODES_OF_A_PROCESS)
+        made = map_ordered(
+            Player, missing, workers=workers, max_items_per_process=EPISODES_OF_A_PROCESS
+        )
         for told in track(made, row.name, count, completed=done, console=Console(stderr=True)):
             yield told | {"commit": commit}
 
-    return list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]
+    return list(resume_jsonl(path, asked, play, upgrade_head))[1 : 1 + count]
 
 
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:
@@ -338,5 +340,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.catalogue import Catalogue, load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import told_in_one_line, write_json
+from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.perception.depth_noise import noisy_depth
 from drake_clutter.perception.image_set import ImageSet, LabelledImage
@@ -197,5 +197,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

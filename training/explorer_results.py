@@ -27,16 +27,16 @@ from drake_clutter.agents.evaluation import (
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, upgrade_head
-from drake_clutter.files import InputError, told_in_one_line, write_json
+from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.learning.shipped import weights_of
-from drake_clutter.records import recorded
+from drake_clutter.records import resume_jsonl
 from drake_clutter.reports.in_words import in_words
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
-from drake_clutter.statistics import ratio_interval
+from drake_clutter.statistics import bootstrap_ratio_interval
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
@@ -92,7 +92,7 @@ def played(
 
     return [
         episode_of(record)
-        for record in list(recorded(path, asked, play, upgrade_head))[1 : 1 + count]
+        for record in list(resume_jsonl(path, asked, play, upgrade_head))[1 : 1 + count]
     ]
 
 
@@ -136,7 +136,9 @@ def row_of(
         row[f"moves_to_{name}"] = (
             sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
         )
-        row[f"moves_to_{name}_ci95"] = ratio_interval(*zip(*pairs, strict=True)) if pairs else None
+        row[f"moves_to_{name}_ci95"] = (
+            bootstrap_ratio_interval(*zip(*pairs, strict=True)) if pairs else None
+        )
         row[f"both_with_{name}"] = len(pairs)
     return row
 
@@ -276,5 +278,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -26,8 +26,8 @@ from drake_clutter.agents.generation import TRAINED, GenerationJob
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, told_in_one_line, write_json
-from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.files import InputError, cli_error_handler, write_json
+from drake_clutter.resources import git_commit, resource_path
 from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
@@ -137,7 +137,7 @@ def of_temperatures(found: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]
     """The rows of SG* at 25 nodes in the order of their temperatures; Table I's is at that of the checkpoint."""
     rows = [found[row.folder] for row in TRADE if row.folder in found]
     if (as_shipped := found.get(Row("sg-star", 25, 1000).folder)) is not None:
-        about = json.loads(shipped_path(TRAINED["sg-star"]).with_suffix(".json").read_text())
+        about = json.loads(resource_path(TRAINED["sg-star"]).with_suffix(".json").read_text())
         rows.append(as_shipped | {"temperature": about["temperature"]})
     return sorted(rows, key=lambda row: float(row["temperature"]))
 
@@ -226,5 +226,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

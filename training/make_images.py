@@ -37,14 +37,14 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, output_directory, told_in_one_line, write_json
+from drake_clutter.files import InputError, cli_error_handler, prepare_output_directory, write_json
 from drake_clutter.perception.image_set import LabelledImage, write_images
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 JOB_FILE = "job.json"
 HEAP_IMAGES, GENERATED_IMAGES = 20, 16
@@ -287,9 +287,9 @@ def main(
     job = ImageJob(objects, dropped_share, seed)
     agents = [agent for agent, _ in job.agents()]
     there = [path.name for path in out.iterdir()] if out.is_dir() else []
-    output_directory(
+    prepare_output_directory(
         out,
-        may_hold=frozenset(
+        allowed_entries=frozenset(
             {JOB_FILE, *(name for name in there if re.fullmatch(r"\.?\d{6}", name))}
         ),
     )
@@ -313,5 +313,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -25,9 +25,9 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, told_in_one_line
+from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.grammar import canonical_form
-from drake_clutter.records import recorded
+from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene_file import load_scene
@@ -36,7 +36,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.generation import GenerationTask
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 MOST_DRAWS = 20
 """Scenes that are drawn at most, for each that is to be collected."""
@@ -154,7 +154,7 @@ def main(
     }
     found, drawn = list[SetScene](), 0
     if not frozen:
-        judged = recorded(
+        judged = resume_jsonl(
             work / JUDGED,
             job.fields,
             lambda done: map_ordered(
@@ -185,5 +185,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

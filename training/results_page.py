@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_clutter.files import told_in_one_line, write_text
+from drake_clutter.files import cli_error_handler, write_text
 
 ROOT = Path(__file__).parents[1]
 RESULTS, CALIBRATION = ROOT / "training/results", ROOT / "benchmarks/results/calibration.json"
@@ -474,5 +474,5 @@ def main(out: Annotated[Path, typer.Option(help="Page to write.")] = PAGE) -> No
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

@@ -17,7 +17,7 @@ import typer
 from matplotlib.axes import Axes
 from results_page import IMAGES, RESULTS, read
 
-from drake_clutter.files import told_in_one_line
+from drake_clutter.files import cli_error_handler
 
 OF_SEED = ", seed "
 """Between a training's name and its seed, if that is not 0."""
@@ -175,5 +175,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

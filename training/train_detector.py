@@ -17,7 +17,7 @@ import typer
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade
-from drake_clutter.files import told_in_one_line
+from drake_clutter.files import cli_error_handler
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.perception.image_set import ImageSet
 from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
@@ -130,5 +130,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

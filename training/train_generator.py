@@ -18,7 +18,7 @@ from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig, upgrade
-from drake_clutter.files import told_in_one_line
+from drake_clutter.files import cli_error_handler
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
@@ -143,5 +143,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with told_in_one_line():
+    with cli_error_handler():
         typer.run(main)

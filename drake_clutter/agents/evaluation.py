@@ -16,7 +16,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
-from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
+from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd
 
@@ -133,7 +133,7 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
             "found": float(np.mean(found)),
             "found_ci95": mean_interval(found),
             "found_of_hidden": sum(found) / sum(r.hidden for r in results),
-            "found_of_hidden_ci95": ratio_interval(found, [r.hidden for r in results]),
+            "found_of_hidden_ci95": bootstrap_ratio_interval(found, [r.hidden for r in results]),
             "collapsed": sum(fallen) / len(results),
             "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
         }

@@ -18,7 +18,7 @@ from drake_clutter.assets.gltf import box_surface, cylinder_surface, embedded_gl
 from drake_clutter.assets.textures import draw_texture, png_bytes
 from drake_clutter.catalogue import CATALOGUE_FILE, ObjectClass, Rest, Shape, load_catalogue
 from drake_clutter.files import InputError, write_text
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
 _BUILT = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
@@ -256,7 +256,7 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
     built = [
         build_class(entry, folder) for name, entry in own.items() if names is None or name in names
     ]
-    package = _SHIPPED_PACKAGE if folder == shipped_path("sdf_assets") else folder.name
+    package = _SHIPPED_PACKAGE if folder == resource_path("sdf_assets") else folder.name
     description = "Object classes of drake_clutter: one folder per class."
     write_text(
         folder / "package.xml", _PACKAGE.format(name=escape(package), description=description)

@@ -15,7 +15,7 @@ from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.validation import (
     NonEmptyText,
     StrictModel,
@@ -139,7 +139,7 @@ class WorkCell(StrictModel):
 @lru_cache(maxsize=1)
 def default_cell() -> WorkCell:
     """Return the cell of `models/cells/ur10_epick_tray.yaml`."""
-    return load_cell(shipped_path(DEFAULT_CELL))
+    return load_cell(resource_path(DEFAULT_CELL))
 
 
 def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:

@@ -15,7 +15,7 @@ from drake_clutter.cli.replay import replay
 from drake_clutter.cli.run import demo, run
 from drake_clutter.cli.solve import solve
 from drake_clutter.cli.view import view
-from drake_clutter.files import told_in_one_line
+from drake_clutter.files import cli_error_handler
 
 app = typer.Typer(
     help="Clutter that is generated, judged, looked at and searched, on Drake.",
@@ -43,5 +43,5 @@ app.add_typer(assets_app, name="assets")
 
 def main() -> None:
     """Run the console script: a misuse is one line and exit code 2."""
-    with told_in_one_line():
+    with cli_error_handler():
         app()

@@ -16,7 +16,7 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import report_step, show_episode
 from drake_clutter.cli.world import load_scene_and_world
-from drake_clutter.files import output_directory
+from drake_clutter.files import prepare_output_directory
 
 
 def explore(
@@ -36,7 +36,7 @@ def explore(
     from drake_clutter.commands import explore as command
 
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
-    output_directory(out)
+    prepare_output_directory(out)
     limit = max_moves or world.exploration.max_moves
     task = command.explore(
         command.at_rest(file.scene, world, seed),

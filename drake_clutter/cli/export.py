@@ -7,7 +7,7 @@ import typer
 
 from drake_clutter.cli.options import CatalogueOption, LaidOutOption, OutOption, SceneArgument
 from drake_clutter.cli.output import out_console
-from drake_clutter.files import output_directory
+from drake_clutter.files import prepare_output_directory
 
 
 class Format(Enum):
@@ -35,7 +35,7 @@ def export(
     from drake_clutter.scenes.scene_file import load_scene
 
     file = load_scene(scene, load_catalogue(catalogue))
-    output_directory(out)
+    prepare_output_directory(out)
     out_console.print(
         f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}"
     )

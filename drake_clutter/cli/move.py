@@ -19,7 +19,7 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import report_step, show, show_episode
 from drake_clutter.cli.world import load_scene_and_world
-from drake_clutter.files import InputError, output_directory
+from drake_clutter.files import InputError, prepare_output_directory
 
 
 def move(
@@ -59,7 +59,7 @@ def move(
         raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
     chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
-    output_directory(out)
+    prepare_output_directory(out)
     start = command.at_rest(file.scene, world, seed)
     if plan_only:
         plans = command.plan_only(start, chosen, seed, world, out)

@@ -10,7 +10,7 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import show
 from drake_clutter.cli.world import load_scene_and_world
-from drake_clutter.files import output_directory
+from drake_clutter.files import prepare_output_directory
 
 
 def render(
@@ -25,6 +25,6 @@ def render(
     from drake_clutter.commands.render import render_scene
 
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
-    output_directory(out)
+    prepare_output_directory(out)
     shares = render_scene(file.settled_scene, world, out)
     show({name: round(share, 3) for name, share in shares.items()}, False, "visible share")

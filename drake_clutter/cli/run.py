@@ -17,7 +17,7 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import report_step, show_episode
 from drake_clutter.cli.world import check_cell, in_world, refuse_support
-from drake_clutter.files import output_directory
+from drake_clutter.files import prepare_output_directory
 
 if TYPE_CHECKING:
     from drake_clutter.systems.scenario import Scenario
@@ -81,7 +81,7 @@ def run(
     from drake_clutter.commands import run as command
 
     given = _load_scenario(scenario, cell, settings)
-    output_directory(out)
+    prepare_output_directory(out)
     show_episode(command.run(given, out, report_step), as_json, out)
 
 
@@ -99,5 +99,5 @@ def demo(
     given = replace(
         _load_scenario(None, cell, settings), seed=seed, nodes=nodes, perception="depth"
     )
-    output_directory(out)
+    prepare_output_directory(out)
     show_episode(command.demo(given, out, report_step), as_json, out)

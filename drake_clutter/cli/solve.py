@@ -16,7 +16,7 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import report_step, show
 from drake_clutter.cli.world import load_scene_and_world
-from drake_clutter.files import output_directory
+from drake_clutter.files import prepare_output_directory
 
 
 def solve(
@@ -36,7 +36,7 @@ def solve(
     from drake_clutter.commands import explore, solve
 
     file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
-    output_directory(out)
+    prepare_output_directory(out)
     fields = solve.solve(
         explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step
     )

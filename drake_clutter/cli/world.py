@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drake_clutter.files import refusal
+from drake_clutter.files import input_error
 
 if TYPE_CHECKING:
     from drake_clutter.cell.work_cell import WorkCell
@@ -53,7 +53,7 @@ def refuse_support(settings: Sequence[str] | None) -> None:
         if in_world(setting).startswith(
             ("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")
         ):
-            raise refusal(
+            raise input_error(
                 f"--set {setting}",
                 "the objects stand on their scene's support; allowed are other fields",
             )

@@ -16,12 +16,12 @@ from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, sha256_of, write_json
-from drake_clutter.resources import git_commit, shipped_path
+from drake_clutter.files import InputError, file_sha256, write_json
+from drake_clutter.resources import git_commit, resource_path
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 _READ_AT = 10
 """Moves at which a longer search is read, too (SPEC section 6)."""
@@ -63,7 +63,7 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
     if not scenes.exists():
         sets = {
             path.stem: path
-            for path in shipped_path("training/scenes").glob("*.json")
+            for path in resource_path("training/scenes").glob("*.json")
             if not path.stem.startswith("train_")
         }
         if named not in sets:
@@ -168,6 +168,6 @@ def evaluate(
         "config": to_plain(config),
         "rows": rows,
     }
-    fields |= {"commit": git_commit(), "scenes": {str(file): sha256_of(file) for file in files}}
+    fields |= {"commit": git_commit(), "scenes": {str(file): file_sha256(file) for file in files}}
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

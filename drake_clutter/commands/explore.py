@@ -9,7 +9,7 @@ import numpy as np
 from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, refusal, write_json
+from drake_clutter.files import InputError, input_error, write_json
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.plan import NoPlan, PlanFailure, plan_fields
 from drake_clutter.reports.episode_page import write_episode_page
@@ -168,7 +168,7 @@ def read_moves(path: Path) -> list[Move]:
     content = f"a list of {{pick: NAME, place: NAME or {TRAY}}}"
     entries = validate(tuple[_MoveEntry, ...], read_yaml(path, content), str(path))
     if not entries:
-        raise refusal(str(path), f"holds no moves; allowed is {content}")
+        raise input_error(str(path), f"holds no moves; allowed is {content}")
     return [Move(entry.pick, entry.place) for entry in entries]
 
 

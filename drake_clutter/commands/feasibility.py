@@ -18,7 +18,7 @@ from drake_clutter.catalogue import load_catalogue
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
-from drake_clutter.files import InputError, output_directory, write_json, write_text
+from drake_clutter.files import InputError, prepare_output_directory, write_json, write_text
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import Reachability, base_scores
 from drake_clutter.reports.feasibility_report import write_report
@@ -39,7 +39,7 @@ from drake_clutter.validation import (
     to_plain,
     validate,
 )
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 from drake_clutter.yaml_io import read_yaml
 
 JOB_FILE, PARTS, REPORT = "job.json", "parts", "report.html"
@@ -312,7 +312,7 @@ def feasibility(
                 f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder"
             )
     else:
-        output_directory(out)
+        prepare_output_directory(out)
         write_json(out / JOB_FILE, job.fields())
     (out / PARTS).mkdir(exist_ok=True)
     parts = [Part(setup, number) for setup in job.setups for number in range(len(job.scenes))]

@@ -19,7 +19,7 @@ from drake_clutter.agents.generation import (
     summarise,
 )
 from drake_clutter.catalogue import load_catalogue
-from drake_clutter.files import InputError, output_directory, write_json
+from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
 from drake_clutter.reports.pictures import PictureCamera
@@ -28,7 +28,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.mapping import map_ordered
+from drake_clutter.workers.parallel_map import map_ordered
 
 JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
 SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"
@@ -77,8 +77,8 @@ def generate(
     catalogue = load_catalogue(job.catalogue_folder)
     for object_class in catalogue.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written
-    output_directory(
-        out, may_hold=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES})
+    prepare_output_directory(
+        out, allowed_entries=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES})
     )
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
@@ -87,7 +87,7 @@ def generate(
                 f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
             )
     else:
-        output_directory(out)
+        prepare_output_directory(out)
         write_json(out / JOB_FILE, job.fields)
     (out / SCENES).mkdir(exist_ok=True)
     paths = [out / SCENES / f"{index:04d}.yaml" for index in range(count)]

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from drake_clutter.files import InputError, replacing, write_json
+from drake_clutter.files import InputError, atomic_write, write_json
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Checkpoint:
 
 def save_checkpoint(path: Path, network: nn.Module, about: dict[str, Any]) -> None:
     """Writes `path` (.safetensors) and a .json beside it."""
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         save_file(
             {
                 name: value.detach().cpu().contiguous()
@@ -60,7 +60,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
     """Writes tensors by name, and beside them what JSON can hold, in one file and in one step."""
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         held = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         save_file(held, temporary, metadata={"state": json.dumps(state)})
 

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
-from drake_clutter.files import InputError, sha256_of
-from drake_clutter.resources import shipped_path
+from drake_clutter.files import InputError, file_sha256
+from drake_clutter.resources import resource_path
 
 
 def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
@@ -24,7 +24,7 @@ def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
             f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]"
         )
     try:
-        return shipped_path(shipped[name]) if name in shipped else Path(name)
+        return resource_path(shipped[name]) if name in shipped else Path(name)
     except FileNotFoundError as error:
         raise InputError(
             f"--agent {name}: {error}; train it with the scripts of training/, and give its file"
@@ -41,7 +41,7 @@ def weights_of(name: str, shipped: Mapping[str, str]) -> str:
         return ""
     path = checkpoint_path(name, shipped)
     try:
-        return sha256_of(path)
+        return file_sha256(path)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); allowed is a checkpoint"

@@ -11,7 +11,13 @@ from rich.console import Console
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
-from drake_clutter.files import InputError, output_directory, sha256_of, write_json, write_text
+from drake_clutter.files import (
+    InputError,
+    file_sha256,
+    prepare_output_directory,
+    write_json,
+    write_text,
+)
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import config_yaml, to_plain
@@ -56,12 +62,12 @@ class TrainingRun:
             InputError: the folder holds something else, or a run of another config or of other files.
         """
         self._out, self._config, self._learner, self._steps = out, config, learner, steps
-        self._files = {str(file): sha256_of(file) for file in files}
+        self._files = {str(file): file_sha256(file) for file in files}
         told = config_yaml(config) + "".join(
             f"# {file}: sha256 {digest}\n" for file, digest in self._files.items()
         )
         if not (out / CONFIG).exists():
-            output_directory(out)
+            prepare_output_directory(out)
             write_text(out / CONFIG, told)
         elif (out / CONFIG).read_text() != told:
             raise InputError(

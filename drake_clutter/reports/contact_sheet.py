@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from drake_clutter.files import replacing
+from drake_clutter.files import atomic_write
 from drake_clutter.reports.drawing import font
 
 MAX_THUMBNAILS = 48
@@ -64,7 +64,7 @@ def write_contact_sheet(path: Path, entries: Sequence[tuple[NDArray[np.uint8], s
             ),
         )
         _caption(draw, caption, (left + outer / 2, top + outer + CAPTION_HEIGHT / 2 - 2))
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         sheet.save(temporary)
 
 

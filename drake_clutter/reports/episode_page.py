@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.files import replacing, write_text
+from drake_clutter.files import atomic_write, write_text
 from drake_clutter.perception.label_detector import Look
 from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.detections_picture import detections_picture
@@ -92,7 +92,7 @@ class _Pictures:
 
     def figure(self, name: str, picture: NDArray[np.uint8], alt: str, caption: str) -> str:
         """Writes `name`.png; returns its figure element."""
-        with replacing(self._folder / f"{name}.png") as temporary:
+        with atomic_write(self._folder / f"{name}.png") as temporary:
             Image.fromarray(picture).save(temporary)
         height, width = picture.shape[:2]
         return (

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.robots.stl import stl_as_obj
 
 PACKAGE = "drake_clutter_models"
@@ -32,7 +32,7 @@ def model_path(model: str, field: str = "robot.model") -> Path:
     """
     prefix = f"package://{PACKAGE}/"
     shipped, inside = model.startswith(prefix), model.removeprefix(prefix)
-    path = shipped_path("models") / inside if shipped else Path(model)
+    path = resource_path("models") / inside if shipped else Path(model)
     if not path.is_file() or path.suffix not in (".sdf", ".urdf"):
         raise InputError(f"{field}: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
     return path
@@ -48,7 +48,7 @@ def package_map(path: Path) -> PackageMap:
     packages.PopulateFromRosPackagePath()
     above = (folder / "package.xml" for folder in path.parents)
     found = next((package for package in above if package.is_file()), None)
-    for package in (found, shipped_path("models/package.xml")):
+    for package in (found, resource_path("models/package.xml")):
         if package is not None:
             packages.AddPackageXml(str(package))
     return packages

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import trimesh
 
-from drake_clutter.files import InputError, replacing, sha256_of
+from drake_clutter.files import InputError, atomic_write, file_sha256
 
 
 def stl_as_obj(path: Path) -> Path:
@@ -16,7 +16,7 @@ def stl_as_obj(path: Path) -> Path:
         InputError: The file is no STL.
     """
     folder = Path(tempfile.gettempdir()) / f"drake_clutter_meshes_{os.getuid()}"
-    made = folder / f"{path.stem}_{sha256_of(path)[:16]}.obj"
+    made = folder / f"{path.stem}_{file_sha256(path)[:16]}.obj"
     if made.is_file():
         return made
     try:
@@ -27,6 +27,6 @@ def stl_as_obj(path: Path) -> Path:
     if empty:
         raise InputError(f"{path}: is no STL mesh; allowed are OBJ, glTF, VTK and STL")
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(made) as temporary:
+    with atomic_write(made) as temporary:
         mesh.export(temporary, file_type="obj")
     return made

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from drake_clutter.catalogue import Catalogue
 from drake_clutter.cell.support import Side
 from drake_clutter.cell.work_cell import WorkCell, default_cell
-from drake_clutter.files import InputError, refusal, shown, write_text
+from drake_clutter.files import InputError, format_value, input_error, write_text
 from drake_clutter.grammar import ClutterGraph, Orientation
 from drake_clutter.grammar.graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
 from drake_clutter.scenes.geometry import PENETRATION_ALLOWED, deepest_penetration
@@ -189,7 +189,7 @@ def _scene_file(given: Any, path: str, catalogue: Catalogue) -> SceneFile:
     depth, first, second = deepest_penetration(objects)
     if depth > PENETRATION_ALLOWED:
         found = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
-        raise refusal(path, f"{found}; allowed is {1000 * PENETRATION_ALLOWED:g} mm")
+        raise input_error(path, f"{found}; allowed is {1000 * PENETRATION_ALLOWED:g} mm")
     graph = None if document.graph is None else _graph(document.graph, objects, path)
     cell = document.work_cell
     scene = Scene(objects, cell.support, graph, document.derivation, document.seed)
@@ -198,7 +198,7 @@ def _scene_file(given: Any, path: str, catalogue: Catalogue) -> SceneFile:
 
 
 def _refusal(path: str, field: str, value: Any, what: str) -> InputError:
-    return refusal(path, f"{field}: {shown(value)}; allowed is {what}")
+    return input_error(path, f"{field}: {format_value(value)}; allowed is {what}")
 
 
 def _objects(entries: Sequence[_ObjectEntry], path: str, catalogue: Catalogue) -> list[SceneObject]:
@@ -209,8 +209,8 @@ def _objects(entries: Sequence[_ObjectEntry], path: str, catalogue: Catalogue) -
             known = f"one of {', '.join(catalogue.classes)}"
             raise _refusal(path, f"objects[{k}].class", entry.object_class, known)
         if entry.name in made:
-            found = f"objects[{k}].name: {shown(entry.name)} is there twice"
-            raise refusal(path, f"{found}; allowed are names without repeats")
+            found = f"objects[{k}].name: {format_value(entry.name)} is there twice"
+            raise input_error(path, f"{found}; allowed are names without repeats")
         made[entry.name] = SceneObject(entry.name, object_class, entry.X_TO.pose, entry.node)
     return list(made.values())
 
@@ -234,14 +234,14 @@ def _graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> Clu
     try:
         graph = ClutterGraph.from_parts(nodes, edges)
     except ValueError as error:
-        raise refusal(path, f"graph.{error}") from error
+        raise input_error(path, f"graph.{error}") from error
     for o in objects:
         if o.node is not None and nodes.get(o.node) != o.object_class.name:
             found = f"graph.nodes: the node of {o.name}, {o.node}, is missing or of another kind"
-            raise refusal(path, f"{found}; allowed is {o.object_class.name}")
+            raise input_error(path, f"{found}; allowed is {o.object_class.name}")
     if not graph.is_terminal:
         found = "graph: holds slots or edges without orientation"
-        raise refusal(path, f"{found}; allowed is a terminal graph")
+        raise input_error(path, f"{found}; allowed is a terminal graph")
     return graph
 
 
@@ -249,17 +249,17 @@ def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     why = entry.instability
     if entry.stable == (why is not None):
         what = "allowed is one for an unstable scene, and none for a stable one"
-        raise refusal(path, f"verdict.instability: {what}")
+        raise input_error(path, f"verdict.instability: {what}")
     named = {"settled": set(entry.settled), "visible_share": set(entry.visible_share)}
     named |= {"hidden": set(entry.hidden), "instability.object": {why.object} if why else set()}
     for field, names in named.items():
         if strangers := sorted(names - set(scene.names)):
-            found = f"verdict.{field}: {shown(strangers[0])} is no object"
-            raise refusal(path, f"{found}; allowed are {', '.join(scene.names)}")
+            found = f"verdict.{field}: {format_value(strangers[0])} is no object"
+            raise input_error(path, f"{found}; allowed are {', '.join(scene.names)}")
     for field in ("settled", "visible_share") if entry.stable else ("settled",):
         if missing := sorted(set(scene.names) - named[field]):
             found = f"verdict.{field}: {missing[0]} is missing"
-            raise refusal(path, f"{found}; allowed is an entry for every object")
+            raise input_error(path, f"{found}; allowed is an entry for every object")
     instability = None
     if why is not None:
         instability = Instability(why.reason, why.object, why.displacement, why.tilt)

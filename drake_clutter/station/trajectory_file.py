@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalogue import Catalogue
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
-from drake_clutter.files import InputError, refusal, replacing
+from drake_clutter.files import InputError, atomic_write, input_error
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
@@ -47,7 +47,7 @@ def write_trajectories(
         cell: in which they were carried out; its support is the scene's.
     """
     count = 0
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_write(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
             {
                 "version": VERSION,
@@ -92,7 +92,7 @@ def read_trajectories(
     try:
         file = h5py.File(path)
     except OSError as error:
-        raise refusal(
+        raise input_error(
             str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})"
         ) from error
     with file:

@@ -9,7 +9,7 @@ import numpy as np
 from drake_clutter.catalogue import load_catalogue
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
@@ -70,7 +70,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         """
         if not isinstance(scenes, SceneSet):
             scenes = load_scene_set(
-                shipped_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue()
+                resource_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue()
             )
         self._config = config or ClutterConfig(cell=scenes.cell)
         self._privileged, self.scenes = privileged, scenes

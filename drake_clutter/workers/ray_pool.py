@@ -12,14 +12,18 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from drake_clutter.files import InputError
-from drake_clutter.workers.environment import IN_FLIGHT_PER_WORKER, ONE_THREAD_EACH, environment
+from drake_clutter.workers.process_environment import (
+    IN_FLIGHT_PER_WORKER,
+    SINGLE_THREAD_VARIABLES,
+    temporary_environment,
+)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_MAX_LOSSES = 3
+MAX_WORKER_LOSSES = 3
 # Ray reads these when it is imported. Without them it tries for a quarter of an hour to reach a cluster that is not there.
-_SHORT_WAIT = {
+SHORT_CONNECTION_TIMEOUTS = {
     "RAY_NUM_REDIS_GET_RETRIES": "1",
     "RAY_gcs_rpc_server_connect_timeout_s": "2",
     "RAY_py_gcs_connect_timeout_s": "5",
@@ -65,29 +69,29 @@ def map_on_ray(
     workers: int,
     address: str,
 ) -> Generator[Result, None, None]:
-    """See `drake_clutter.workers.mapping.map_ordered`."""
-    with _connection(address) as ray:
+    """See `drake_clutter.workers.parallel_map.map_ordered`."""
+    with _ray_session(address) as ray:
         options = {
             "num_cpus": 1,
             "max_restarts": -1,
             "max_task_retries": -1,
-            "runtime_env": {"env_vars": ONE_THREAD_EACH},
+            "runtime_env": {"env_vars": SINGLE_THREAD_VARIABLES},
         }
         actor_class = ray.remote(**options)(_Actor)
         factory = ray.cloudpickle.dumps(make_worker)
         actors = [actor_class.remote(factory, os.getcwd()) for _ in range(workers)]
         try:
-            yield from _map(ray, actors, items)
+            yield from _map_over_actors(ray, actors, items)
         finally:
             for actor in actors:
                 ray.kill(actor)
 
 
 @contextmanager
-def _connection(address: str) -> Iterator[Any]:
+def _ray_session(address: str) -> Iterator[Any]:
     """Ray, connected for the length of the block; a connection that the process already has is used, and kept."""
     try:
-        with environment(_SHORT_WAIT):
+        with temporary_environment(SHORT_CONNECTION_TIMEOUTS):
             import ray
     except ModuleNotFoundError as error:
         raise InputError(
@@ -109,7 +113,9 @@ def _connection(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def _map(ray: Any, actors: list[Any], items: Iterable[Any]) -> Generator[Any, None, None]:
+def _map_over_actors(
+    ray: Any, actors: list[Any], items: Iterable[Any]
+) -> Generator[Any, None, None]:
     """Gives the items to the actors. Ray starts these, notices when one dies, and starts it anew where there is room.
 
     The items are not left to Ray's own retries. Those keep an item with its actor, which waits for ever if its machine is gone
@@ -117,23 +123,23 @@ def _map(ray: Any, actors: list[Any], items: Iterable[Any]) -> Generator[Any, No
     actor goes to the next actor that is ready.
     """
     remaining = iter(items)
-    in_order: deque[_Job] = deque()  # read, not yet yielded
-    waiting: deque[_Job] = deque()  # those of them that no actor works on
+    pending: deque[_Job] = deque()  # read, not yet yielded
+    unassigned: deque[_Job] = deque()  # those of them that no actor works on
     idle: list[Any] = []
     busy: dict[Any, tuple[Any, _Job | None]] = {
         actor.ready.remote(): (actor, None) for actor in actors
     }
     while True:
-        for item in islice(remaining, len(actors) * IN_FLIGHT_PER_WORKER - len(in_order)):
-            in_order.append(_Job(ray.cloudpickle.dumps(item)))
-            waiting.append(in_order[-1])
-        if not in_order:
+        for item in islice(remaining, len(actors) * IN_FLIGHT_PER_WORKER - len(pending)):
+            pending.append(_Job(ray.cloudpickle.dumps(item)))
+            unassigned.append(pending[-1])
+        if not pending:
             return
-        if in_order[0].result.done():
-            yield in_order.popleft().result.result()
+        if pending[0].result.done():
+            yield pending.popleft().result.result()
             continue
-        while idle and waiting:
-            actor, given = idle.pop(), waiting.popleft()
+        while idle and unassigned:
+            actor, given = idle.pop(), unassigned.popleft()
             busy[actor.work.options(max_task_retries=0).remote(given.item)] = (actor, given)
         (done,), _ = ray.wait(list(busy))
         actor, job = busy.pop(done)
@@ -149,10 +155,12 @@ def _map(ray: Any, actors: list[Any], items: Iterable[Any]) -> Generator[Any, No
             if job is None:
                 raise
             job.losses += 1
-            if job.losses < _MAX_LOSSES:
-                waiting.appendleft(job)
+            if job.losses < MAX_WORKER_LOSSES:
+                unassigned.appendleft(job)
             else:
-                message = f"an item ended {_MAX_LOSSES} worker processes, the last so: {error}"
+                message = (
+                    f"an item ended {MAX_WORKER_LOSSES} worker processes, the last so: {error}"
+                )
                 job.result.set_exception(BrokenProcessPool(message))
             # Where one died others may have, e.g. with their machine; they get no item before they have answered.
             busy |= {other.ready.remote(): (other, None) for other in (actor, *idle)}

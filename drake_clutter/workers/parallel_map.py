@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
-from drake_clutter.workers.process_pool import map_in_fresh_processes, map_in_processes
+from drake_clutter.workers.process_pool import map_in_processes, map_in_recycled_processes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -15,7 +15,7 @@ def map_ordered(
     *,
     workers: int,
     ray_address: str | None = None,
-    fresh_after: int | None = None,
+    max_items_per_process: int | None = None,
 ) -> Generator[Result, None, None]:
     """Yields `make_worker()(item)` for every item, in the order of the items, each as soon as it is there.
 
@@ -33,8 +33,9 @@ def map_ordered(
         items: the items; with more than one worker, or on a cluster, they and the results are pickled.
         workers: number of processes; 1 works in this process, or as one process on the cluster.
         ray_address: of the Ray cluster that the processes run on, e.g. "auto"; None: they run on this machine, without Ray.
-        fresh_after: items, after which processes on this machine are replaced by fresh ones, also a single one. pydrake never
-            frees a Diagram that holds a system written in Python: an episode of the closed loop keeps 340 MB.
+        max_items_per_process: After so many items, processes on this machine are replaced, also a
+            single one; None: never. pydrake never frees a Diagram that holds a system written in
+            Python: an episode of the closed loop keeps 340 MB.
 
     Raises:
         BrokenProcessPool: a worker process was killed; on a cluster, an item lost its worker three times.
@@ -46,16 +47,16 @@ def map_ordered(
         from drake_clutter.workers.ray_pool import map_on_ray
 
         return map_on_ray(make_worker, items, workers, ray_address)
-    if fresh_after is not None:
-        return map_in_fresh_processes(make_worker, items, workers, fresh_after)
+    if max_items_per_process is not None:
+        return map_in_recycled_processes(make_worker, items, workers, max_items_per_process)
     return (
-        _map_here(make_worker, items)
+        _map_in_this_process(make_worker, items)
         if workers == 1
         else map_in_processes(make_worker, items, workers)
     )
 
 
-def _map_here(
+def _map_in_this_process(
     make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item]
 ) -> Generator[Result, None, None]:
     worker: Callable[[Item], Result] | None = None

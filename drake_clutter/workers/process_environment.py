@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 IN_FLIGHT_PER_WORKER = 4
 """Items that are sent to each worker before the first of their results is read."""
-ONE_THREAD_EACH = {
+SINGLE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -20,7 +20,7 @@ renderer (LP: llvmpipe) was twice seen waiting for one of its own threads for ev
 
 
 @contextmanager
-def environment(variables: dict[str, str]) -> Iterator[None]:
+def temporary_environment(variables: dict[str, str]) -> Iterator[None]:
     """Sets environment variables for the length of the block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
