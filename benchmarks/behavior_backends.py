@@ -14,7 +14,7 @@ import numpy as np
 from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration import PolicyMaker, make_explorers
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import CannotJudge, Verdict
@@ -85,7 +85,7 @@ def hash_of(part: Part) -> str:
 
 @cache
 def _scene_set(name: str) -> SceneSet:
-    return load_scene_set(resource_path(f"training/scenes/{name}.json"), load_catalogue())
+    return load_scene_set(resource_path(f"training/scenes/{name}.json"), load_catalog())
 
 
 def _scene(case: Case) -> Scene:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import NodeBudget, SceneGrammar, uniform_choice
 from drake_clutter.scenes.geometry import deepest_penetration
@@ -25,8 +25,8 @@ class _Layouts:
     """Lays out the random graph of an index: 3 to 30 nodes, either object set."""
 
     def __init__(self) -> None:
-        catalogue = load_catalogue()
-        self._grammars = [SceneGrammar(catalogue.object_set(name)) for name in ("ycb7", "pantry14")]
+        catalog = load_catalog()
+        self._grammars = [SceneGrammar(catalog.object_set(name)) for name in ("ycb7", "pantry14")]
 
     def __call__(self, index: int) -> tuple[str, float]:
         """What came of it, and the deepest penetration, m."""

@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
@@ -30,15 +30,15 @@ OUT = Path(__file__).parent / "results" / "come_apart.json"
 
 def counted(folder: Path) -> dict[str, Any]:
     """A folder's row."""
-    job, catalogue, judge = (
+    job, catalog, judge = (
         json.loads((folder / JOB_FILE).read_text()),
-        load_catalogue(),
+        load_catalog(),
         FastJudge(ClutterConfig()),
     )
     counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
     answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(answers):
-        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
+        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalog)
         if file.verdict is not None and file.verdict.stable:
             counts[
                 judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value

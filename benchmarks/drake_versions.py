@@ -23,7 +23,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.explore import explore
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
@@ -45,7 +45,7 @@ app = typer.Typer(no_args_is_help=True)
 
 
 def _frozen(number: int, config: ClutterConfig) -> Scene:
-    held = load_scene_set(resource_path(f"training/scenes/{EPISODES[0]}.json"), load_catalogue())
+    held = load_scene_set(resource_path(f"training/scenes/{EPISODES[0]}.json"), load_catalog())
     return held.settled(number, held.grammar, config)
 
 

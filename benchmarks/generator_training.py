@@ -17,7 +17,7 @@ from rich.table import Table
 
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Replay, SoftQConfig, SoftQLearner
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
@@ -49,7 +49,7 @@ def timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) ->
 
 def measured(threads: int, steps: int) -> dict[str, Any]:
     """Steps per second after the warm-up, first without, then with the single parts timed."""
-    classes = load_catalogue().object_set("ycb7")
+    classes = load_catalog().object_set("ycb7")
     learning = SoftQConfig(temperature=0.25)
     learner = SoftQLearner(
         lambda: ClutterGeneration(classes, GenerationTask(), ClutterConfig()),

@@ -14,7 +14,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import RandomGenerator
-from drake_clutter.catalogue import Rest, Shape, load_catalogue
+from drake_clutter.catalog import Rest, Shape, load_catalog
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
@@ -41,7 +41,7 @@ def stacks(
     count: int, nodes: int, seed: int, config: ClutterConfig
 ) -> list[tuple[list[SceneObject], list[SceneObject]]]:
     """RG stacks of two objects or more, each with two draws of its random offsets."""
-    grammar = SceneGrammar(load_catalogue().object_set("ycb7"))
+    grammar = SceneGrammar(load_catalog().object_set("ycb7"))
     found: list[tuple[list[SceneObject], list[SceneObject]]] = []
     index = 0
     while len(found) < count:

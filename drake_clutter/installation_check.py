@@ -124,20 +124,20 @@ def probe_torch() -> str:
 
 def probe_assets() -> str:
     """Every shipped object class has a model."""
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.resources import resource_path
 
-    catalogue = load_catalogue()
+    catalog = load_catalog()
     unbuilt = [
         name
-        for name, object_class in catalogue.classes.items()
+        for name, object_class in catalog.classes.items()
         if not object_class.sdf_path.is_file()
     ]
     if unbuilt:
         raise ProbeError(
-            f"{len(unbuilt)} of {len(catalogue.classes)} object classes have no model, the first is {unbuilt[0]}"
+            f"{len(unbuilt)} of {len(catalog.classes)} object classes have no model, the first is {unbuilt[0]}"
         )
-    return f"{len(catalogue.classes)} object classes in {resource_path('sdf_assets')}"
+    return f"{len(catalog.classes)} object classes in {resource_path('sdf_assets')}"
 
 
 def probe_machine() -> str:

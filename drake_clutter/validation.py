@@ -145,7 +145,11 @@ def with_current_names(schema: type, given: Any) -> Any:
         schema: The class of `given`; classes of its fields are left alone.
         given: What was read.
     """
-    current = _RENAMED.get(schema)
+    current = {
+        earlier: name
+        for base in reversed(schema.__mro__)
+        for earlier, name in _RENAMED.get(base, {}).items()
+    }
     if not current or not isinstance(given, dict):
         return given
     return {

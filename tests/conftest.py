@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig, load_config
@@ -45,9 +45,9 @@ settings.load_profile("repeatable")
 
 AnyReport = TypeVar("AnyReport", pytest.CollectReport, pytest.TestReport)
 
-CATALOGUE = load_catalogue()
-CLASSES = CATALOGUE.classes
-GRAMMARS = {name: SceneGrammar(CATALOGUE.object_set(name)) for name in ("ycb7", "pantry14")}
+CATALOG = load_catalog()
+CLASSES = CATALOG.classes
+GRAMMARS = {name: SceneGrammar(CATALOG.object_set(name)) for name in ("ycb7", "pantry14")}
 
 DEFAULT_CELL = default_cell()
 TRAY = DEFAULT_CELL.support

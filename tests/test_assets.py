@@ -1,4 +1,4 @@
-"""What is built from the catalogue: that Drake reads it, its mass and inertia, its contact, its picture."""
+"""What is built from the catalog: that Drake reads it, its mass and inertia, its contact, its picture."""
 
 import base64
 import json
@@ -22,12 +22,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_clutter.assets import MOTIFS, build_assets, build_class
 from drake_clutter.assets.contact import FRICTION, HYDROELASTIC_MODULUS
 from drake_clutter.assets.textures import draw_texture
-from drake_clutter.catalogue import ObjectClass, Rest, Shape, load_catalogue
+from drake_clutter.catalog import ObjectClass, Rest, Shape, load_catalog
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
 
-CLASSES = load_catalogue().classes
+CLASSES = load_catalog().classes
 EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
 
 
@@ -67,13 +67,13 @@ def document(folder: Path) -> dict[str, Any]:
 def example(folder: Path) -> Path:
     """A copy of the example's sources."""
     folder.mkdir()
-    for name in ("catalogue.yaml", "mug.stl"):
+    for name in ("catalog.yaml", "mug.stl"):
         shutil.copy(EXAMPLE / name, folder)
     return folder
 
 
 def user_class(folder: Path, text: str) -> Path:
-    (folder / "catalogue.yaml").write_text(f"classes:\n  block: {text}\n")
+    (folder / "catalog.yaml").write_text(f"classes:\n  block: {text}\n")
     return folder
 
 
@@ -171,7 +171,7 @@ def test_every_motif_draws(tmp_path: Path) -> None:
         user_class(
             folder, f"{{shape: box, size_mm: [20, 30, 40], mass_g: 50, label: {{motif: {motif}}}}}"
         )
-        image = draw_texture(load_catalogue(folder).classes["block"]).image
+        image = draw_texture(load_catalog(folder).classes["block"]).image
         assert isinstance(image, Image.Image)
         pictures.add(image.tobytes())
     assert len(pictures) == len(MOTIFS)
@@ -185,7 +185,7 @@ def built_example(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_example_is_in_pieces_that_cover_it(built_example: Path) -> None:
-    mug = load_catalogue(built_example).classes["mug"]
+    mug = load_catalog(built_example).classes["mug"]
     assert 5 <= len(mug.convex_pieces) <= 40
     assert np.ptp(mug.corners, axis=0) == pytest.approx(mug.size, rel=1e-3)
     hulls = [trimesh.convex.convex_hull(piece) for piece in mug.convex_pieces]
@@ -220,7 +220,7 @@ def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) ->
     block.apply_translation((1, 2, 3))  # the frame moves to its centre
     block.export(tmp_path / "block.stl")
     build_assets(tmp_path)
-    (corners,) = load_catalogue(tmp_path).classes["block"].convex_pieces
+    (corners,) = load_catalog(tmp_path).classes["block"].convex_pieces
     assert corners.max(axis=0) == pytest.approx([0.025, 0.03, 0.035], abs=1e-6)
     plant, _ = plant_of(f"package://{tmp_path.name}/block/model.sdf", tmp_path / "package.xml")
     inertia = plant.GetBodyByName("body").default_spatial_inertia()
@@ -250,13 +250,13 @@ def test_bad_label(tmp_path: Path, label: str, complaint: str) -> None:
     user_class(tmp_path, f"{{shape: box, size_mm: [20, 30, 40], mass_g: 50, label: {label}}}")
     with pytest.raises(InputError, match=complaint) as caught:
         build_assets(tmp_path)
-    assert str(tmp_path / "catalogue.yaml") in str(caught.value)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["catalogue.yaml"]
+    assert str(tmp_path / "catalog.yaml") in str(caught.value)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["catalog.yaml"]
 
 
 def test_builds_only_what_is_asked_and_known(tmp_path: Path) -> None:
     box = "{shape: box, size_mm: [20, 30, 40], mass_g: 50, source: 'ends in -->'}"
-    (tmp_path / "catalogue.yaml").write_text(f"classes:\n  one: {box}\n  two: {box}\n")
+    (tmp_path / "catalog.yaml").write_text(f"classes:\n  one: {box}\n  two: {box}\n")
     assert build_assets(tmp_path, ["two"]) == [tmp_path / "two"]
     assert not (tmp_path / "one").exists()
     plant_of(f"package://{tmp_path.name}/two/model.sdf", tmp_path / "package.xml")

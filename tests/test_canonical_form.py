@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import CLASSES, GRAMMARS
 
-from drake_clutter.catalogue import ObjectClass, Rest
+from drake_clutter.catalog import ObjectClass, Rest
 from drake_clutter.grammar import Orientation, canonical_form, resting_rotation
 
 YCB = GRAMMARS["ycb7"]

@@ -264,7 +264,7 @@ def broken(**changes: object) -> str:
         (("generate", "--objects", "nothing", "--out", "new"), ("nothing", "ycb7")),
         (("generate", "--out", "full"), ("full", "not empty")),
         (("generate", "--out", "scene.yaml"), ("scene.yaml", "is a file")),
-        (("generate", "--catalogue", "full", "--out", "new"), ("catalogue.yaml",)),
+        (("generate", "--catalog", "full", "--out", "new"), ("catalog.yaml",)),
         (("generate", "--config", "config.yaml", "--out", "new"), ("config.yaml", "visibility_threshold")),
         (("explore", "missing.yaml", "--out", "new"), ("missing.yaml",)),
         (("explore", "unknown.yaml", "--out", "new"), ("unknown.yaml", "objects[0].class", "teapot")),

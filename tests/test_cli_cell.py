@@ -8,7 +8,7 @@ import yaml
 from conftest import DEFAULT_CELL, resting, scene_of
 from typer.testing import CliRunner
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.cli import app
 from drake_clutter.cli.run import _load_scenario
@@ -56,10 +56,10 @@ def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(
         out,
     )
     expected = load_cell(UR5E).with_support(SCENE.support)
-    _, cell, moves = read_trajectories(out / "trajectory.h5", load_catalogue())
+    _, cell, moves = read_trajectories(out / "trajectory.h5", load_catalog())
     assert cell == expected
     assert len(moves) == 1
-    assert load_scene(out / "after.yaml", load_catalogue()).cell == expected
+    assert load_scene(out / "after.yaml", load_catalog()).cell == expected
     episode = json.loads((out / "episode.json").read_text())
     assert validate(WorkCell, episode["cell"], "episode.json") == expected
     assert episode["moves"][0]["outcome"] == "placed"

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import CATALOGUE, DEFAULT_CELL, cell_with, random_scene, training_script
+from conftest import CATALOG, DEFAULT_CELL, cell_with, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
@@ -53,7 +53,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scenes(file: Path) -> SceneSet:
-    return load_scene_set(file, CATALOGUE)
+    return load_scene_set(file, CATALOG)
 
 
 def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import pytest
 import typer.main
 from conftest import DEFAULT_CELL, resting, scene_of, training_script
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
 from drake_clutter.config import load_config, upgrade
@@ -109,10 +109,10 @@ def test_yaml_loads(page: Path, folder: Path) -> None:
         path = folder / "given.yaml"
         path.write_text(block.text, encoding="utf-8")
         if "classes" in fields:
-            path.replace(folder / "examples/custom_class/catalogue.yaml")
-            load_catalogue(folder / "examples/custom_class")
+            path.replace(folder / "examples/custom_class/catalog.yaml")
+            load_catalog(folder / "examples/custom_class")
         elif "objects" in fields and "version" in fields:
-            load_scene(path, load_catalogue())
+            load_scene(path, load_catalog())
         elif "agent" in fields:
             load_config_as(Scenario(), path)
         elif fields <= {"layout", "settle", "exploration", "cell"}:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_clutter.assets import build_assets
 from drake_clutter.assets.contact import FRICTION
-from drake_clutter.catalogue import ObjectClass, load_catalogue
+from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.export.parts import class_inertial, class_visual
 from drake_clutter.files import InputError
@@ -47,10 +47,10 @@ def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
     """The example's mesh class, with its origin away from its centre of mass."""
     folder = tmp_path_factory.mktemp("user") / "custom_class"
     folder.mkdir()
-    for name in ("catalogue.yaml", "mug.stl"):
+    for name in ("catalog.yaml", "mug.stl"):
         shutil.copy(EXAMPLE / name, folder)
     build_assets(folder)
-    return load_catalogue(folder).classes["mug"]
+    return load_catalog(folder).classes["mug"]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import drake_clutter
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
     0: {
-        *("assets", "catalogue", "files", "learning", "records", "resources", "seeding"),
+        *("assets", "catalog", "files", "learning", "records", "resources", "seeding"),
         *("statistics", "validation", "workers", "yaml_io"),
     },
     1: {"cell", "config", "grammar"},

@@ -15,7 +15,7 @@ import drake_clutter
 
 ROOT = Path(__file__).resolve().parent.parent
 VERSIONED = f"drake_clutter-{drake_clutter.__version__}"
-WHERE = "from drake_clutter.resources import resource_path as s; print(s('sdf_assets/catalogue.yaml')); print(s('models'))"
+WHERE = "from drake_clutter.resources import resource_path as s; print(s('sdf_assets/catalog.yaml')); print(s('models'))"
 
 
 def run(*command: str | Path, cwd: Path) -> str:

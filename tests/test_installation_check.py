@@ -47,8 +47,8 @@ def test_a_hang_is_a_finding(torch_is: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_missing_models_are_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    catalogue = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
-    monkeypatch.setattr("drake_clutter.catalogue.load_catalogue", lambda: catalogue)
+    catalog = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
+    monkeypatch.setattr("drake_clutter.catalog.load_catalog", lambda: catalog)
     with pytest.raises(
         installation_check.ProbeError,
         match="1 of 1 object classes have no model, the first is crate",

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import CATALOGUE, resting, scene_of
+from conftest import CATALOG, resting, scene_of
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -18,7 +18,7 @@ from drake_clutter.systems.scenario import DETECTORS
 def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
     network = SegmentationNetwork.load(resource_path(DETECTORS[request.param]))
     return LearnedDetector(
-        network, CATALOGUE.object_set("ycb7"), config.cell.camera, config.cell.support
+        network, CATALOG.object_set("ycb7"), config.cell.camera, config.cell.support
     )
 
 

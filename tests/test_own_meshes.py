@@ -13,7 +13,7 @@ from test_fast_judge import STEP
 from test_settle import BELOW
 
 from drake_clutter.assets import build_assets
-from drake_clutter.catalogue import ObjectClass, load_catalogue
+from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -68,10 +68,10 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
     for name, mesh in meshes.items():
         mesh.export(folder / f"{name}.stl")
     entries = [f"  {name}: {{shape: mesh, mesh: {name}.stl, mass_g: 200}}\n" for name in meshes]
-    (folder / "catalogue.yaml").write_text("classes:\n" + "".join(entries))
+    (folder / "catalog.yaml").write_text("classes:\n" + "".join(entries))
     build_assets(folder)
-    catalogue = load_catalogue(folder)
-    return {name: catalogue.classes[name] for name in meshes}
+    catalog = load_catalog(folder)
+    return {name: catalog.classes[name] for name in meshes}
 
 
 def as_made(

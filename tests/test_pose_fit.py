@@ -5,18 +5,18 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CATALOGUE, CLASSES, DEFAULT_CELL, resting, rng, scene_of
+from conftest import CATALOG, CLASSES, DEFAULT_CELL, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter, pose_error
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 
-PANTRY = CATALOGUE.object_sets["pantry14"]
+PANTRY = CATALOG.object_sets["pantry14"]
 
 
 @pytest.fixture(scope="module")

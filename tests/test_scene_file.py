@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import (
-    CATALOGUE,
+    CATALOG,
     CLASSES,
     DEFAULT_CELL,
     TRAY,
@@ -48,13 +48,13 @@ def unstable_verdict(scene: Scene) -> Verdict:
 def reloaded(folder: Path, scene: Scene, verdict: Verdict | None = None) -> SceneFile:
     path = folder / "scene.yaml"
     save_scene(path, scene, DEFAULT_CELL, verdict)
-    return load_scene(path, CATALOGUE)
+    return load_scene(path, CATALOG)
 
 
 def loads_or_is_refused(path: Path) -> bool:
     """Whether the file loads; if not, it must be refused by an error that names it."""
     try:
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)
     except InputError as refusal:
         message = str(refusal)
     else:
@@ -101,21 +101,21 @@ def test_a_file_holds_the_cell_that_it_was_made_with(tmp_path: Path) -> None:
         "robot.base.x=-0.8", "cameras.overhead.pose.roll=165", "gripper.extension=0.15"
     )
     save_scene(tmp_path / "scene.yaml", SCENE, cell)
-    read = load_scene(tmp_path / "scene.yaml", CATALOGUE)
+    read = load_scene(tmp_path / "scene.yaml", CATALOG)
     assert read.cell == cell
     assert_same(read.scene, SCENE)
     smaller = scene_of(resting("sugar_box"), side=0.5)
     save_scene(tmp_path / "scene.yaml", smaller, cell)
-    assert load_scene(tmp_path / "scene.yaml", CATALOGUE).cell == cell.with_support(tray(0.5))
+    assert load_scene(tmp_path / "scene.yaml", CATALOG).cell == cell.with_support(tray(0.5))
 
 
 def test_a_file_of_version_1_names_the_tray_alone(tmp_path: Path) -> None:
     (path := tmp_path / "scene.yaml").write_text(ONE_BOX + "tray: {side: 0.5}\n")
-    read = load_scene(path, CATALOGUE)
+    read = load_scene(path, CATALOG)
     assert read.scene.support == read.cell.support == tray(0.5)
     assert read.cell == DEFAULT_CELL.with_support(tray(0.5))
     path.write_text(ONE_BOX)
-    assert load_scene(path, CATALOGUE).cell == DEFAULT_CELL
+    assert load_scene(path, CATALOG).cell == DEFAULT_CELL
 
 
 def test_names_are_any_text(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ objects:
     class: tomato_soup_can
     X_TO: {translation: [0.2, 0, 0.0505], quaternion: [1, 0, 0, 0]}
 """)
-    read = load_scene(path, CATALOGUE)
+    read = load_scene(path, CATALOG)
     box, can = read.scene.objects
     assert box.X_TO.quaternion == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
     assert math.hypot(*box.X_TO.quaternion) == pytest.approx(1, abs=1e-15)
@@ -168,7 +168,7 @@ objects:
 def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
     scene = random_scene(2, 12, 12, "pantry14")
     save_scene(tmp_path / "one.yaml", scene, DEFAULT_CELL, stable_verdict(scene))
-    read = load_scene(tmp_path / "one.yaml", CATALOGUE)
+    read = load_scene(tmp_path / "one.yaml", CATALOG)
     save_scene(tmp_path / "two.yaml", read.scene, read.cell, read.verdict)
     assert (tmp_path / "one.yaml").read_bytes() == (tmp_path / "two.yaml").read_bytes()
 
@@ -325,7 +325,7 @@ REFUSED: list[tuple[Path_, Any, str]] = [
 def test_a_broken_field_is_named(path: Path_, value: Any, message: str, tmp_path: Path) -> None:
     file = written(tmp_path, changed(DOCUMENT, path, value))
     with pytest.raises(InputError) as refusal:
-        load_scene(file, CATALOGUE)
+        load_scene(file, CATALOG)
     assert str(refusal.value).startswith(str(file))
     assert message in str(refusal.value)
 
@@ -361,7 +361,7 @@ def test_a_broken_instability_is_named(
 ) -> None:
     file = written(tmp_path, changed(UNSTABLE, path, value))
     with pytest.raises(InputError) as refusal:
-        load_scene(file, CATALOGUE)
+        load_scene(file, CATALOG)
     assert str(refusal.value).startswith(f"{file}: {message}")
 
 
@@ -374,13 +374,13 @@ def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> 
         )
         save_scene(tmp_path / "scene.yaml", scene, DEFAULT_CELL)
         if allowed:
-            assert load_scene(tmp_path / "scene.yaml", CATALOGUE).scene == scene
+            assert load_scene(tmp_path / "scene.yaml", CATALOG).scene == scene
         else:
             with pytest.raises(
                 InputError,
                 match=rf"objects: below and above overlap by {-1000 * gap:.1f} mm; allowed is 1 mm",
             ):
-                load_scene(tmp_path / "scene.yaml", CATALOGUE)
+                load_scene(tmp_path / "scene.yaml", CATALOG)
 
 
 @pytest.mark.parametrize(
@@ -402,15 +402,15 @@ def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> 
 def test_what_is_no_document_is_refused(content: bytes, tmp_path: Path) -> None:
     (path := tmp_path / "scene.yaml").write_bytes(content)
     with pytest.raises(InputError) as refusal:
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)
     assert str(refusal.value).startswith(str(path))
 
 
 def test_no_file_and_a_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"missing\.yaml: cannot be read \(No such file"):
-        load_scene(tmp_path / "missing.yaml", CATALOGUE)
+        load_scene(tmp_path / "missing.yaml", CATALOG)
     with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)"):
-        load_scene(tmp_path, CATALOGUE)
+        load_scene(tmp_path, CATALOG)
 
 
 def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
@@ -424,7 +424,7 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
         if not loads_or_is_refused(path):
             refused += 1
             continue
-        read = load_scene(path, CATALOGUE).scene
+        read = load_scene(path, CATALOG).scene
         for cut, o in zip(read.objects, SCENE.objects[: len(read.objects)], strict=True):
             assert (cut.name, cut.object_class, cut.X_TO) == (o.name, o.object_class, o.X_TO)
     assert refused > 120
@@ -454,7 +454,7 @@ def test_yaml_that_its_reader_stumbles_over_is_refused(line: str, tmp_path: Path
     path = tmp_path / "scene.yaml"
     path.write_text(ONE_BOX + line + "\n")
     with pytest.raises(InputError, match=r"scene\.yaml"):
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)
 
 
 @pytest.mark.parametrize(
@@ -474,7 +474,7 @@ def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Pa
     path = tmp_path / "scene.yaml"
     path.write_text(ONE_BOX + f"verdict: {verdict}\n")
     with pytest.raises(InputError, match=r"scene\.yaml: verdict"):
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)
 
 
 @pytest.mark.parametrize(
@@ -488,7 +488,7 @@ def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Pa
 def test_a_graph_that_no_derivation_ends_with_is_refused(graph: str, tmp_path: Path) -> None:
     (path := tmp_path / "scene.yaml").write_text(ONE_BOX + f"graph: {graph}\n")
     with pytest.raises(InputError, match=r"scene\.yaml: graph"):
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)
 
 
 def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
@@ -497,4 +497,4 @@ def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
         ONE_BOX.replace("name: a", "name: a, node: 0") + graph
     )
     with pytest.raises(InputError, match="node"):
-        load_scene(path, CATALOGUE)
+        load_scene(path, CATALOG)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from conftest import CATALOGUE, DEFAULT_CELL, GRAMMARS, random_scene, rng, tray
+from conftest import CATALOG, DEFAULT_CELL, GRAMMARS, random_scene, rng, tray
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -21,7 +21,7 @@ def entry(number: int, *, frozen: bool) -> SetScene:
         tuple(pose.moved((0.001, 0.0, 0.0)) for pose in scene.poses.values()) if frozen else None
     )
     return SetScene(
-        scene.derivation, canonical_form(scene.graph, CATALOGUE.classes), number, "solvable", poses
+        scene.derivation, canonical_form(scene.graph, CATALOG.classes), number, "solvable", poses
     )
 
 
@@ -29,7 +29,7 @@ def entry(number: int, *, frozen: bool) -> SetScene:
 def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
     written = [entry(number, frozen=frozen) for number in range(3)]
     save_scene_set(tmp_path / "set.json", {"objects": "ycb7", "seed": 5}, written, DEFAULT_CELL)
-    held = load_scene_set(tmp_path / "set.json", CATALOGUE)
+    held = load_scene_set(tmp_path / "set.json", CATALOG)
     assert held.name == "set.json"
     assert held.about == {"objects": "ycb7", "seed": 5}
     assert [(s.rules, s.form, s.hidden, s.solvable) for s in held.scenes] == [
@@ -68,21 +68,21 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
     whole = path.read_text()
     path.write_text(whole.replace('"hidden":0', '"hidden":9'))
     with pytest.raises(InputError, match=r"set\.json: sha256"):
-        load_scene_set(path, CATALOGUE)
+        load_scene_set(path, CATALOG)
     path.write_text(whole.replace('"version": 1', '"version": 7'))
     with pytest.raises(InputError, match=r"set\.json: version: 7; allowed is 1"):
-        load_scene_set(path, CATALOGUE)
+        load_scene_set(path, CATALOG)
     path.write_text(whole[:-20])
     with pytest.raises(InputError, match=r"set\.json: is no set of scenes"):
-        load_scene_set(path, CATALOGUE)
+        load_scene_set(path, CATALOG)
     with pytest.raises(InputError, match=r"none\.json: cannot be read"):
-        load_scene_set(tmp_path / "none.json", CATALOGUE)
+        load_scene_set(tmp_path / "none.json", CATALOG)
 
 
 def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
     """Of the sets that are shipped, up to symmetry; and none is there twice."""
     sets = {
-        path: load_scene_set(path, CATALOGUE)
+        path: load_scene_set(path, CATALOG)
         for path in (Path(__file__).parents[1] / "training/scenes").glob("*.json")
     }
     learned_from = {
@@ -103,5 +103,5 @@ def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
 def test_a_frozen_scene_stands_on_the_support_of_its_set(tmp_path: Path) -> None:
     small = DEFAULT_CELL.with_support(tray(0.65))
     save_scene_set(tmp_path / "set.json", {"objects": "ycb7"}, [entry(0, frozen=True)], small)
-    held = load_scene_set(tmp_path / "set.json", CATALOGUE)
+    held = load_scene_set(tmp_path / "set.json", CATALOG)
     assert held.settled(0, held.grammar, WORLD).support == small.support

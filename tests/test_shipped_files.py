@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import CATALOGUE, DEFAULT_CELL, training_script
+from conftest import CATALOG, DEFAULT_CELL, training_script
 
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_head
@@ -69,7 +69,7 @@ def test_checkpoints_and_their_configs(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SETS, ids=name_of)
 def test_scene_sets(path: Path) -> None:
-    assert load_scene_set(path, CATALOGUE).cell == DEFAULT_CELL
+    assert load_scene_set(path, CATALOG).cell == DEFAULT_CELL
 
 
 def configs_in(document: Any) -> Iterator[tuple[str, Any]]:

@@ -24,7 +24,7 @@ from drake_clutter.agents.soft_q import (
     softmax_choice,
 )
 from drake_clutter.assets import build_assets
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, SceneGrammar
@@ -280,7 +280,7 @@ def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
     folder = tmp_path / "own"
     folder.mkdir()
     brick = "  brick: {shape: box, size_mm: [60, 100, 40], mass_g: 300}\n"
-    (folder / "catalogue.yaml").write_text(
+    (folder / "catalog.yaml").write_text(
         f"classes:\n{brick}object_sets:\n  mine: [sugar_box, tomato_soup_can, brick]\n"
     )
     build_assets(folder)
@@ -288,7 +288,7 @@ def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
     train.main(tmp_path / "first", settings=SETTINGS)
     own = [
         *SETTINGS,
-        f"catalogue={folder}",
+        f"catalog={folder}",
         "objects=mine",
         f"warm_start={tmp_path / 'first/generator.safetensors'}",
     ]
@@ -296,7 +296,7 @@ def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
     agent = make_generation_agent(
         str(tmp_path / "second" / "generator.safetensors"), ClutterConfig()
     )
-    grammar = SceneGrammar(load_catalogue(folder).object_set("mine"))
+    grammar = SceneGrammar(load_catalog(folder).object_set("mine"))
     kinds = [
         kind
         for seed in range(10)

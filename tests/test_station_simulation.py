@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import cell_with, resting, scene_of
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
@@ -74,7 +74,7 @@ def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
     outcome = Outcome(MoveResult.PLACED, SCENE, motion=tuple(motion))
     path = tmp_path / "trajectory.h5"
     write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], CELL)
-    scene, cell, ((_, frames),) = read_trajectories(path, load_catalogue())
+    scene, cell, ((_, frames),) = read_trajectories(path, load_catalog())
     assert cell == CELL
     _, _, drawn_at = recording._shown(scene, cell, arm=True)
     for frame, poses in zip(frames, simulated, strict=True):
@@ -122,14 +122,14 @@ def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
     assert result.tracking < 0.02
     outcome, path = Outcome(MoveResult.PLACED, SCENE, motion=result.motion), tmp_path / "t.h5"
     write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], cell)
-    _, read, ((_, frames),) = read_trajectories(path, load_catalogue())
+    _, read, ((_, frames),) = read_trajectories(path, load_catalog())
     assert read == cell.with_support(SCENE.support)
     assert frames[0].arm is not None
     assert frames[0].arm.q == pytest.approx(cell.robot.home, abs=0.01)
     with h5py.File(path, "a") as file:
         file.attrs["cell"] = config_yaml(CELL)
     with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
-        read_trajectories(path, load_catalogue())
+        read_trajectories(path, load_catalog())
 
 
 BOARD = """<robot name="board"><link name="top">

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_fast_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT
 from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
 
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 

@@ -7,7 +7,7 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_clutter.catalogue import Rest, Shape, load_catalogue
+from drake_clutter.catalog import Rest, Shape, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspSampling, Gripper, NoGrasp
 from drake_clutter.cell.suction import GRAVITY, SuctionGripper, carried_load, unevenness
 from drake_clutter.simulation.plant import rigid_transform
@@ -60,7 +60,7 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
     """On all faces of the boxes, and the tops of the cans, of all fourteen classes."""
 
     def seals(diameter: float) -> bool:
-        for o in load_catalogue().object_set("pantry14"):
+        for o in load_catalog().object_set("pantry14"):
             for axis in (
                 range(3) if o.shape is Shape.BOX else [2] if o.only_rest is Rest.UPRIGHT else []
             ):

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 from conftest import DEFAULT_CELL, TRAY, resting, scene_of
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.systems.tracking import recognised, tracked
 
-CLASSES, CAMERA = load_catalogue().classes, DEFAULT_CELL.camera
+CLASSES, CAMERA = load_catalog().classes, DEFAULT_CELL.camera
 CAN = "tomato_soup_can"
 
 

@@ -8,7 +8,7 @@ from shutil import copyfile
 from typing import Any
 
 import pytest
-from conftest import CATALOGUE, training_script
+from conftest import CATALOG, training_script
 
 from drake_clutter.agents.evaluation import EpisodeResult
 from drake_clutter.agents.generation import GenerationJob
@@ -74,7 +74,7 @@ def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
 def test_episodes_are_played_once(tmp_path: Path) -> None:
     """And those that are there are not taken for others."""
     script = training_script("explorer_results")
-    scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOGUE)
+    scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOG)
     path = tmp_path / "random.jsonl"
     played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
     before = path.read_bytes()
@@ -168,13 +168,13 @@ def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
         "frozen": frozen,
     }
     script.main(tmp_path / "first.json", count=2, **options)
-    first = load_scene_set(tmp_path / "first.json", CATALOGUE)
+    first = load_scene_set(tmp_path / "first.json", CATALOG)
     assert first.about["judge"] == "drake"
     assert len({scene.form for scene in first.scenes}) == 2
     assert all(scene.hidden > 0 and (scene.settled is not None) == frozen for scene in first.scenes)
     again = tmp_path / "again.json"
     script.main(again, count=1, not_in=[tmp_path / "first.json"], **options)
-    (other,) = load_scene_set(again, CATALOGUE).scenes
+    (other,) = load_scene_set(again, CATALOG).scenes
     assert other.form not in {scene.form for scene in first.scenes}
 
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import DEFAULT_CELL, executed, resting, rng, scene_of, tray
 from typer.testing import CliRunner
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cli import app
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -42,7 +42,7 @@ def file(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> Path:
 
 
 def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Outcome]]) -> None:
-    scene, cell, moves = read_trajectories(file, load_catalogue())
+    scene, cell, moves = read_trajectories(file, load_catalog())
     assert cell == DEFAULT_CELL
     assert scene.poses == SCENE.poses
     ((move, motion),) = moves
@@ -61,7 +61,7 @@ def test_the_cell_has_the_support_that_the_objects_stand_on(
 ) -> None:
     path, other = tmp_path / "trajectory.h5", DEFAULT_CELL.with_support(tray(0.9))
     write_trajectories(path, SCENE, outcomes, other)
-    scene, cell, _ = read_trajectories(path, load_catalogue())
+    scene, cell, _ = read_trajectories(path, load_catalog())
     assert cell.support == scene.support == SCENE.support
     assert cell == DEFAULT_CELL
 
@@ -84,21 +84,21 @@ def test_the_arrays_belong_together(file: Path) -> None:
 
 
 def test_what_is_no_such_file_is_refused(file: Path, tmp_path: Path) -> None:
-    catalogue = load_catalogue()
+    catalog = load_catalog()
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(InputError, match="cannot be read as HDF5"):
-        read_trajectories(tmp_path / "text.h5", catalogue)
+        read_trajectories(tmp_path / "text.h5", catalog)
     with pytest.raises(InputError, match="allowed is a trajectory file") as refusal:
-        read_trajectories(tmp_path, catalogue)
+        read_trajectories(tmp_path, catalog)
     assert "\n" not in str(refusal.value)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["x"] = 1
     with pytest.raises(InputError, match="allowed is a trajectory file of version 1"):
-        read_trajectories(tmp_path / "other.h5", catalogue)
+        read_trajectories(tmp_path / "other.h5", catalog)
     with h5py.File(file, "a") as stored:
         del stored["move_0001/q"]
     with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
-        read_trajectories(file, catalogue)
+        read_trajectories(file, catalog)
 
 
 def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.exploration import TRAINED
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import upgrade_head
 from drake_clutter.files import InputError, cli_error_handler, file_sha256, write_json
 from drake_clutter.learning.shipped import checkpoint_path
@@ -104,9 +104,9 @@ class Player:
     """Plays episodes; a worker for the runner."""
 
     def __init__(self) -> None:
-        self._catalogue = load_catalogue()
+        self._catalog = load_catalog()
         self._set = cache(
-            lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalogue)
+            lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalog)
         )
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
         self._ceiling = ArmCeiling(Scenario().world)
@@ -158,7 +158,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     Raises:
         InputError: the file holds episodes of other networks, scenes or settings.
     """
-    scenes = load_scene_set(HERE / "scenes" / f"{row.scenes}.json", load_catalogue())
+    scenes = load_scene_set(HERE / "scenes" / f"{row.scenes}.json", load_catalog())
     networks = [checkpoint_path(row.agent, TRAINED)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.optimize import linear_sum_assignment
 
-from drake_clutter.catalogue import Catalogue, load_catalogue
+from drake_clutter.catalog import Catalog, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.learning.checkpoint import load_checkpoint
@@ -55,7 +55,7 @@ class Seen:
 
 
 def compared(
-    image: LabelledImage, detector: LearnedDetector, catalogue: Catalogue, rng: np.random.Generator
+    image: LabelledImage, detector: LearnedDetector, catalog: Catalog, rng: np.random.Generator
 ) -> tuple[list[Seen], int, float]:
     """The objects of an image, how many detections are none of them, and s that the detector took."""
     depth = noisy_depth(image.depth, rng)
@@ -76,7 +76,7 @@ def compared(
         named = detection is not None and detection.object_class.name == name
         errors = (np.nan, np.nan)
         if named and detection is not None:
-            errors = pose_error(catalogue.classes[name], detection.X_TO, image.X_TO[k])
+            errors = pose_error(catalog.classes[name], detection.X_TO, image.X_TO[k])
         objects.append(Seen(float(share), detection is not None, named, *errors))
     return objects, len(said) - len(pairs), spent
 
@@ -133,7 +133,7 @@ def main(
 ) -> None:
     """Compares detections with the truth."""
     torch.set_num_threads(threads)
-    config, catalogue, console = ClutterConfig(), load_catalogue(), Console(stderr=True)
+    config, catalog, console = ClutterConfig(), load_catalog(), Console(stderr=True)
     network, camera, rows = (
         SegmentationNetwork.load(detector),
         OverheadCamera(config.cell.camera),
@@ -141,7 +141,7 @@ def main(
     )
 
     def shown(path: Path) -> tuple[list[str], list[LabelledImage]]:
-        held = load_scene_set(path, catalogue)
+        held = load_scene_set(path, catalog)
         found = []
         for k in track(range(min(count, len(held.scenes))), path.stem, console=console):
             scene = held.settled(k, held.grammar, config)
@@ -169,12 +169,12 @@ def main(
 
     def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
         eye = LearnedDetector(
-            network, [catalogue.classes[n] for n in names], config.cell.camera, config.cell.support
+            network, [catalog.classes[n] for n in names], config.cell.camera, config.cell.support
         )
         eye.detect(given[0].depth, given[0].color)  # compiles
         objects, false, seconds = list[Seen](), 0, list[float]()
         for k, image in enumerate(given):
-            more, wrong, spent = compared(image, eye, catalogue, item_rng(seed, k))
+            more, wrong, spent = compared(image, eye, catalog, item_rng(seed, k))
             objects, false, seconds = objects + more, false + wrong, [*seconds, spent]
         return summarised(objects, false, seconds)
 

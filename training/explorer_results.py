@@ -25,7 +25,7 @@ from drake_clutter.agents.evaluation import (
     summarise_episodes,
 )
 from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade_head
 from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.learning.shipped import weights_of
@@ -226,12 +226,12 @@ def main(
     if fidelity not in FIDELITIES:
         raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(FIDELITIES)}")
     folder.mkdir(parents=True, exist_ok=True)
-    catalogue, shown = load_catalogue(), list[dict[str, Any]]()
+    catalog, shown = load_catalog(), list[dict[str, Any]]()
     names = [name for name in TABLES if only is None or only in name]
     if not names:
         raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
     held = {"seed": seed, "fidelity": fidelity, "config": to_plain(ClutterConfig())}
-    sets = {name: load_scene_set(SCENES / f"{name}.json", catalogue) for name in names}
+    sets = {name: load_scene_set(SCENES / f"{name}.json", catalog) for name in names}
     for name, scenes in sets.items():  # says what is wrong before anything is played
         rows_there(out or RESULTS / f"{TABLES[name][0]}.json", held)
         for agent in agents or TABLES[name][1]:

@@ -23,7 +23,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generation import TRAINED, GenerationJob
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, write_json
@@ -80,11 +80,11 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
         return track(made, row.folder, total=total, completed=done, console=Console(stderr=True))
 
     summary = generate(job, row.count, folder, workers, progress)
-    catalogue, judge = load_catalogue(), FastJudge(job.config)
+    catalog, judge = load_catalog(), FastJudge(job.config)
     confusion: Counter[str] = Counter()
     heights: Counter[int] = Counter()
     for path in sorted((folder / SCENES).iterdir())[: row.count]:
-        file = load_scene(path, catalogue)
+        file = load_scene(path, catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None
         found = judge.stability(file.scene)
@@ -167,7 +167,7 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
     ):
         right.plot(warmth, [row[key] for row in rows], marker=marker, label=name)
     even = [
-        row["class_entropy"] / np.log2(len(load_catalogue().object_set(row["objects"])))
+        row["class_entropy"] / np.log2(len(load_catalog().object_set(row["objects"])))
         for row in rows
     ]
     right.plot(warmth, even, marker="v", label="classes, of the\ngreatest entropy")

@@ -35,7 +35,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, prepare_output_directory, write_json
 from drake_clutter.perception.image_set import LabelledImage, write_images
@@ -90,13 +90,11 @@ class ImageJob:
 
     def agents(self) -> list[tuple[str, str]]:
         """Generators that know no classes but the job's, each with its object set."""
-        catalogue = load_catalogue()
-        own = set(catalogue.object_set(self.objects))
+        catalog = load_catalog()
+        own = set(catalog.object_set(self.objects))
         named = [(agent, objects or self.objects) for agent, objects in AGENTS.items()]
         return [
-            (agent, objects)
-            for agent, objects in named
-            if set(catalogue.object_set(objects)) <= own
+            (agent, objects) for agent, objects in named if set(catalog.object_set(objects)) <= own
         ]
 
 
@@ -105,7 +103,7 @@ class ItemMaker:
 
     def __init__(self, job: ImageJob, out: Path) -> None:
         self._job, self._out, self._config = job, out, ClutterConfig()
-        self._classes = load_catalogue().object_set(job.objects)
+        self._classes = load_catalog().object_set(job.objects)
         self._generators = dict[str, SceneGenerator]()
 
     def __call__(self, item: int) -> None:
@@ -120,7 +118,7 @@ class ItemMaker:
             self._out / f"{item:06d}",
             images,
             self._config.cell.camera,
-            list(load_catalogue().classes),
+            list(load_catalog().classes),
         )
         del camera
         gc.collect()  # in this thread: a renderer that another one collects can abort the process

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler
@@ -48,15 +48,15 @@ JUDGED = "judged.jsonl"
 
 def judged_by_drake(folder: Path) -> Iterator[SetScene]:
     """The stable scenes of a folder that hide something."""
-    catalogue = load_catalogue()
+    catalog = load_catalog()
     solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(solvable):
-        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalogue)
+        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None
         if file.verdict.stable and file.verdict.hidden:
             settled = tuple(file.verdict.settled[name] for name in file.scene.names)
-            form = canonical_form(file.scene.graph, catalogue.classes)
+            form = canonical_form(file.scene.graph, catalog.classes)
             yield SetScene(file.scene.derivation, form, len(file.verdict.hidden), answer, settled)
 
 
@@ -69,7 +69,7 @@ class GraphJudge:
             FastJudge(job.config, margin=GenerationTask().margin),
             DrakeJudge(job.config),
         )
-        self._classes = load_catalogue().classes
+        self._classes = load_catalog().classes
 
     def __call__(self, index: int) -> dict[str, Any]:
         """What is said of the scene of an index: `fast`, whether it stands, comes apart and hides something as the fast judge
@@ -135,9 +135,7 @@ def main(
     """Makes a set."""
     console = Console(stderr=True)
     taken = {
-        scene.form
-        for path in not_in or []
-        for scene in load_scene_set(path, load_catalogue()).scenes
+        scene.form for path in not_in or [] for scene in load_scene_set(path, load_catalog()).scenes
     }
     job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
     about: dict[str, Any] = {

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import typer
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade
 from drake_clutter.files import cli_error_handler
@@ -27,18 +27,19 @@ from drake_clutter.perception.segmentation_learning import (
     example,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import Flag, InRange, config_class, load_config_as
+from drake_clutter.validation import Flag, InRange, config_class, load_config_as, renamed_fields
 
 CHECKPOINT = "detector.safetensors"
 
 
 @config_class
+@renamed_fields(catalogue="catalog")
 class TrainDetector:
     """A training.
 
     Attributes:
         images: folder of `make_images.py`; held_out: of its last images are not learned from, but looked at as it goes.
-        objects: name of the object set; catalogue: a folder with object classes of one's own, or "".
+        objects: name of the object set; catalog: a folder with object classes of one's own, or "".
         looks_at_color: whether the network is given colour beside depth.
         warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
         seed: same seed, same weights (on the same kind of machine).
@@ -49,7 +50,7 @@ class TrainDetector:
     images: str = "runs/images"
     held_out: Annotated[int, InRange(0)] = 200
     objects: str = "pantry14"
-    catalogue: str = ""
+    catalog: str = ""
     looks_at_color: Flag = False
     warm_start: str = ""
     seed: Annotated[int, InRange(0)] = 0
@@ -79,7 +80,7 @@ def main(
     chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
     classes = [
         c.name
-        for c in load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(
+        for c in load_catalog(Path(given.catalog) if given.catalog else None).object_set(
             given.objects
         )
     ]

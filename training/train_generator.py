@@ -16,24 +16,31 @@ import typer
 from drake_clutter.agents.learned_generator import about_values, load_values
 from drake_clutter.agents.message_passing import one_thread_per_operation
 from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade
 from drake_clutter.files import cli_error_handler
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, device_of
 from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
-from drake_clutter.validation import InRange, NonNegative, config_class, load_config_as
+from drake_clutter.validation import (
+    InRange,
+    NonNegative,
+    config_class,
+    load_config_as,
+    renamed_fields,
+)
 
 CHECKPOINT = "generator.safetensors"
 
 
 @config_class
+@renamed_fields(catalogue="catalog")
 class TrainGenerator:
     """A training.
 
     Attributes:
-        objects: name of an object set; catalogue: a folder with object classes of one's own, or "".
+        objects: name of an object set; catalog: a folder with object classes of one's own, or "".
         seed: same seed, same weights (on the same kind of machine).
         warm_start: a checkpoint to begin with, or "".
         evaluate_every: steps; evaluation_scenes: that are then sampled and judged by the fast judge.
@@ -43,7 +50,7 @@ class TrainGenerator:
     """
 
     objects: str = "ycb7"
-    catalogue: str = ""
+    catalog: str = ""
     seed: Annotated[int, InRange(0)] = 0
     warm_start: str = ""
     evaluate_every: Annotated[int, InRange(1)] = 32_000
@@ -98,9 +105,7 @@ def main(
     given = load_config_as(TrainGenerator(), config, settings or [], upgrade)
     chosen = device_of(device)
     one_thread_per_operation()
-    classes = load_catalogue(Path(given.catalogue) if given.catalogue else None).object_set(
-        given.objects
-    )
+    classes = load_catalog(Path(given.catalog) if given.catalog else None).object_set(given.objects)
 
     def make_environment() -> ClutterGeneration:
         return ClutterGeneration(classes, given.task, given.world)

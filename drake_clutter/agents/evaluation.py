@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration import PolicyMaker, make_explorers
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
@@ -74,21 +74,21 @@ class EpisodePlayer:
     def __init__(
         self,
         config: ClutterConfig,
-        catalogue_folder: Path | None,
+        catalog_folder: Path | None,
         max_moves: int,
         seed: int,
         fidelity: str,
     ) -> None:
         self._config, self._max_moves, self._seed = config, max_moves, seed
         # In this process: an object class is known by its identity.
-        self._catalogue = load_catalogue(catalogue_folder)
-        self._set = cache(partial(load_scene_set, catalogue=self._catalogue))
+        self._catalog = load_catalog(catalog_folder)
+        self._set = cache(partial(load_scene_set, catalog=self._catalog))
         self._start_backend = backends(fidelity, config)
         self._explorers: dict[str, PolicyMaker] = {}
 
     def _scene(self, episode: Episode) -> Scene:
         if episode.number is None:
-            return load_scene(episode.file, self._catalogue).settled_scene
+            return load_scene(episode.file, self._catalog).settled_scene
         held = self._set(episode.file)
         return held.settled(episode.number, held.grammar, self._config)
 

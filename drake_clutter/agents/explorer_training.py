@@ -7,21 +7,22 @@ from typing import Annotated
 from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration_episodes import acting, figures, play_episodes
 from drake_clutter.agents.explorer_network import ExplorerNetwork
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.validation import InRange, config_class
+from drake_clutter.validation import InRange, config_class, renamed_fields
 
 CHECKPOINT = "explorer.safetensors"
 
 
 @config_class
+@renamed_fields(catalogue="catalog")
 class ExplorerTraining:
     """A training.
 
     Attributes:
-        scenes: file of a set of scenes; catalogue: a folder with object classes of one's own, or "".
+        scenes: file of a set of scenes; catalog: a folder with object classes of one's own, or "".
         seed: same seed, same weights (on the same kind of machine).
         fidelity: of the moves; max_moves: of an episode; most_objects: of a scene.
         evaluation_episodes: that are played with the likeliest moves, to see how it goes.
@@ -29,7 +30,7 @@ class ExplorerTraining:
     """
 
     scenes: str = "training/scenes/train_sg_star.json"
-    catalogue: str = ""
+    catalog: str = ""
     seed: Annotated[int, InRange(0)] = 0
     fidelity: str = "equilibrium"
     max_moves: Annotated[int, InRange(1)] = 20
@@ -41,7 +42,7 @@ class ExplorerTraining:
         """Where it learns; `privileged`: it sees everything, or K_t."""
         return ClutterExploration(
             load_scene_set(
-                Path(self.scenes), load_catalogue(Path(self.catalogue) if self.catalogue else None)
+                Path(self.scenes), load_catalog(Path(self.catalog) if self.catalog else None)
             ),
             privileged=privileged,
             fidelity=backends(self.fidelity, self.world),

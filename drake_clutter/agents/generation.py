@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import (
@@ -137,7 +137,7 @@ class GenerationJob:
     Attributes:
         agent: see `make_generation_agent`.
         objects: name of an object set.
-        catalogue_folder: a user's asset folder, or None.
+        catalog_folder: a user's asset folder, or None.
         nodes: exact size of the graphs.
         seed: of the batch.
         config: the world.
@@ -146,7 +146,7 @@ class GenerationJob:
 
     agent: str
     objects: str
-    catalogue_folder: Path | None
+    catalog_folder: Path | None
     nodes: int
     seed: int
     config: ClutterConfig
@@ -155,9 +155,9 @@ class GenerationJob:
     @property
     def fields(self) -> dict[str, Any]:
         """The same for JSON, with the hash of a trained agent's weights: all that decides what the scenes are."""
-        folder = str(self.catalogue_folder.resolve()) if self.catalogue_folder else None
+        folder = str(self.catalog_folder.resolve()) if self.catalog_folder else None
         weights = {"weights": found} if (found := weights_of(self.agent, TRAINED)) else {}
-        return {**to_plain(self), **weights, "catalogue_folder": folder}
+        return {**to_plain(self), **weights, "catalog_folder": folder}
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class SceneGenerator:
 
     def __init__(self, job: GenerationJob) -> None:
         self._job = job
-        self._grammar = SceneGrammar(load_catalogue(job.catalogue_folder).object_set(job.objects))
+        self._grammar = SceneGrammar(load_catalog(job.catalog_folder).object_set(job.objects))
         self._budget = NodeBudget(job.nodes)
         self._agent: GenerationAgent = make_generation_agent(job.agent, job.config, job.temperature)
         self._judge = DrakeJudge(job.config)
@@ -226,7 +226,7 @@ def summarise(
     `largest_stack_share` is of a scene's objects, on average; `balanced_share` is of the scenes in which no stack holds more than
     60 % of them; `class_entropy` is in bits, over all objects.
     """
-    classes = load_catalogue(job.catalogue_folder).classes
+    classes = load_catalog(job.catalog_folder).classes
     stable, hidden, stacks, forms, objects = 0, [], [], set(), []
     reasons: Counter[str] = Counter()
     kinds: Counter[str] = Counter()

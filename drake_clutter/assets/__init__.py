@@ -1,4 +1,4 @@
-"""Builds what Drake loads, one folder per object class, from a catalogue: SDF model, collision pieces, textured visual."""
+"""Builds what Drake loads, one folder per object class, from a catalog: SDF model, collision pieces, textured visual."""
 
 from drake_clutter.assets.build import build_assets, build_class
 from drake_clutter.assets.textures import MOTIFS

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drake_clutter.assets.contact import proximity_properties
 from drake_clutter.assets.gltf import box_surface, cylinder_surface, embedded_gltf, mesh_surface
 from drake_clutter.assets.textures import draw_texture, png_bytes
-from drake_clutter.catalogue import CATALOGUE_FILE, ObjectClass, Rest, Shape, load_catalogue
+from drake_clutter.catalog import CATALOG_FILE, ObjectClass, Rest, Shape, catalog_path, load_catalog
 from drake_clutter.files import InputError, write_text
 from drake_clutter.resources import resource_path
 
@@ -47,7 +47,7 @@ _PACKAGE = """<?xml version="1.0"?>
 """
 
 _MODEL = """<?xml version="1.0"?>
-<!-- Built by drake_clutter.assets from {catalogue}; size and mass: {source}. -->
+<!-- Built by drake_clutter.assets from {catalog}; size and mass: {source}. -->
 <sdf version="1.10" xmlns:drake="drake.mit.edu">
   <model name="{name}">
     <link name="body">
@@ -176,7 +176,7 @@ def _asset_files(object_class: ObjectClass) -> dict[str, str]:
     inertial = _inertial(object_class, mesh)
     files["model.sdf"] = _MODEL.format(
         name=object_class.name,
-        catalogue=CATALOGUE_FILE,
+        catalog=CATALOG_FILE,
         source=_comment_text(object_class.source or "not stated"),
         com=" ".join(repr(float(value)) for value in inertial.com),
         mass=object_class.mass,
@@ -228,28 +228,28 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
 
 
 def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]:
-    """Builds the classes of an asset folder's own catalogue, and its `package.xml`.
+    """Builds the classes of an asset folder's own catalog, and its `package.xml`.
 
     Args:
-        folder: holds `catalogue.yaml`.
+        folder: holds `catalog.yaml`.
         names: the classes to build; None for all.
 
     Returns:
-        The folders made, one per class, in the catalogue's order.
+        The folders made, one per class, in the catalog's order.
 
     Raises:
-        InputError: a broken catalogue, a class that it does not hold, or a folder that may not be written.
+        InputError: a broken catalog, a class that it does not hold, or a folder that may not be written.
     """
     folder = folder.resolve()
     own = {
         name: entry
-        for name, entry in load_catalogue(folder).classes.items()
+        for name, entry in load_catalog(folder).classes.items()
         if entry.folder.parent == folder
     }
     unknown = sorted(set(names or ()) - set(own))
     if unknown:
         raise InputError(
-            f"{folder / CATALOGUE_FILE}: classes: no {unknown[0]}; allowed are {', '.join(own)}"
+            f"{catalog_path(folder)}: classes: no {unknown[0]}; allowed are {', '.join(own)}"
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from drake_clutter.assets.gltf import Region
 from drake_clutter.assets.motifs import MOTIFS, strew
-from drake_clutter.catalogue import CATALOGUE_FILE, Label, ObjectClass, Shape
+from drake_clutter.catalog import Label, ObjectClass, Shape, catalog_path
 from drake_clutter.files import InputError
 
 __all__ = ["MOTIFS", "Texture", "draw_texture", "png_bytes"]
@@ -309,7 +309,7 @@ def _mesh_panels(object_class: ObjectClass, unit: float) -> dict[str, _Panel]:
 def _checked_label(object_class: ObjectClass) -> tuple[Label, str]:
     """Its label, and the title to draw."""
     label = object_class.label
-    where = f"{object_class.folder.parent / CATALOGUE_FILE}: classes.{object_class.name}.label"
+    where = f"{catalog_path(object_class.folder.parent)}: classes.{object_class.name}.label"
     for field in ("base", "accent"):
         if not re.fullmatch(r"#[0-9a-fA-F]{6}", getattr(label, field)):
             raise InputError(

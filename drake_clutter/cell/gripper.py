@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 
 Floats = NDArray[np.float64]
 

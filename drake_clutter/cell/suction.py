@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import ConvexHull
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
 from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, NoGrasp, Payload
 from drake_clutter.validation import InRange, StrictModel

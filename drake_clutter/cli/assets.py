@@ -17,12 +17,12 @@ def assets() -> None:
 
 @assets_app.command("build")
 def build(
-    folder: Annotated[Path, typer.Argument(help="An asset folder: it holds catalogue.yaml.")],
+    folder: Annotated[Path, typer.Argument(help="An asset folder: it holds catalog.yaml.")],
     only: Annotated[
         list[str] | None, typer.Option("--class", help="Build this class alone; may be repeated.")
     ] = None,
 ) -> None:
-    """Build SDF models, collision pieces and textures of a catalogue's classes."""
+    """Build SDF models, collision pieces and textures of a catalog's classes."""
     from drake_clutter.assets import build_assets
 
     for built in build_assets(folder, only):

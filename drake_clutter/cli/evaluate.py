@@ -10,7 +10,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     Fidelity,
@@ -60,7 +60,7 @@ def evaluate(
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     ray: RayOption = None,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -77,7 +77,7 @@ def evaluate(
             "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
         )
     refuse_support(settings)
-    played = command.playable(named, catalogue)[:count]
+    played = command.playable(named, catalog)[:count]
     world = load_world(config, cell, settings, None if cell else command.cell_of(played))
     names = [name for some in agents or BASELINES for name in some.split(",")]
     limit = max_moves or world.exploration.max_moves
@@ -86,7 +86,7 @@ def evaluate(
         return progress_bar("episodes", results, 0, total)
 
     rows = command.evaluate(
-        played, names, limit, fidelity.value, seed, world, catalogue, workers, out, progress, ray
+        played, names, limit, fidelity.value, seed, world, catalog, workers, out, progress, ray
     )
     if as_json:
         print(json.dumps(rows, indent=2))

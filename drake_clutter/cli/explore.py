@@ -1,7 +1,7 @@
 """`drake-clutter explore`."""
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     ExplorerOption,
@@ -26,7 +26,7 @@ def explore(
     fidelity: FidelityOption = Fidelity.SETTLE,
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -35,7 +35,7 @@ def explore(
     """Search a scene for what it hides; writes episode.json and a page, index.html."""
     from drake_clutter.commands import explore as command
 
-    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
     limit = max_moves or world.exploration.max_moves
     task = command.explore(

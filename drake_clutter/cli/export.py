@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.cli.options import CatalogueOption, LaidOutOption, OutOption, SceneArgument
+from drake_clutter.cli.options import CatalogOption, LaidOutOption, OutOption, SceneArgument
 from drake_clutter.cli.output import out_console
 from drake_clutter.files import prepare_output_directory
 
@@ -27,14 +27,14 @@ def export(
         typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer."),
     ],
     laid_out: LaidOutOption = False,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
 ) -> None:
     """Export a scene to a self-contained folder."""
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.export import ExportFormat, export_scene
     from drake_clutter.scenes.scene_file import load_scene
 
-    file = load_scene(scene, load_catalogue(catalogue))
+    file = load_scene(scene, load_catalog(catalog))
     prepare_output_directory(out)
     out_console.print(
         f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}"

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     ConfigOption,
     JsonOption,
     SeedOption,
@@ -71,7 +71,7 @@ def feasibility(
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -80,7 +80,7 @@ def feasibility(
 
     refuse_support(settings)
     files = command.scene_files(scenes)
-    _, world = load_scene_and_world(files[0], catalogue, config, None, settings)
+    _, world = load_scene_and_world(files[0], catalog, config, None, settings)
     command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])
     support = world.cell.support
     cells = {
@@ -96,7 +96,7 @@ def feasibility(
     if cells:
         setups = cells | {name: other for name, other in setups.items() if name != "default"}
     asked = command.read_targets(targets) if targets else ()
-    job = command.FeasibilityJob(files, setups, asked, seed, world, catalogue)
+    job = command.FeasibilityJob(files, setups, asked, seed, world, catalog)
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return progress_bar("parts", made, done, total)

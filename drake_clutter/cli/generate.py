@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     JsonOption,
@@ -38,7 +38,7 @@ def generate(
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     ray: RayOption = None,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -49,7 +49,7 @@ def generate(
     from drake_clutter.commands import generate as command
 
     job = GenerationJob(
-        agent, objects, catalogue, nodes, seed, load_world(config, cell, settings), temperature
+        agent, objects, catalog, nodes, seed, load_world(config, cell, settings), temperature
     )
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     Fidelity,
@@ -42,7 +42,7 @@ def move(
         ),
     ] = False,
     seed: SeedOption = 0,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -58,7 +58,7 @@ def move(
     if plan_only and fidelity is not Fidelity.ARM:
         raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
     chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
-    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
     start = command.at_rest(file.scene, world, seed)
     if plan_only:

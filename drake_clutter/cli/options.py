@@ -27,10 +27,13 @@ HtmlOption = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON on standard output.")
 ]
-CatalogueOption = Annotated[
+CatalogOption = Annotated[
     Path | None,
     typer.Option(
-        "--catalogue", metavar="DIR", help="An asset folder with object classes of your own."
+        "--catalog",
+        "--catalogue",
+        metavar="DIR",
+        help="An asset folder with object classes of your own.",
     ),
 ]
 ConfigOption = Annotated[
@@ -58,7 +61,7 @@ SetOption = Annotated[
     ),
 ]
 ObjectsOption = Annotated[
-    str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalogue's.")
+    str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalog's.")
 ]
 MaxMovesOption = Annotated[
     int | None,

@@ -1,7 +1,7 @@
 """`drake-clutter render`."""
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     OutOption,
@@ -16,7 +16,7 @@ from drake_clutter.files import prepare_output_directory
 def render(
     scene: SceneArgument,
     out: OutOption,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -24,7 +24,7 @@ def render(
     """Render what the cameras see: color.png, depth.png (16 bit, 0.1 mm), label.png, visible.json, picture.png."""
     from drake_clutter.commands.render import render_scene
 
-    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
     shares = render_scene(file.settled_scene, world, out)
     show({name: round(share, 3) for name, share in shares.items()}, False, "visible share")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.cli.options import CatalogueOption, HtmlOption
+from drake_clutter.cli.options import CatalogOption, HtmlOption
 from drake_clutter.cli.output import out_console, watch
 from drake_clutter.files import InputError
 
@@ -18,14 +18,14 @@ def replay(
         ),
     ],
     html: HtmlOption = None,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
 ) -> None:
     """Show the arm's recorded motions in the browser (Meshcat), or write them to one HTML file."""
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.reports.recording import joined
     from drake_clutter.station.trajectory_file import read_trajectories
 
-    scene, cell, moves = read_trajectories(file, load_catalogue(catalogue))
+    scene, cell, moves = read_trajectories(file, load_catalog(catalog))
     if not moves:
         raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
     for number, (move, motion) in enumerate(moves, start=1):

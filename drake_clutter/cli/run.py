@@ -34,7 +34,7 @@ def _load_scenario(
     file: Path | None, cell: Path | None, settings: Sequence[str] | None
 ) -> "Scenario":
     """Return a scenario; its cell is that of --cell, else of its scene file, under the fields that are named."""
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import upgrade
     from drake_clutter.scenes.scene_file import load_scene
@@ -42,13 +42,13 @@ def _load_scenario(
     from drake_clutter.validation import load_config_as
 
     names = [_in_scenario(setting) for setting in settings or ()]
-    which_scene = [name for name in names if name.startswith(("scene=", "catalogue="))]
+    which_scene = [name for name in names if name.startswith(("scene=", "catalog=", "catalogue="))]
     base, named = Scenario(), load_config_as(Scenario(), file, which_scene, upgrade)
     if named.scene:
         refuse_support(names)
-        catalogue = load_catalogue(Path(named.catalogue) if named.catalogue else None)
+        catalog = load_catalog(Path(named.catalog) if named.catalog else None)
         base = replace(
-            base, world=replace(base.world, cell=load_scene(Path(named.scene), catalogue).cell)
+            base, world=replace(base.world, cell=load_scene(Path(named.scene), catalog).cell)
         )
     scenario = load_config_as(base, file, upgrade=upgrade)
     if cell is not None:

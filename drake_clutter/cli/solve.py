@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import (
-    CatalogueOption,
+    CatalogOption,
     CellOption,
     ConfigOption,
     JsonOption,
@@ -26,7 +26,7 @@ def solve(
         int, typer.Option(min=1, help="Moves that the search may try before it gives up.")
     ] = 5000,
     seed: SeedOption = 0,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
     config: ConfigOption = None,
     cell: CellOption = None,
     settings: SetOption = None,
@@ -35,7 +35,7 @@ def solve(
     """Find the fewest moves that reveal everything, with full knowledge of the scene; Drake confirms the plan."""
     from drake_clutter.commands import explore, solve
 
-    file, world = load_scene_and_world(scene, catalogue, config, cell, settings)
+    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
     fields = solve.solve(
         explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step

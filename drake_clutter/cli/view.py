@@ -1,6 +1,6 @@
 """`drake-clutter view`."""
 
-from drake_clutter.cli.options import CatalogueOption, HtmlOption, LaidOutOption, SceneArgument
+from drake_clutter.cli.options import CatalogOption, HtmlOption, LaidOutOption, SceneArgument
 from drake_clutter.cli.output import watch
 
 
@@ -8,13 +8,13 @@ def view(
     scene: SceneArgument,
     html: HtmlOption = None,
     laid_out: LaidOutOption = False,
-    catalogue: CatalogueOption = None,
+    catalog: CatalogOption = None,
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.scenes.interfaces import Frame
     from drake_clutter.scenes.scene_file import load_scene
 
-    file = load_scene(scene, load_catalogue(catalogue))
+    file = load_scene(scene, load_catalog(catalog))
     shown = file.scene if laid_out else file.settled_scene
     watch(scene, shown, [Frame(0.0, shown.poses)], file.cell, html)

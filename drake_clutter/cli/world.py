@@ -89,7 +89,7 @@ def load_world(
 
 def load_scene_and_world(
     scene: Path,
-    catalogue: Path | None,
+    catalog: Path | None,
     config: Path | None,
     cell: Path | None,
     settings: Sequence[str] | None,
@@ -99,13 +99,13 @@ def load_scene_and_world(
     The cell is that of --cell, else the one that the scene was made with; its support is the scene's, as the objects stand
     on it. Fields of --config and --set go over it.
     """
-    from drake_clutter.catalogue import load_catalogue
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import ClutterConfig, upgrade
     from drake_clutter.scenes.scene_file import load_scene
     from drake_clutter.validation import load_config_as
 
-    file = load_scene(scene, load_catalogue(catalogue))
+    file = load_scene(scene, load_catalog(catalog))
     of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
     world = load_config_as(replace(ClutterConfig(), cell=of_scene), config, upgrade=upgrade)
     world = load_config_as(

@@ -13,7 +13,7 @@ from drake_clutter.agents.evaluation import (
     summarise_episodes,
 )
 from drake_clutter.agents.exploration import make_explorers
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, file_sha256, write_json
@@ -49,17 +49,17 @@ class PlayableScene:
     cell: WorkCell
 
 
-def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
+def playable(named: str, catalog_folder: Path | None) -> list[PlayableScene]:
     """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set with each number.
 
     Args:
         named: a folder, a set's file, or the name of a set that is shipped.
-        catalogue_folder: with object classes of one's own.
+        catalog_folder: with object classes of one's own.
 
     Raises:
         InputError: nothing of that name, no scene files, one that is broken, or none that can be played.
     """
-    catalogue, scenes = load_catalogue(catalogue_folder), Path(named)
+    catalog, scenes = load_catalog(catalog_folder), Path(named)
     if not scenes.exists():
         sets = {
             path.stem: path
@@ -72,7 +72,7 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
             )
         scenes = sets[named]
     if scenes.is_file():
-        held = load_scene_set(scenes, catalogue)
+        held = load_scene_set(scenes, catalog)
         classes = frozenset(c.name for c in held.classes)
         return [
             PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))
@@ -84,7 +84,7 @@ def playable(named: str, catalogue_folder: Path | None) -> list[PlayableScene]:
         )
     found = []
     for path in paths:
-        file = load_scene(path, catalogue)
+        file = load_scene(path, catalog)
         if file.verdict is not None and file.verdict.hidden:
             names = frozenset(o.object_class.name for o in file.scene.objects)
             found.append(PlayableScene(path, None, names, file.cell))
@@ -116,7 +116,7 @@ def evaluate(
     fidelity: str,
     seed: int,
     config: ClutterConfig,
-    catalogue_folder: Path | None,
+    catalog_folder: Path | None,
     workers: int,
     out: Path | None,
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
@@ -144,7 +144,7 @@ def evaluate(
         for agent in agents
         for index, scene in enumerate(scenes)
     ]
-    make_player = partial(EpisodePlayer, config, catalogue_folder, max_moves, seed, fidelity)
+    make_player = partial(EpisodePlayer, config, catalog_folder, max_moves, seed, fidelity)
     played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
     results = [result for result in progress(played, len(episodes)) if result.hidden]
     if not results:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import field_validator
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
@@ -70,7 +70,7 @@ class FeasibilityJob:
         scenes: files. setups: arms by name.
         targets: poses of the cup that are asked about beside the moves.
         seed: of places and errors. world: the config.
-        catalogue_folder: a user's asset folder, or None.
+        catalog_folder: a user's asset folder, or None.
     """
 
     scenes: tuple[Path, ...]
@@ -78,7 +78,7 @@ class FeasibilityJob:
     targets: tuple[Target, ...]
     seed: int
     world: ClutterConfig
-    catalogue_folder: Path | None
+    catalog_folder: Path | None
 
     def fields(self) -> dict[str, Any]:
         """As a document."""
@@ -88,9 +88,7 @@ class FeasibilityJob:
             "targets": [asdict(target) for target in self.targets],
             "seed": self.seed,
             "world": to_plain(self.world),
-            "catalogue_folder": str(self.catalogue_folder.resolve())
-            if self.catalogue_folder
-            else None,
+            "catalog_folder": str(self.catalog_folder.resolve()) if self.catalog_folder else None,
         }
 
 
@@ -281,7 +279,7 @@ class Worker:
 
 def scene_at_rest(path: Path, job: FeasibilityJob) -> Scene | None:
     """The scene as it settles; None if it does not stay."""
-    file = load_scene(path, load_catalogue(job.catalogue_folder))
+    file = load_scene(path, load_catalog(job.catalog_folder))
     verdict = file.verdict or DrakeJudge(job.world).judge(file.scene, item_rng(job.seed))
     return file.scene.at(verdict.settled) if verdict.stable else None
 
@@ -304,7 +302,7 @@ def feasibility(
         InputError: a scene file that is none, or a folder that holds something else.
     """
     for path in job.scenes:
-        load_scene(path, load_catalogue(job.catalogue_folder))
+        load_scene(path, load_catalog(job.catalog_folder))
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
         if json.dumps(earlier) != json.dumps(job.fields()):  # the order of cameras counts, too

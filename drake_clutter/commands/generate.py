@@ -18,7 +18,7 @@ from drake_clutter.agents.generation import (
     make_generation_agent,
     summarise,
 )
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
@@ -74,8 +74,8 @@ def generate(
         raise InputError(f"--count {count}; allowed is 1 or more")
     NodeBudget(job.nodes)
     make_generation_agent(job.agent, job.config, job.temperature)
-    catalogue = load_catalogue(job.catalogue_folder)
-    for object_class in catalogue.object_set(job.objects):
+    catalog = load_catalog(job.catalog_folder)
+    for object_class in catalog.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written
     prepare_output_directory(
         out, allowed_entries=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES})
@@ -118,7 +118,7 @@ def generate(
         )
     seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
 
-    files = [load_scene(path, catalogue) for path in paths]
+    files = [load_scene(path, catalog) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
     answers = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
     summary = summarise(job, judged, answers)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.explore import Report, at_rest, write_episode
 from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
@@ -32,9 +32,9 @@ def scene_of(
     Raises:
         InputError: a scene file that cannot be used, or a generator that makes no such scene that is stable and hides something.
     """
-    catalogue = Path(scenario.catalogue) if scenario.catalogue else None
+    catalog = Path(scenario.catalog) if scenario.catalog else None
     if scenario.scene:
-        file = load_scene(Path(scenario.scene), load_catalogue(catalogue))
+        file = load_scene(Path(scenario.scene), load_catalog(catalog))
         judged = file.verdict is not None and file.verdict.stable
         return (
             file.settled_scene if judged else at_rest(file.scene, scenario.world, scenario.seed)
@@ -42,7 +42,7 @@ def scene_of(
     job = GenerationJob(
         scenario.generator,
         scenario.objects,
-        catalogue,
+        catalog,
         scenario.nodes,
         scenario.seed,
         scenario.world,

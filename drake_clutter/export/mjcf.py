@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_clutter.assets.contact import FRICTION
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.export.parts import (
     class_inertial,

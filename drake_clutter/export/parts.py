@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Scene

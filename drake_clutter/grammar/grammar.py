@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.files import InputError
 from drake_clutter.grammar.graph import OPEN_SLOT, PRIMITIVE, ClutterGraph
 from drake_clutter.grammar.rules import KEEP, Pattern, ProductionRule, rule_sheet

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 
 import networkx as nx
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.grammar.orientation import Orientation, symmetry_key
 
 TRAY = "tray"

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, Rest, Shape
+from drake_clutter.catalog import ObjectClass, Rest, Shape
 
 
 class Orientation(Enum):

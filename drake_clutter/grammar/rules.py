@@ -7,7 +7,7 @@ node or edge states the kinds it may match. In G_R it states the kind it gets, `
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from drake_clutter.catalogue import ObjectClass, PairArrangement
+from drake_clutter.catalog import ObjectClass, PairArrangement
 from drake_clutter.grammar.graph import (
     DUMMY,
     END,

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import pose_in_camera
 from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds, rays_of_row

@@ -10,7 +10,7 @@ A folder of the set holds the images of one scene, `000000/`:
     scene_gt_info.json     of each instance px_count_all, px_count_visib, visib_fract, bbox_visib
     scene_gt_coco.json     the same masks as COCO run-length counts
 
-An obj_id is the place of the class in the catalogue, from 1 on. Frames: T tray, O object, C camera.
+An obj_id is the place of the class in the catalog, from 1 on. Frames: T tray, O object, C camera.
 """
 
 import json
@@ -78,7 +78,7 @@ def write_images(
         folder: not there yet; what an interrupted run left of it is replaced.
         images: of the scene, with at most 255 instances each.
         camera: what took them.
-        class_names: of the catalogue, in its order.
+        class_names: of the catalog, in its order.
     """
     temporary = folder.with_name(f".{folder.name}")
     shutil.rmtree(temporary, ignore_errors=True)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.perception.explaining import Explanation, chosen, explanation

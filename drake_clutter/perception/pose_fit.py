@@ -10,7 +10,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.pose_candidates import (
     FEWEST_POINTS,

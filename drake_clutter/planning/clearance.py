@@ -17,7 +17,7 @@ from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.tool_kinematics import inverse
 from drake_clutter.robots.robot_model import load_robot

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import TRAY, Pose, Scene

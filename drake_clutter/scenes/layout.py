@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, Rest
+from drake_clutter.catalog import ObjectClass, Rest
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, Orientation, resting_rotation

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import NEAREST, in_camera, project
 from drake_clutter.cell.support import Support

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.catalogue import ObjectClass, Shape
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.grammar import ClutterGraph
 

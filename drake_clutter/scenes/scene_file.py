@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from drake_clutter.catalogue import Catalogue
+from drake_clutter.catalog import Catalog
 from drake_clutter.cell.support import Side
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.files import InputError, format_value, input_error, write_text
@@ -156,36 +156,36 @@ class _Document(StrictModel):
         return cell.with_support(cell.support.model_copy(update={"size": (side, side)}))
 
 
-def load_scene(path: Path, catalogue: Catalogue) -> SceneFile:
+def load_scene(path: Path, catalog: Catalog) -> SceneFile:
     """Read a scene file.
 
     Args:
         path: The file.
-        catalogue: Of the objects' classes.
+        catalog: Of the objects' classes.
 
     Raises:
         InputError: The file, the field and what is allowed, for whatever cannot be a scene.
     """
-    return _scene_file(read_yaml(path, "a scene file"), str(path), catalogue)
+    return _scene_file(read_yaml(path, "a scene file"), str(path), catalog)
 
 
-def scene_from_text(text: str, path: str, catalogue: Catalogue) -> SceneFile:
+def scene_from_text(text: str, path: str, catalog: Catalog) -> SceneFile:
     """Read what a scene file holds.
 
     Args:
         text: The content.
         path: How errors name the file.
-        catalogue: Of the objects' classes.
+        catalog: Of the objects' classes.
 
     Raises:
         InputError: See `load_scene`.
     """
-    return _scene_file(parse_yaml(text, path, "a scene file"), path, catalogue)
+    return _scene_file(parse_yaml(text, path, "a scene file"), path, catalog)
 
 
-def _scene_file(given: Any, path: str, catalogue: Catalogue) -> SceneFile:
+def _scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
     document = validate(_Document, given, path)
-    objects = tuple(_objects(document.objects, path, catalogue))
+    objects = tuple(_objects(document.objects, path, catalog))
     depth, first, second = deepest_penetration(objects)
     if depth > PENETRATION_ALLOWED:
         found = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
@@ -201,12 +201,12 @@ def _refusal(path: str, field: str, value: Any, what: str) -> InputError:
     return input_error(path, f"{field}: {format_value(value)}; allowed is {what}")
 
 
-def _objects(entries: Sequence[_ObjectEntry], path: str, catalogue: Catalogue) -> list[SceneObject]:
+def _objects(entries: Sequence[_ObjectEntry], path: str, catalog: Catalog) -> list[SceneObject]:
     made: dict[str, SceneObject] = {}
     for k, entry in enumerate(entries):
-        object_class = catalogue.classes.get(entry.object_class)
+        object_class = catalog.classes.get(entry.object_class)
         if object_class is None:
-            known = f"one of {', '.join(catalogue.classes)}"
+            known = f"one of {', '.join(catalog.classes)}"
             raise _refusal(path, f"objects[{k}].class", entry.object_class, known)
         if entry.name in made:
             found = f"objects[{k}].name: {format_value(entry.name)} is there twice"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.catalogue import Catalogue, ObjectClass
+from drake_clutter.catalog import Catalog, ObjectClass
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, write_text
@@ -143,7 +143,7 @@ def save_scene_set(
     write_text(path, f'{json.dumps(head)[:-1]}, "scenes": [\n{lines}\n]}}\n')
 
 
-def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
+def load_scene_set(path: Path, catalog: Catalog) -> SceneSet:
     """Reads a set.
 
     Raises:
@@ -180,7 +180,7 @@ def load_scene_set(path: Path, catalogue: Catalogue) -> SceneSet:
         )
         rules = tuple(names[k] for k in entry["rules"])
         scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
-    return SceneSet(path.name, catalogue.object_set(objects), document, tuple(scenes), digest, cell)
+    return SceneSet(path.name, catalog.object_set(objects), document, tuple(scenes), digest, cell)
 
 
 def _pose(numbers: Sequence[float]) -> Pose:

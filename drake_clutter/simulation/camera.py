@@ -23,7 +23,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import FARTHEST
 from drake_clutter.cell.support import Support

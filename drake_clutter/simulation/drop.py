@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.plant import add_scene_plant

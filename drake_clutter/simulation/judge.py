@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import touching_groups

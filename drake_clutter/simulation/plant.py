@@ -11,7 +11,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_clutter.catalogue import ObjectClass, Rest, Shape
+from drake_clutter.catalog import ObjectClass, Rest, Shape
 from drake_clutter.cell.sdf import sdf_text
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_clutter.catalogue import Shape
+from drake_clutter.catalog import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import SettleConfig
 from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_clutter.catalogue import ObjectClass
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject

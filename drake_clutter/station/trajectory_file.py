@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import Catalogue
+from drake_clutter.catalog import Catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
 from drake_clutter.files import InputError, atomic_write, input_error
@@ -82,7 +82,7 @@ def write_trajectories(
 
 
 def read_trajectories(
-    path: Path, catalogue: Catalogue
+    path: Path, catalog: Catalog
 ) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[Frame, ...]]]]:
     """Return the scene at first, the cell, and the motion of each move.
 
@@ -100,7 +100,7 @@ def read_trajectories(
             raise InputError(
                 f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}"
             )
-        scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalogue).scene
+        scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _cell(path, file.attrs).with_support(scene.support)
         joints = load_robot(cell.robot).num_joints
         return scene, cell, [_move(path, name, file[name], scene, joints) for name in sorted(file)]

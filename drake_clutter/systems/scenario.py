@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from drake_clutter.agents.exploration import BASELINES, FULL_KNOWLEDGE, make_explorers
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -13,16 +13,17 @@ from drake_clutter.learning.shipped import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
 from drake_clutter.systems.perception_system import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
-from drake_clutter.validation import InRange, config_class
+from drake_clutter.validation import InRange, config_class, renamed_fields
 
 
 @config_class
+@renamed_fields(catalogue="catalog")
 class Scenario:
     """An episode of the closed loop.
 
     Attributes:
         scene: a scene file; "": one that the generator makes.
-        catalogue: a folder with object classes of one's own, or "".
+        catalog: a folder with object classes of one's own, or "".
         generator, objects, nodes: as for `drake-clutter generate`.
         agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
         perception: what sees: labels, the perfect detector; depth or depth-color, trained ones; or the file of a checkpoint.
@@ -33,7 +34,7 @@ class Scenario:
     """
 
     scene: str = ""
-    catalogue: str = ""
+    catalog: str = ""
     generator: str = "sg-star"
     objects: str = "ycb7"
     nodes: Annotated[int, InRange(3, 1000)] = 25
@@ -66,7 +67,7 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     from drake_clutter.perception.learned_detector import LearnedDetector  # takes PyTorch
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
-    classes = load_catalogue(Path(scenario.catalogue) if scenario.catalogue else None).object_set(
+    classes = load_catalog(Path(scenario.catalog) if scenario.catalog else None).object_set(
         scenario.objects
     )
     camera = scenario.world.cell.camera

@@ -6,7 +6,7 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 
-from drake_clutter.catalogue import load_catalogue
+from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
@@ -70,7 +70,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         """
         if not isinstance(scenes, SceneSet):
             scenes = load_scene_set(
-                resource_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalogue()
+                resource_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalog()
             )
         self._config = config or ClutterConfig(cell=scenes.cell)
         self._privileged, self.scenes = privileged, scenes

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.catalogue import Shape
+from drake_clutter.catalog import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalogue import ObjectClass, load_catalogue
+from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, SceneGrammar
 from drake_clutter.grammar.graph import (
@@ -256,7 +256,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
             config: the world.
         """
         self.task, self._config = task or GenerationTask(), config or ClutterConfig()
-        self.grammar = SceneGrammar(classes or load_catalogue().object_set("ycb7"))
+        self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
         self.vocabulary = GraphVocabulary.of(self.grammar)
         self._judge = FastJudge(self._config, margin=self.task.margin)
         n, e = self.task.nodes, most_edges(self.task.nodes)

@@ -1,8 +1,8 @@
-"""The catalogue of object classes: what they measure and weigh, and where their assets lie.
+"""The catalog of object classes: what they measure and weigh, and where their assets lie.
 
-An *asset folder* holds `catalogue.yaml` and one folder per class that `drake_clutter.assets` builds from it. The shipped
+An *asset folder* holds `catalog.yaml` and one folder per class that `drake_clutter.assets` builds from it. The shipped
 one is `sdf_assets/`; a user's own adds classes to it. An object's frame O has its origin at the geometric centre: a box's
-x, y, z are its sizes in the order of the catalogue, a cylinder's axis is z, a mesh keeps its axes.
+x, y, z are its sizes in the order of the catalog, a cylinder's axis is z, a mesh keeps its axes.
 """
 
 import math
@@ -25,7 +25,9 @@ from drake_clutter.resources import resource_path
 from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
 from drake_clutter.yaml_io import read_yaml
 
-CATALOGUE_FILE = "catalogue.yaml"
+CATALOG_FILE = "catalog.yaml"
+_EARLIER_CATALOG_FILE = "catalogue.yaml"
+"""Name of a catalog in asset folders that were made before version 0.2."""
 _CYLINDER_SIDES = 32
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _NONE: Any = Field(default_factory=dict)
@@ -80,7 +82,7 @@ def _class_name(name: str) -> str:
 
 
 class ClassEntry(StrictModel):
-    """One class as it stands in `catalogue.yaml`.
+    """One class as it stands in `catalog.yaml`.
 
     Attributes:
         shape: Box, cylinder or mesh.
@@ -90,7 +92,7 @@ class ClassEntry(StrictModel):
         source: Where size and mass come from.
         pairs: The arrangements in which two of it stand as a pair.
         only_rest: How it rests in all orientations (cans stand, a marker lies); None if it varies.
-        mesh: A watertight mesh in meters, beside the catalogue; for shape mesh only.
+        mesh: A watertight mesh in meters, beside the catalog; for shape mesh only.
         label: How its texture is drawn.
     """
 
@@ -129,12 +131,12 @@ class ClassEntry(StrictModel):
         return self
 
 
-class CatalogueFile(StrictModel):
-    """The schema of `catalogue.yaml`.
+class CatalogFile(StrictModel):
+    """The schema of `catalog.yaml`.
 
     Attributes:
         classes: By name (lower case, digits, underscores).
-        object_sets: Named lists of classes; a user's catalogue may name shipped classes too.
+        object_sets: Named lists of classes; a user's catalog may name shipped classes too.
     """
 
     classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = _NONE
@@ -143,7 +145,7 @@ class CatalogueFile(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class ObjectClass:
-    """An object class, checked; compared by identity, as a catalogue holds one of each.
+    """An object class, checked; compared by identity, as a catalog holds one of each.
 
     Attributes:
         name: the class's name.
@@ -182,7 +184,7 @@ class ObjectClass:
 
     @cached_property
     def model_path(self) -> Path:
-        """The built SDF model, with the mass of the catalogue.
+        """The built SDF model, with the mass of the catalog.
 
         Raises:
             InputError: It is missing, or was built with another mass.
@@ -193,7 +195,7 @@ class ObjectClass:
         mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
         if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
             raise InputError(
-                f"{self.sdf_path}: mass: {mass}; allowed is the catalogue's, {self.mass:g} kg; {remedy}"
+                f"{self.sdf_path}: mass: {mass}; allowed is the catalog's, {self.mass:g} kg; {remedy}"
             )
         return self.sdf_path
 
@@ -228,7 +230,7 @@ class ObjectClass:
 
 
 @dataclass(frozen=True)
-class Catalogue:
+class Catalog:
     """Object classes and named sets of them.
 
     Attributes:
@@ -256,9 +258,7 @@ class Catalogue:
 
 def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
     if not path.is_file():
-        raise InputError(
-            f"{where}.mesh: no file {path}; give a mesh that lies beside the catalogue"
-        )
+        raise InputError(f"{where}.mesh: no file {path}; give a mesh that lies beside the catalog")
     try:
         mesh = trimesh.load_mesh(path)
     except Exception as error:  # trimesh's readers raise whatever their formats suggest
@@ -297,15 +297,22 @@ def _object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> Obj
     )
 
 
+def catalog_path(folder: Path) -> Path:
+    """Return the path of an asset folder's catalog."""
+    path = folder / CATALOG_FILE
+    earlier = folder / _EARLIER_CATALOG_FILE
+    return earlier if earlier.is_file() and not path.is_file() else path
+
+
 @lru_cache
-def load_catalogue(folder: Path | None = None) -> Catalogue:
-    """The shipped catalogue, with the classes and sets of a user's asset folder added.
+def load_catalog(folder: Path | None = None) -> Catalog:
+    """The shipped catalog, with the classes and sets of a user's asset folder added.
 
     Args:
         folder: a user's asset folder; None for the shipped one alone.
 
     Raises:
-        InputError: the catalogue is missing or broken; the message names file, field and what is allowed.
+        InputError: the catalog is missing or broken; the message names file, field and what is allowed.
     """
     shipped = resource_path("sdf_assets")
     folders = (
@@ -314,11 +321,11 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
     classes: dict[str, ObjectClass] = {}
     object_sets: dict[str, tuple[str, ...]] = {}
     for asset_folder in folders:
-        path = asset_folder / CATALOGUE_FILE
+        path = catalog_path(asset_folder)
         if not path.is_file():
-            what = f"no such file; a catalogue is a folder that holds {CATALOGUE_FILE}"
+            what = f"no such file; a catalog is a folder that holds {CATALOG_FILE}"
             raise input_error(str(path), what)
-        read = validate(CatalogueFile, read_yaml(path, "a catalogue"), str(path))
+        read = validate(CatalogFile, read_yaml(path, "a catalog"), str(path))
         for name, entry in read.classes.items():
             if name in classes:
                 raise InputError(f"{path}: classes.{name}: is shipped already; choose another name")
@@ -330,4 +337,4 @@ def load_catalogue(folder: Path | None = None) -> Catalogue:
                 found = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
                 raise input_error(str(path), f"{found}; allowed is {what}")
             object_sets[set_name] = members
-    return Catalogue(classes, object_sets, folders)
+    return Catalog(classes, object_sets, folders)

@@ -1,4 +1,4 @@
-"""The shipped catalogue, and what the reader says to a broken one."""
+"""The shipped catalog, and what the reader says to a broken one."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from conftest import TRAY
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.assets import build_assets
-from drake_clutter.catalogue import ObjectClass, PairArrangement, Rest, Shape, load_catalogue
+from drake_clutter.catalog import ObjectClass, PairArrangement, Rest, Shape, load_catalog
 from drake_clutter.cell.sdf import sdf_text
 from drake_clutter.files import InputError
 from drake_clutter.simulation.plant import add_scene_plant
@@ -17,17 +17,17 @@ from drake_clutter.simulation.plant import add_scene_plant
 BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
 
 
-def user_catalogue(folder: Path, text: str) -> Path:
-    """A folder with `text` as its catalogue."""
-    (folder / "catalogue.yaml").write_text(text)
+def user_catalog(folder: Path, text: str) -> Path:
+    """A folder with `text` as its catalog."""
+    (folder / "catalog.yaml").write_text(text)
     return folder
 
 
 def test_shipped_sets() -> None:
-    catalogue = load_catalogue()
-    ycb7, pantry14 = catalogue.object_set("ycb7"), catalogue.object_set("pantry14")
+    catalog = load_catalog()
+    ycb7, pantry14 = catalog.object_set("ycb7"), catalog.object_set("pantry14")
     assert pantry14[:7] == ycb7
-    assert {entry.name for entry in pantry14} == set(catalogue.classes)
+    assert {entry.name for entry in pantry14} == set(catalog.classes)
     # 3 structure rules, a single per class, a rule per pair, 10 orientations: the paper's 30 and 49.
     assert [
         13 + sum(1 + len(entry.pairs) for entry in entries) for entries in (ycb7, pantry14)
@@ -50,7 +50,7 @@ def test_shipped_sets() -> None:
 def test_ycb_measures(
     name: str, shape: Shape, size: tuple[float, float, float], mass: float
 ) -> None:
-    entry = load_catalogue().classes[name]
+    entry = load_catalog().classes[name]
     assert entry.shape is shape
     assert entry.size == pytest.approx(size)
     assert entry.mass == pytest.approx(mass)
@@ -58,7 +58,7 @@ def test_ycb_measures(
 
 
 def test_cans_stand_and_pairs_follow_the_grammar() -> None:
-    classes = load_catalogue().classes
+    classes = load_catalog().classes
     assert {name for name, entry in classes.items() if entry.only_rest is Rest.UPRIGHT} == {
         "master_chef_can",
         "tomato_soup_can",
@@ -69,21 +69,21 @@ def test_cans_stand_and_pairs_follow_the_grammar() -> None:
     assert classes["tomato_soup_can"].pairs == (PairArrangement.STANDING,)
 
 
-@pytest.mark.parametrize("name", list(load_catalogue().classes))
+@pytest.mark.parametrize("name", list(load_catalog().classes))
 def test_corners_span_the_size(name: str) -> None:
-    entry = load_catalogue().classes[name]
+    entry = load_catalog().classes[name]
     assert np.ptp(entry.corners, axis=0) == pytest.approx(entry.size)
     assert entry.corners.min(axis=0) == pytest.approx(-entry.corners.max(axis=0))
 
 
 def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
-    user_catalogue(
+    user_catalog(
         tmp_path, f"classes:\n  brick: {{{BOX}}}\nobject_sets:\n  mixed: [sugar_box, brick]\n"
     )
-    catalogue = load_catalogue(tmp_path)
-    assert [entry.name for entry in catalogue.object_set("mixed")] == ["sugar_box", "brick"]
-    assert catalogue.classes["brick"].folder == tmp_path.resolve() / "brick"
-    assert catalogue.folders[1] == tmp_path.resolve()
+    catalog = load_catalog(tmp_path)
+    assert [entry.name for entry in catalog.object_set("mixed")] == ["sugar_box", "brick"]
+    assert catalog.classes["brick"].folder == tmp_path.resolve() / "brick"
+    assert catalog.folders[1] == tmp_path.resolve()
 
 
 @pytest.mark.parametrize(
@@ -135,41 +135,49 @@ def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
     ],
 )
 def test_bad_class(tmp_path: Path, entry: str, complaint: str) -> None:
-    user_catalogue(tmp_path, f"classes:\n  {entry}\n")
+    user_catalog(tmp_path, f"classes:\n  {entry}\n")
     with pytest.raises(InputError, match=complaint) as caught:
-        load_catalogue(tmp_path)
-    assert str(tmp_path / "catalogue.yaml") in str(caught.value)
+        load_catalog(tmp_path)
+    assert str(tmp_path / "catalog.yaml") in str(caught.value)
 
 
 @pytest.mark.parametrize("members", ["[sugar_box, teapot]", "[sugar_box, sugar_box]", "[]"])
 def test_bad_object_set(tmp_path: Path, members: str) -> None:
-    user_catalogue(tmp_path, f"object_sets:\n  tea: {members}\n")
+    user_catalog(tmp_path, f"object_sets:\n  tea: {members}\n")
     with pytest.raises(
         InputError, match=r"object_sets\.tea: .*allowed is a list, without repeats, of cracker_box"
     ):
-        load_catalogue(tmp_path)
+        load_catalog(tmp_path)
 
 
 def test_unknown_object_set() -> None:
     with pytest.raises(InputError, match=r"'ycb8' is unknown; known are ycb7, pantry14"):
-        load_catalogue().object_set("ycb8")
+        load_catalog().object_set("ycb8")
 
 
-def test_no_catalogue(tmp_path: Path) -> None:
+def test_a_catalog_under_its_earlier_file_name(tmp_path: Path) -> None:
+    block = "{shape: box, size_mm: [50, 40, 30], mass_g: 100, label: {base: blue}}"
+    (tmp_path / "catalogue.yaml").write_text(f"classes:\n  block: {block}\n")
+    assert "block" in load_catalog(tmp_path).classes
+    with pytest.raises(InputError, match=r"catalogue\.yaml: classes\.block\.label\.base"):
+        build_assets(tmp_path)
+
+
+def test_no_catalog(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"no such file; a catalogue is a folder that holds catalogue\.yaml"
+        InputError, match=r"no such file; a catalog is a folder that holds catalog\.yaml"
     ):
-        load_catalogue(tmp_path)
+        load_catalog(tmp_path)
 
 
-def test_catalogue_that_is_not_yaml(tmp_path: Path) -> None:
-    user_catalogue(tmp_path, "classes: [unclosed")
-    with pytest.raises(InputError, match=r"catalogue\.yaml"):
-        load_catalogue(tmp_path)
+def test_catalog_that_is_not_yaml(tmp_path: Path) -> None:
+    user_catalog(tmp_path, "classes: [unclosed")
+    with pytest.raises(InputError, match=r"catalog\.yaml"):
+        load_catalog(tmp_path)
 
 
 def test_bad_meshes(tmp_path: Path) -> None:
-    user_catalogue(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
+    user_catalog(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
     block = trimesh.creation.box((0.05, 0.05, 0.05))
     opened = trimesh.Trimesh(block.vertices, block.faces[:-1])
     inverted = trimesh.Trimesh(block.vertices, block.faces[:, ::-1], process=False)
@@ -181,29 +189,29 @@ def test_bad_meshes(tmp_path: Path) -> None:
     ):
         mesh.export(tmp_path / "block.stl")
         with pytest.raises(InputError, match=complaint):
-            load_catalogue(tmp_path)
+            load_catalog(tmp_path)
     (tmp_path / "block.stl").write_text("no mesh")
     with pytest.raises(InputError, match=r"classes\.block\.mesh"):
-        load_catalogue(tmp_path)
+        load_catalog(tmp_path)
 
 
 def test_mesh_without_assets(tmp_path: Path) -> None:
-    user_catalogue(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
+    user_catalog(tmp_path, "classes:\n  block: {shape: mesh, mesh: block.stl, mass_g: 5}\n")
     trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "block.stl")
-    block = load_catalogue(tmp_path).classes["block"]
+    block = load_catalog(tmp_path).classes["block"]
     assert block.size == pytest.approx((0.05, 0.06, 0.07))
     with pytest.raises(InputError, match="run `drake-clutter assets build"):
         _ = block.convex_pieces
 
 
 def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
-    """A mass that the catalogue changes is refused until the model is built anew; then it is simulated."""
+    """A mass that the catalog changes is refused until the model is built anew; then it is simulated."""
 
     def block(mass_g: int) -> ObjectClass:
         text = f"classes:\n  block: {{shape: box, size_mm: [50, 60, 70], mass_g: {mass_g}, source: made up}}\n"
-        load_catalogue.cache_clear()  # a process reads a folder once
+        load_catalog.cache_clear()  # a process reads a folder once
         sdf_text.cache_clear()
-        return load_catalogue(user_catalogue(tmp_path, text)).classes["block"]
+        return load_catalog(user_catalog(tmp_path, text)).classes["block"]
 
     def body_mass(entry: ObjectClass) -> float:
         made = add_scene_plant(DiagramBuilder(), [("it", entry)], TRAY, 0.01, visuals=False)
@@ -216,7 +224,7 @@ def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
     build_assets(tmp_path)
     assert body_mass(block(100)) == pytest.approx(0.100)
     with pytest.raises(
-        InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalogue's, 0\.15 kg; run"
+        InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalog's, 0\.15 kg; run"
     ):
         body_mass(block(150))
     build_assets(tmp_path)
