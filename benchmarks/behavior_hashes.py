@@ -31,10 +31,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-import behavior_backends as backends
 import typer
-from behavior_backends import Case, Line, hash_of
 
+from benchmarks import behavior_backends as backends
+from benchmarks.behavior_backends import Case, Line, hash_of
 from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.workers.parallel_map import map_ordered

@@ -1,4 +1,4 @@
-"""The scenes of `speed.py` in PyBullet: loading, looking, and where the objects are."""
+"""The scenes of `judge_speed.py` in PyBullet: loading, looking, and where the objects are."""
 
 import math
 from pathlib import Path

@@ -3,7 +3,6 @@
 import gc
 import importlib.util
 import re
-import sys
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -103,13 +102,7 @@ def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "yc
 
 def training_script(name: str) -> ModuleType:
     """A script of `training/`, as a module."""
-    path = Path(__file__).parents[1] / "training" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    sys.modules[name] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"training.{name}")
 
 
 def executed(

@@ -327,15 +327,15 @@ STUDENT_SETTINGS = [
 STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
 
 
-@pytest.mark.parametrize("script", ["train_explorer", "clone_explorer"])
+@pytest.mark.parametrize("script", ["train_explorer_ppo", "train_explorer_dagger"])
 def test_a_script_is_killed_and_ends_with_the_same_weights(
     script: str, file: Path, tmp_path: Path
 ) -> None:
     settings = [
         f"scenes={file}",
-        *(TEACHER_SETTINGS if script == "train_explorer" else STUDENT_SETTINGS),
+        *(TEACHER_SETTINGS if script == "train_explorer_ppo" else STUDENT_SETTINGS),
     ]
-    if script == "clone_explorer":
+    if script == "train_explorer_dagger":
         numbers = ClutterExploration(file).numbers
         torch.manual_seed(3)
         save_checkpoint(
@@ -379,7 +379,7 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(
     assert sum(decision.picks.values()) == pytest.approx(1, abs=1e-5)
     assert set(decision.picks) == {d.name for d in task.first_look.observation.detections}
     everything = set(environment.task.start.names)
-    assert (set(decision.known) == everything) == (script == "train_explorer")
+    assert (set(decision.known) == everything) == (script == "train_explorer_ppo")
 
 
 def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Pa
         "learning.steps=10",
         "learning.learning_rate=1.0e-30",
     ]
-    train = training_script("train_explorer")
+    train = training_script("train_explorer_ppo")
     train.main(tmp_path / "tuned", settings=[*settings, "privileged=false"])
     tuned = load_checkpoint(tmp_path / "tuned" / "explorer.safetensors")
     assert tuned.about["kind"] == STUDENT

@@ -178,9 +178,8 @@ def test_training_scripts_parse(page: Path) -> None:
         script.command()(module.main)
         given = typer.main.get_command(script).make_context(name, words).params
         if "settings" in given:
-            training = getattr(module, name.title().replace("_", ""))
             config = ROOT / given["config"] if given["config"] else None
-            load_config_as(training(), config, given["settings"] or [], upgrade)
+            load_config_as(module.CONFIG, config, given["settings"] or [], upgrade)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -12,7 +12,7 @@ from drake_clutter.files import InputError
 
 @pytest.fixture(scope="module")
 def results() -> ModuleType:
-    return training_script("generator_results")
+    return training_script("evaluate_generators")
 
 
 def test_a_table_of_one_row(

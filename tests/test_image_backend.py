@@ -68,7 +68,7 @@ def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
 
 
 def test_rows_of_the_results() -> None:
-    script = training_script("closed_loop_results")
+    script = training_script("evaluate_closed_loop")
     episode = {
         "hidden": 2,
         "found": 2,
@@ -114,7 +114,7 @@ def test_rows_of_the_results() -> None:
 
 def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And one of other networks is not taken for it."""
-    script, path = training_script("closed_loop_results"), tmp_path / "row.jsonl"
+    script, path = training_script("evaluate_closed_loop"), tmp_path / "row.jsonl"
     made = list[int]()
 
     def play(asked: Any) -> dict[str, int]:

@@ -34,7 +34,7 @@ def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
 def images(camera: OverheadCamera) -> list[LabelledImage]:
     """Two images of the scene, the second without what lies on top."""
     known: dict[SceneObject, int] = {}
-    photograph, generator = training_script("make_images").photograph, rng()
+    photograph, generator = training_script("render_image_dataset").photograph, rng()
     scenes = (SCENE, scene_of(*(o for o in SCENE.objects if o.name != "over")))
     return [photograph(camera, scene, known, generator) for scene in scenes]
 
@@ -161,7 +161,7 @@ def test_a_heap() -> None:
 
 
 def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    script = training_script("make_images")
+    script = training_script("render_image_dataset")
     monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
     monkeypatch.setattr(script, "NODES", 10)
     monkeypatch.setattr(script, "AGENTS", {"random": ""})

@@ -16,7 +16,7 @@ from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
 
 RANDOM_SCENES = 2000
-"""`benchmarks/check_layout.py` checks 10,000 alike; here they would take minutes."""
+"""`benchmarks/layout_penetration.py` checks 10,000 alike; here they would take minutes."""
 ROUNDING = 1e-9
 
 Footprint = tuple[NDArray[np.float64], NDArray[np.float64]]

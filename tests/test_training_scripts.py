@@ -45,7 +45,7 @@ def test_a_row_of_the_table() -> None:
         result(ALL, 4, (4,)),
         result("gave up", 1, ()),
     ]
-    row = training_script("explorer_results").row_of(results, {"ceiling": ceiling})
+    row = training_script("evaluate_explorers").row_of(results, {"ceiling": ceiling})
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
     assert (row["within_10"]["found"], row["within_20"]["found"]) == (3 / 4, 6 / 4)
@@ -63,7 +63,7 @@ def test_a_row_of_the_table() -> None:
 @pytest.mark.parametrize(("moves", "in_10", "in_20"), [(10, 0.5, 0.5), (11, 0, 0.5), (20, 0, 0.5)])
 def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
     results = [result(ended, 1, (0,) * (moves - 1) + (1,)) for ended in (ALL, COLLAPSED)]
-    row = training_script("explorer_results").row_of(results, {})
+    row = training_script("evaluate_explorers").row_of(results, {})
     told = {
         limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")]
         for limit in (10, 20)
@@ -73,7 +73,7 @@ def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
 
 def test_episodes_are_played_once(tmp_path: Path) -> None:
     """And those that are there are not taken for others."""
-    script = training_script("explorer_results")
+    script = training_script("evaluate_explorers")
     scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOG)
     path = tmp_path / "random.jsonl"
     played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
@@ -97,7 +97,7 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
-    script, out = training_script("explorer_results"), tmp_path / "table.json"
+    script, out = training_script("evaluate_explorers"), tmp_path / "table.json"
     for agents, told in (
         (["random", "missing.safetensors"], r"missing\.safetensors: cannot be read"),
         (["random", "student"], "was not trained with cereal_box_large"),
@@ -111,7 +111,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
 
 
 def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -> None:
-    script, out = training_script("explorer_results"), tmp_path / "table.json"
+    script, out = training_script("evaluate_explorers"), tmp_path / "table.json"
     options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "equilibrium", "out": out}
     script.main(tmp_path, agents=["largest-clear"], count=1, **options)
     yardstick = tmp_path / "sg_star_10_largest-clear.jsonl"
@@ -130,7 +130,7 @@ def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -
 
 
 def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
-    add_rows, path = training_script("explorer_results").add_rows, tmp_path / "table.json"
+    add_rows, path = training_script("evaluate_explorers").add_rows, tmp_path / "table.json"
     add_rows(
         path,
         {"seed": 1},
@@ -159,7 +159,7 @@ def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
-    script = training_script("make_scenes")
+    script = training_script("generate_scene_dataset")
     options = {
         "agent": "random",
         "nodes": 10,
@@ -182,7 +182,7 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The fast judge calls this one stable; Drake has the last word."""
-    script = training_script("make_scenes")
+    script = training_script("generate_scene_dataset")
     judge = script.GraphJudge(GenerationJob("random", "ycb7", None, 10, 1, ClutterConfig()))
     index = next(k for k in range(20) if judge(k).get("hidden"))
     fall = Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.1, 1.0)
@@ -202,7 +202,7 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
 def test_a_set_goes_on_with_the_weights_that_it_began_with(
     frozen: bool, told: str, tmp_path: Path
 ) -> None:
-    script, agent = training_script("make_scenes"), tmp_path / "agent.safetensors"
+    script, agent = training_script("generate_scene_dataset"), tmp_path / "agent.safetensors"
     options = {
         "agent": str(agent),
         "nodes": 10,
@@ -226,7 +226,7 @@ def test_a_set_goes_on_with_the_weights_that_it_began_with(
 
 def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--count 1: only 0 of 20 scenes are stable"):
-        training_script("make_scenes").main(
+        training_script("generate_scene_dataset").main(
             tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1
         )
 

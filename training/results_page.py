@@ -209,7 +209,7 @@ find room on the tray; others are drawn again, and not counted. Nothing else is 
 by the fast judge. *Stable* is of what is laid out, hidden and solvable are of what is stable; intervals are 95 %. *Balanced*: no
 stack holds more than 60 % of the objects. *Fast judge wrong*: of the scenes that it calls stable, with its margin of 2.05 mm, the
 share that falls in Drake.
-`python training/generator_results.py runs/table1`
+`python training/evaluate_generators.py runs/table1`
 
 `sg_star_seed_1` and `_2` are other seeds of SG*, sampled at 0.28 like it; `sg_star_paper` is SG* with the paper's reward alone,
 sampled at 0.25.
@@ -352,7 +352,7 @@ def explorers() -> str:
 Moves settled by Drake, perfect detector; *of solvable*: success in 20 moves on the scenes that the full-knowledge search solves;
 *to ceiling*, *to LF-clear*: moves on the scenes that both solve, if these are ten at least, to those of full knowledge and of
 LF-clear. Every episode is a line of `training/results/episodes/`, with its commit.
-`python training/explorer_results.py`
+`python training/evaluate_explorers.py`
 
 {table(head, told)}
 ![What was found over the moves](images/explorers.png)
@@ -418,7 +418,7 @@ def closed_loop() -> str:
 
 Within 20 moves. *Arm can*: scenes in which nothing stays hidden behind what no cup holds. *List*: of the objects that the agent
 knows by class and place when all has been in view.
-`python training/closed_loop_results.py --workers 2`
+`python training/evaluate_closed_loop.py --workers 2`
 
 {table(head, told)}"""
 
@@ -453,7 +453,7 @@ def detectors() -> str:
 
 Objects of which at least 30 % are seen; found is one that a detection of its class covers with an IoU of 0.5. Errors and ms per
 frame: median / 95th percentile.
-`python training/detector_results.py --detector FILE --scenes SET --out FILE`
+`python training/evaluate_detector.py --detector FILE --scenes SET --out FILE`
 
 {table([*head, "ms", "from"], told)}"""
 

@@ -15,9 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 from matplotlib.axes import Axes
-from results_page import IMAGES, RESULTS, read
 
 from drake_clutter.files import cli_error_handler
+from training.results_page import IMAGES, RESULTS, read
 
 OF_SEED = ", seed "
 """Between a training's name and its seed, if that is not 0."""

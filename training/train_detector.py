@@ -1,6 +1,6 @@
-"""Trains the network that finds objects in images of `make_images.py`.
+"""Trains the network that finds objects in images of `render_image_dataset.py`.
 
-    python training/make_images.py --out runs/images --count 20000 --workers 2
+    python training/render_image_dataset.py --out runs/images --count 20000 --workers 2
     python training/train_detector.py --config training/configs/detector.yaml --out runs/detector
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
@@ -34,11 +34,11 @@ CHECKPOINT = "detector.safetensors"
 
 @config_class
 @renamed_fields(catalogue="catalog")
-class TrainDetector:
+class DetectorTrainingConfig:
     """A training.
 
     Attributes:
-        images: folder of `make_images.py`; held_out: of its last images are not learned from, but looked at as it goes.
+        images: folder of `render_image_dataset.py`; held_out: of its last images are not learned from, but looked at as it goes.
         objects: name of the object set; catalog: a folder with object classes of one's own, or "".
         looks_at_color: whether the network is given colour beside depth.
         warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
@@ -59,13 +59,18 @@ class TrainDetector:
     cell: WorkCell = field(default_factory=default_cell)
 
 
+CONFIG = DetectorTrainingConfig()
+"""Default configuration of the training."""
+
+
 def main(
     out: Annotated[
         Path,
         typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
     ],
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainDetector.")
+        Path | None,
+        typer.Option(metavar="FILE", help="YAML with fields of DetectorTrainingConfig."),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -75,7 +80,7 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
 ) -> None:
     """Trains, evaluates as it goes, and writes detector.safetensors."""
-    given = load_config_as(TrainDetector(), config, settings or [], upgrade)
+    given = load_config_as(CONFIG, config, settings or [], upgrade)
     torch.set_num_threads(threads)
     chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
     classes = [

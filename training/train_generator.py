@@ -36,7 +36,7 @@ CHECKPOINT = "generator.safetensors"
 
 @config_class
 @renamed_fields(catalogue="catalog")
-class TrainGenerator:
+class GeneratorTrainingConfig:
     """A training.
 
     Attributes:
@@ -60,6 +60,10 @@ class TrainGenerator:
     task: GenerationTask = field(default_factory=GenerationTask)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
     world: ClutterConfig = field(default_factory=ClutterConfig)
+
+
+CONFIG = GeneratorTrainingConfig()
+"""Default configuration of the training."""
 
 
 def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float]:
@@ -90,7 +94,8 @@ def main(
         typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
     ],
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainGenerator.")
+        Path | None,
+        typer.Option(metavar="FILE", help="YAML with fields of GeneratorTrainingConfig."),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -102,7 +107,7 @@ def main(
     ] = PARTS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
-    given = load_config_as(TrainGenerator(), config, settings or [], upgrade)
+    given = load_config_as(CONFIG, config, settings or [], upgrade)
     chosen = device_of(device)
     one_thread_per_operation()
     classes = load_catalog(Path(given.catalog) if given.catalog else None).object_set(given.objects)

@@ -146,7 +146,7 @@ class LearnedExplorers:
     def __init__(
         self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()
     ) -> None:
-        """Loads a checkpoint of `training/train_explorer.py` or `training/clone_explorer.py`.
+        """Loads a checkpoint of `training/train_explorer_ppo.py` or `training/train_explorer_dagger.py`.
 
         Args:
             path: of the checkpoint.

@@ -208,7 +208,7 @@ class ImageSet:
         ]
         if not self._files:
             raise InputError(
-                f"{folder}: holds no images; allowed is a folder that training/make_images.py wrote"
+                f"{folder}: holds no images; allowed is a folder that training/render_image_dataset.py wrote"
             )
         categories = json.loads((scenes[0] / COCO_FILE).read_text(encoding="utf-8"))["categories"]
         self._class_names = {category["id"]: category["name"] for category in categories}

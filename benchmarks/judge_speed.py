@@ -1,6 +1,6 @@
 """How fast scenes are judged, seen and searched: this project and PyBullet, on the same scenes and one core.
 
-python benchmarks/speed.py --out benchmarks/results/speed.json
+python benchmarks/judge_speed.py --out benchmarks/results/speed.json
 """
 
 import os
@@ -27,11 +27,11 @@ import numpy as np
 import pybullet
 import typer
 from numpy.typing import NDArray
-from pybullet_world import label_image, load, poses
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.pybullet_world import label_image, load, poses
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene

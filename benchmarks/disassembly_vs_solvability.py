@@ -1,7 +1,7 @@
 """Is what the generator's reward asks of a scene, that it can be taken apart from the top, what makes it solvable?
 
     drake-clutter generate --agent training/checkpoints/sg_star_paper.safetensors --count 100 --seed 1000 --out out/paper
-    python benchmarks/come_apart.py out/paper out/others
+    python benchmarks/disassembly_vs_solvability.py out/paper out/others
 
 For each folder that `drake-clutter generate` wrote: its stable scenes by whether they come apart, and whether they are solvable.
 """

@@ -1,6 +1,6 @@
 """RG's row of the paper's Table I under a config: stability and hidden objects by size, judged by Drake.
 
-python benchmarks/calibrate.py --count 1000 --workers 2 --out benchmarks/results/calibration.json
+python benchmarks/random_generator_calibration.py --count 1000 --workers 2 --out benchmarks/results/calibration.json
 """
 
 import json

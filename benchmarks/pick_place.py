@@ -1,8 +1,8 @@
 """The arm: random legal moves in stable RG scenes, planned and carried out; its parts; and the two ways to hold an object.
 
-python benchmarks/arm.py moves --count 1000 --workers 2 --out benchmarks/results/arm_moves.json
-python benchmarks/arm.py parts --count 20 --out benchmarks/results/arm_parts.json
-python benchmarks/arm.py holds --count 20 --out benchmarks/results/arm_holds.json
+python benchmarks/pick_place.py moves --count 1000 --workers 2 --out benchmarks/results/arm_moves.json
+python benchmarks/pick_place.py parts --count 20 --out benchmarks/results/arm_parts.json
+python benchmarks/pick_place.py holds --count 20 --out benchmarks/results/arm_holds.json
 """
 
 import math
@@ -220,7 +220,7 @@ def moves(
     fair = [t for t in planned if not t.unstable_anyway]
     good = sum(t.result == "carried out" for t in fair)
     fields = {
-        "command": f"benchmarks/arm.py moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}",
+        "command": f"benchmarks/pick_place.py moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}",
         "commit": git_commit(),
         "cell": to_plain(default_cell()),
         "planner": asdict(PlannerConfig()),
@@ -316,7 +316,7 @@ def parts(
         done += move_timed(number)
         number += 1
     fields = {
-        "command": f"benchmarks/arm.py parts --count {count} --seed {seed}",
+        "command": f"benchmarks/pick_place.py parts --count {count} --seed {seed}",
         "commit": git_commit(),
         "seconds": {name: quantiles(values) for name, values in spent.items()},
     }
@@ -367,7 +367,7 @@ def holds(
                 }
             )
     fields = {
-        "command": f"benchmarks/arm.py holds --count {count} --seed {seed}",
+        "command": f"benchmarks/pick_place.py holds --count {count} --seed {seed}",
         "commit": git_commit(),
         "rows": rows,
     }

@@ -1,6 +1,6 @@
 """Where the time of the generator's training goes, with one thread and with two.
 
-python benchmarks/generator_training.py --out benchmarks/results/generator_training.json
+python benchmarks/generator_training_speed.py --out benchmarks/results/generator_training.json
 """
 
 import platform

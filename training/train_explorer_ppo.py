@@ -1,7 +1,7 @@
 """Trains explorers by actor-critic learning: the privileged teacher, or a student that goes on where it was cloned.
 
-    python training/train_explorer.py --config training/configs/teacher.yaml --out runs/teacher
-    python training/train_explorer.py --config training/configs/student.yaml --out runs/student
+    python training/train_explorer_ppo.py --config training/configs/teacher.yaml --out runs/teacher
+    python training/train_explorer_ppo.py --config training/configs/student.yaml --out runs/student
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
@@ -24,7 +24,7 @@ from drake_clutter.validation import Flag, InRange, config_class, load_config_as
 
 
 @config_class
-class TrainExplorer(ExplorerTraining):
+class PPOTrainingConfig(ExplorerTraining):
     """A training, see `ExplorerTraining`.
 
     Attributes:
@@ -40,13 +40,17 @@ class TrainExplorer(ExplorerTraining):
     learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
 
 
+CONFIG = PPOTrainingConfig()
+"""Default configuration of the training."""
+
+
 def main(
     out: Annotated[
         Path,
         typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
     ],
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of TrainExplorer.")
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of PPOTrainingConfig.")
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -55,7 +59,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_config_as(TrainExplorer(), config, settings or [], upgrade)
+    given = load_config_as(CONFIG, config, settings or [], upgrade)
     one_thread_per_operation()
     environment = given.environment(privileged=given.privileged)
     learner = ActorCritic(environment, given.learning, given.seed, device_of(device))

@@ -1,7 +1,7 @@
 """How far the fast judge and executor agree with Drake, and Drake with itself, on RG scenes and random moves.
 
-python benchmarks/drake_verdicts.py FOLDER --workers 2     # Drake's side, about an hour and a half; resumes
-python benchmarks/judges.py FOLDER --out benchmarks/results/judges.json --picture docs/images/judges_disagree.png
+python benchmarks/collect_drake_verdicts.py FOLDER --workers 2     # Drake's side, about an hour and a half; resumes
+python benchmarks/judge_agreement.py FOLDER --out benchmarks/results/judges.json --picture docs/images/judges_disagree.png
 """
 
 import itertools
@@ -14,7 +14,11 @@ from typing import Annotated, Any
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from drake_verdicts import (
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from benchmarks.collect_drake_verdicts import (
     BATCHES,
     MOVES,
     Batch,
@@ -28,10 +32,6 @@ from drake_verdicts import (
     move_rng,
     settled_scene,
 )
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
-
 from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
 from drake_clutter.resources import git_commit
@@ -305,7 +305,7 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(help="What drake_verdicts.py wrote.")],
+    folder: Annotated[Path, typer.Argument(help="What collect_drake_verdicts.py wrote.")],
     out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
     picture: Annotated[
         Path | None, typer.Option(help="PNG of stacks that the judges see differently.")

@@ -1,6 +1,6 @@
 """Tables II and III: every explorer on every frozen set of scenes, moves settled by Drake.
 
-    python training/explorer_results.py --workers 2
+    python training/evaluate_explorers.py --workers 2
 
 Every episode is a line of a file in training/results/episodes, a file for each set and agent; what is there is not played again.
 """

@@ -1,6 +1,6 @@
 """How well a trained detector sees: in scenes of a frozen set, and in images held out of its training.
 
-    python training/detector_results.py --detector training/checkpoints/detector_depth.safetensors --count 100 \
+    python training/evaluate_detector.py --detector training/checkpoints/detector_depth.safetensors --count 100 \
         --images runs/images --out training/results/detector_depth.json
 """
 
@@ -126,7 +126,9 @@ def main(
     count: Annotated[int, typer.Option(help="Scenes of each.")] = 100,
     images: Annotated[
         Path | None,
-        typer.Option(help="Folder of make_images.py, of another seed than the training's."),
+        typer.Option(
+            help="Folder of render_image_dataset.py, of another seed than the training's."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of the camera's noise.")] = 0,
     threads: Annotated[int, typer.Option(help="Of PyTorch.")] = 2,

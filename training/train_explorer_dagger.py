@@ -1,6 +1,6 @@
 """Trains a student, which sees what the camera has shown, by cloning a teacher, which sees everything.
 
-    python training/clone_explorer.py --config training/configs/student_dagger.yaml --out runs/student_dagger
+    python training/train_explorer_dagger.py --config training/configs/student_dagger.yaml --out runs/student_dagger
 
 A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
 """
@@ -23,7 +23,7 @@ from drake_clutter.validation import InRange, config_class, load_config_as
 
 
 @config_class
-class CloneExplorer(ExplorerTraining):
+class DAggerTrainingConfig(ExplorerTraining):
     """A training, see `ExplorerTraining`.
 
     Attributes:
@@ -37,13 +37,17 @@ class CloneExplorer(ExplorerTraining):
     learning: CloningConfig = field(default_factory=CloningConfig)
 
 
+CONFIG = DAggerTrainingConfig()
+"""Default configuration of the training."""
+
+
 def main(
     out: Annotated[
         Path,
         typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
     ],
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of CloneExplorer.")
+        Path | None, typer.Option(metavar="FILE", help="YAML with fields of DAggerTrainingConfig.")
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -52,7 +56,7 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_config_as(CloneExplorer(), config, settings or [], upgrade)
+    given = load_config_as(CONFIG, config, settings or [], upgrade)
     one_thread_per_operation()
     chosen = device_of(device)
     environment = given.environment()

@@ -1,6 +1,6 @@
 """Is the judge's settling its own truth? Verdicts under finer and coarser steps and without the early stop, on RG stacks.
 
-python benchmarks/settle_settings.py --count 150 --out benchmarks/results/settle_settings.json
+python benchmarks/settle_sensitivity.py --count 150 --out benchmarks/results/settle_settings.json
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """Makes a set of labelled images for networks that learn to see: heaps that were dropped, and scenes that agents generate.
 
-    python training/make_images.py --out runs/images --count 20000 --workers 2
+    python training/render_image_dataset.py --out runs/images --count 20000 --workers 2
 
 A work item is one scene, in a folder of its own (see `drake_clutter.perception.image_set`):
 

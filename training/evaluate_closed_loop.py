@@ -1,7 +1,7 @@
 """The closed loop on frozen sets: perfect or learned perception, moves teleported and settled, or carried out by the arm.
 
-    python training/closed_loop_results.py --workers 2
-    python training/closed_loop_results.py runs/closed_loop --only arm --count 20 --out runs/part.json
+    python training/evaluate_closed_loop.py --workers 2
+    python training/evaluate_closed_loop.py runs/closed_loop --only arm --count 20 --out runs/part.json
 
 Every episode is a line of a file in training/results/closed_loop, a file for each row; what is there is not played again. An
 episode that ends in an exception is counted as one. An episode is a success when a referee, who knows the truth, has seen every

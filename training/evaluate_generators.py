@@ -1,6 +1,6 @@
 """Table I: every generation agent at every size, judged by Drake; how temperature trades what is hidden for variety; pictures.
 
-    python training/generator_results.py runs/table1 --workers 2
+    python training/evaluate_generators.py runs/table1 --workers 2
 
 Scenes stay in the folder; a run that was stopped goes on with what is missing.
 """

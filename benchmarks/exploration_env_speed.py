@@ -1,6 +1,6 @@
 """What a move and a new scene of `ClutterExploration-v0` take, judged fast, and where the time goes.
 
-python benchmarks/exploration_environment.py --out benchmarks/results/exploration_environment.json
+python benchmarks/exploration_env_speed.py --out benchmarks/results/exploration_environment.json
 """
 
 import hashlib
@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from generator_training import timed
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.generator_training_speed import timed
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.resources import git_commit, resource_path

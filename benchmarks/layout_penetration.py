@@ -1,6 +1,6 @@
 """Lays out random graphs of both object sets and measures the deepest penetration of any two objects.
 
-python benchmarks/check_layout.py --count 10000
+python benchmarks/layout_penetration.py --count 10000
 """
 
 from collections import Counter

@@ -1,8 +1,8 @@
-"""What Drake says of RG scenes, group by group: the truth that `judges.py` holds the fast judge against.
+"""What Drake says of RG scenes, group by group: the truth that `judge_agreement.py` holds the fast judge against.
 
 Every group of objects that may touch is settled, also after one of them has fallen, so that each says something.
 
-python benchmarks/drake_verdicts.py FOLDER --workers 2
+python benchmarks/collect_drake_verdicts.py FOLDER --workers 2
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -256,7 +256,7 @@ def hidden(record: dict[str, Any], visibility_threshold: float) -> tuple[str, ..
 
 
 def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:
-    """Collects what `judges.py` needs, about an hour on two cores; a run that was stopped goes on."""
+    """Collects what `judge_agreement.py` needs, about an hour on two cores; a run that was stopped goes on."""
     pool = Pool(workers, ray)
     for batch, count in BATCHES.items():
         if batch.variant == "default":

@@ -1,7 +1,7 @@
 """Makes a set of stable scenes for explorers, drawn by a generation agent and judged by Drake, in one small file.
 
-    python training/make_scenes.py --agent sg-star --seed 100 --work runs/train_sg_star --out training/scenes/train_sg_star.json
-    python training/make_scenes.py --frozen --count 300 --seed 9000 --work runs/sg_star_25 --out training/scenes/sg_star_25.json
+    python training/generate_scene_dataset.py --seed 100 --work runs/train_sg_star --out train_sg_star.json
+    python training/generate_scene_dataset.py --frozen --count 300 --seed 9000 --work runs/sg_star_25 --out sg_star_25.json
 
 A set to learn from holds graphs, to be laid out anew. The fast judge chooses among the scenes, with the margin that generators
 learn with, and Drake has the last word. A frozen set, of all scenes that Drake calls stable, also holds where the objects came to
