@@ -5,10 +5,10 @@
 from .files import InputError as InputError
 
 # Objects, scenes and files of scenes.
-from .catalogue import (
-    Catalogue as Catalogue,
+from .catalog import (
+    Catalog as Catalog,
     ObjectClass as ObjectClass,
-    load_catalogue as load_catalogue,
+    load_catalog as load_catalog,
 )
 from .scenes.scene import Pose as Pose, Scene as Scene, SceneObject as SceneObject
 from .scenes.scene_file import load_scene as load_scene, save_scene as save_scene
