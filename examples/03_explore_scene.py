@@ -1,0 +1,41 @@
+"""Search a scene for its hidden objects with an exploration policy."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from drake_clutter import (
+    ClutterConfig,
+    backends,
+    load_catalogue,
+    load_scene_set,
+    make_explorers,
+    run_episode,
+)
+from drake_clutter.resources import shipped_path
+
+
+def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
+    config = ClutterConfig()
+    scenes = load_scene_set(shipped_path("training/scenes/sg_star_10.json"), load_catalogue())
+    scene = scenes.settled(index, scenes.grammar, config)
+
+    backend = backends(fidelity, config)(scene, np.random.default_rng(0))
+    policy = make_explorers(agent, config)(backend)
+    task = run_episode(backend, policy, max_moves=max_moves)
+
+    print(f"{len(scene.objects)} objects, hidden at the start: {list(task.hidden_at_start)}")
+    for step in task.steps:
+        print(f"{step.move}: {step.outcome.result.value}, found {list(step.newly_found)}")
+    print(f"ended: {task.end.value if task.end else 'no move left'}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--agent", default="largest-clear", help="student, largest-clear, ...")
+    parser.add_argument("--fidelity", default="settle", help="equilibrium, fast, settle or arm")
+    parser.add_argument("--scene", type=int, default=0, help="index in the scene set")
+    parser.add_argument("--max-moves", type=int, default=10)
+    arguments = parser.parse_args()
+    main(arguments.agent, arguments.fidelity, arguments.scene, arguments.max_moves)

@@ -1,0 +1,46 @@
+"""Plan one pick-and-place motion, simulate it, and save the trajectory of the joints."""
+
+from pathlib import Path
+
+import numpy as np
+
+from drake_clutter import (
+    NoPlan,
+    PickPlacePlanner,
+    PlannerConfig,
+    Pose,
+    Scene,
+    SceneObject,
+    StationSimulation,
+    default_cell,
+    load_catalogue,
+)
+
+
+def main(out: Path) -> None:
+    cell = default_cell()
+    sugar_box = load_catalogue().classes["sugar_box"]
+    height = sugar_box.size[2] / 2
+    box = SceneObject("sugar_box", sugar_box, Pose((0.0, 0.0, height)))
+    scene = Scene((box,), cell.support)
+
+    planner = PickPlacePlanner(cell, PlannerConfig())
+    plan = planner.plan(scene.objects, "sugar_box", Pose((0.2, -0.2, height + 0.001)))
+    if isinstance(plan, NoPlan):
+        raise SystemExit(f"no plan: {plan}")
+    for phase in plan.phases:
+        print(f"{phase.name}: {phase.duration:.2f} s")
+
+    result = StationSimulation(cell, scene).execute(plan, record=True)
+    print(f"simulated: {result}; largest load {result.largest_share:.0%} of what the cup bears")
+
+    arms = [sample.arm for sample in result.motion if sample.arm is not None]
+    rows = [(*arm.q, *arm.v, *arm.torque, arm.suction) for arm in arms]
+    times = [sample.time for sample in result.motion]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(out, np.column_stack([times, rows]), "%.5f", delimiter=",")
+    print(f"{out}: {len(rows)} samples of time, q, v, torque and vacuum")
+
+
+if __name__ == "__main__":
+    main(Path("out/tutorial/sugar_box.csv"))
