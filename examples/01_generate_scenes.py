@@ -12,7 +12,7 @@ from drake_clutter import (
     NodeBudget,
     SceneGrammar,
     lay_out,
-    load_catalogue,
+    load_catalog,
     make_generation_agent,
     save_scene,
 )
@@ -20,7 +20,7 @@ from drake_clutter import (
 
 def main(count: int, nodes: int, agent_name: str, out: Path) -> None:
     config = ClutterConfig()
-    grammar = SceneGrammar(load_catalogue().object_set("ycb7"))
+    grammar = SceneGrammar(load_catalog().object_set("ycb7"))
     agent = make_generation_agent(agent_name, config)
     judge = DrakeJudge(config)
     out.mkdir(parents=True, exist_ok=True)

@@ -8,12 +8,13 @@ from drake_clutter import (
     FastJudge,
     Pose,
     Scene,
+    SceneJudge,
     SceneObject,
     Verdict,
-    load_catalogue,
+    load_catalog,
 )
 
-CLASSES = load_catalogue().classes
+CLASSES = load_catalog().classes
 
 
 def standing(name: str, x: float, bottom: float) -> SceneObject:
@@ -24,7 +25,7 @@ def standing(name: str, x: float, bottom: float) -> SceneObject:
 
 def main() -> None:
     config = ClutterConfig()
-    judges = {"fast": FastJudge(config), "Drake": DrakeJudge(config)}
+    judges: dict[str, SceneJudge] = {"fast": FastJudge(config), "Drake": DrakeJudge(config)}
     box_height = CLASSES["pudding_box"].size[2]
     pudding = standing("pudding_box", 0.0, 0.0)
     scenes = {

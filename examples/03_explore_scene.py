@@ -1,24 +1,23 @@
 """Search a scene for its hidden objects with an exploration policy."""
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
 from drake_clutter import (
     ClutterConfig,
     backends,
-    load_catalogue,
+    load_catalog,
     load_scene_set,
     make_explorers,
     run_episode,
 )
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 
 
 def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
     config = ClutterConfig()
-    scenes = load_scene_set(shipped_path("training/scenes/sg_star_10.json"), load_catalogue())
+    scenes = load_scene_set(resource_path("training/scenes/sg_star_10.json"), load_catalog())
     scene = scenes.settled(index, scenes.grammar, config)
 
     backend = backends(fidelity, config)(scene, np.random.default_rng(0))

@@ -13,13 +13,13 @@ from drake_clutter import (
     SceneObject,
     StationSimulation,
     default_cell,
-    load_catalogue,
+    load_catalog,
 )
 
 
 def main(out: Path) -> None:
     cell = default_cell()
-    sugar_box = load_catalogue().classes["sugar_box"]
+    sugar_box = load_catalog().classes["sugar_box"]
     height = sugar_box.size[2] / 2
     box = SceneObject("sugar_box", sugar_box, Pose((0.0, 0.0, height)))
     scene = Scene((box,), cell.support)

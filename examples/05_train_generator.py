@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drake_clutter import ClutterConfig, ClutterGeneration, GenerationTask, load_catalogue
+from drake_clutter import ClutterConfig, ClutterGeneration, GenerationTask, load_catalog
 from drake_clutter.agents.learned_generator import about_values
 from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner, play
 from drake_clutter.learning.checkpoint import save_checkpoint
@@ -22,7 +22,7 @@ def evaluate(learner: SoftQLearner, make: Callable[[], ClutterGeneration], count
 
 
 def main(steps: int, scenes: int, out: Path) -> None:
-    classes = load_catalogue().object_set("ycb7")
+    classes = load_catalog().object_set("ycb7")
 
     def make_environment() -> ClutterGeneration:
         return ClutterGeneration(classes, GenerationTask(nodes=15), ClutterConfig())

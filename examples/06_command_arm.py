@@ -6,12 +6,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_clutter import ClutterStation, Pose, SceneObject, default_cell, load_catalogue
+from drake_clutter import ClutterStation, Pose, SceneObject, default_cell, load_catalog
 
 
 def main() -> None:
     cell = default_cell()
-    can = load_catalogue().classes["master_chef_can"]
+    can = load_catalog().classes["master_chef_can"]
     objects = [SceneObject("can", can, Pose((0.0, 0.0, can.size[2] / 2)))]
 
     # From home, the first joint turns by 0.5 rad and back within two seconds.

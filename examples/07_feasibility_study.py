@@ -11,10 +11,10 @@ from drake_clutter import (
     ClutterConfig,
     FeasibilityStudy,
     PlannerConfig,
-    load_catalogue,
+    load_catalog,
     load_scene_set,
 )
-from drake_clutter.resources import shipped_path
+from drake_clutter.resources import resource_path
 
 BASES = (-0.75, -1.25)
 """Positions of the base along x, from the center of the support [m]."""
@@ -28,7 +28,7 @@ def count_results(base_x: float, index: int) -> Counter[str]:
     robot = robot.model_copy(update={"base": base})
     config = replace(config, cell=config.cell.model_copy(update={"robot": robot}))
 
-    scenes = load_scene_set(shipped_path("training/scenes/sg_star_10.json"), load_catalogue())
+    scenes = load_scene_set(resource_path("training/scenes/sg_star_10.json"), load_catalog())
     scene = scenes.settled(index, scenes.grammar, config)
     study = FeasibilityStudy(f"base {base_x}", config, PlannerConfig(optimise=False), 0)
     return Counter(row.result for row in study.moves(f"{index:04d}", index, scene))

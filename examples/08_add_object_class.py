@@ -12,7 +12,7 @@ from drake_clutter import (
     NodeBudget,
     SceneGrammar,
     lay_out,
-    load_catalogue,
+    load_catalog,
     make_generation_agent,
     save_scene,
 )
@@ -22,7 +22,7 @@ from drake_clutter.assets import build_assets
 def main(folder: Path, object_set: str, nodes: int, out: Path) -> None:
     for built in build_assets(folder):
         print(f"built {built.name}: {len(list(built.iterdir()))} files")
-    classes = load_catalogue(folder).object_set(object_set)
+    classes = load_catalog(folder).object_set(object_set)
     grammar = SceneGrammar(classes)
     print(f"{len(grammar.rules)} rules for {len(grammar.classes)} classes")
 
