@@ -25,10 +25,14 @@ from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.attempts import NEAR, REPORTED
-from drake_clutter.planning.paths import sampled, smooth, timed
-from drake_clutter.planning.plan import NoPlan, Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
+from drake_clutter.planning.pick_place_search import INFLUENCE_DISTANCE, MAX_REPORTED_DISTANCE
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.time_parameterization import (
+    bspline_path,
+    parameterize_time_optimal,
+    sample_path,
+)
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
@@ -100,7 +104,7 @@ def judged(carried: PickPlaceResult) -> str:
     )
 
 
-def teleported_falls(scene: Scene, plan: Plan) -> bool:
+def teleported_falls(scene: Scene, plan: PickPlacePlan) -> bool:
     """Whether the pile falls, or the object does not stay, when it is moved by teleport."""
     after = scene.at({plan.pick: plan.X_TO_place})
     verdict = DrakeJudge(WORLD).judge(after, np.random.default_rng(0))
@@ -134,7 +138,7 @@ class Mover:
     def __init__(self, nodes: int, seed: int) -> None:
         self._scenes, self._seed = Scenes(nodes, seed), seed
         self._detector, self._executor = LabelDetector(WORLD.cell.camera), ArmExecutor(WORLD)
-        self._sure = ArmExecutor(WORLD, planner=PlannerConfig(optimise=False))
+        self._sure = ArmExecutor(WORLD, planner_config=PlannerConfig(optimize=False))
 
     def __call__(self, number: int) -> list[Trial]:
         """Moves in the scene of a number."""
@@ -142,7 +146,7 @@ class Mover:
         observation = self._detector.look(scene).observation
         moves = legal_moves(observation)
         for executor in (self._executor, self._sure):
-            executor.planner(scene.support).clearance_scene(
+            executor.planner_for(scene.support).collision_model(
                 scene.objects
             )  # as when moves follow each other
         return [
@@ -155,15 +159,15 @@ class Mover:
         command = resolve_placement(move, observation, WORLD.exploration, rng)
         if command is None:
             return Trial("no free spot", False, name, 0.0)
-        planner, X_TO = self._executor.planner(scene.support), command.X_TO_place
-        sure = self._sure.planner(scene.support).plan(scene.objects, move.pick, X_TO)
+        planner, X_TO = self._executor.planner_for(scene.support), command.X_TO_place
+        sure = self._sure.planner_for(scene.support).plan(scene.objects, move.pick, X_TO)
         plan = planner.plan(scene.objects, move.pick, X_TO)
-        if isinstance(plan, NoPlan):
+        if isinstance(plan, PlanningFailure):
             return Trial(
                 str(plan.reason.value),
-                planner.ends_exist(scene.objects, move.pick, X_TO),
+                planner.are_endpoints_reachable(scene.objects, move.pick, X_TO),
                 name,
-                sure.seconds,
+                sure.planning_time,
             )
         begun = time.perf_counter()
         carried = StationSimulation(default_cell(), scene).execute(plan)
@@ -172,18 +176,20 @@ class Mover:
             result=result,
             possible=True,
             object_class=name,
-            sure_planning=sure.seconds,
-            planning=plan.seconds,
-            sure_motion=plan.sure,
+            sure_planning=sure.planning_time,
+            planning=plan.planning_time,
+            sure_motion=plan.unoptimized_duration,
             motion=plan.duration,
-            shortened=tuple(phase.name for phase in plan.phases if phase.duration < phase.sure),
+            shortened=tuple(
+                phase.name for phase in plan.segments if phase.duration < phase.unoptimized_duration
+            ),
             wall=wall,
             place_error=carried.place_error,
             turn_error=carried.turn_error,
             disturbed=max(carried.displaced.values(), default=0.0),
             slip=carried.slip,
             tracking=carried.tracking,
-            clearance=min(phase.clearance.distance for phase in plan.phases),
+            clearance=min(phase.min_distance.distance for phase in plan.segments),
             unstable_anyway=result != "carried out" and teleported_falls(scene, plan),
         )
 
@@ -259,7 +265,7 @@ def parts(
     """Times the parts of planning and simulating a move, one by one, on one core."""
     detector, spent = LabelDetector(WORLD.cell.camera), dict[str, list[float]]()
     sure, executor, scenes = (
-        ArmExecutor(WORLD, planner=PlannerConfig(optimise=False)),
+        ArmExecutor(WORLD, planner_config=PlannerConfig(optimize=False)),
         ArmExecutor(WORLD),
         Scenes(25, seed),
     )
@@ -279,33 +285,38 @@ def parts(
         if command is None:
             return False
         X_TO = command.X_TO_place
-        planner, quick = executor.planner(scene.support), sure.planner(scene.support)
-        timed_as("scene of distances", lambda: planner.clearance_scene(scene.objects))
-        quick.clearance_scene(scene.objects)
+        planner, quick = executor.planner_for(scene.support), sure.planner_for(scene.support)
+        timed_as("scene of distances", lambda: planner.collision_model(scene.objects))
+        quick.collision_model(scene.objects)
         timed_as("sure plan", lambda: quick.plan(scene.objects, move.pick, X_TO))
         plan = timed_as("optimised plan", lambda: planner.plan(scene.objects, move.pick, X_TO))
-        if not isinstance(plan, Plan):
+        if not isinstance(plan, PickPlacePlan):
             spent["sure plan"].pop(), spent["optimised plan"].pop()
             return False
-        around = planner.clearance_scene(scene.objects)
-        q = sampled(plan.phases[1].trajectory)
+        around = planner.collision_model(scene.objects)
+        q = sample_path(plan.segments[1].trajectory)
         poses = planner.tool.pose(q)
         timed_as(
             "forward kinematics of a pose", lambda: planner.tool.robot.forward_kinematics(q), len(q)
         )
         timed_as(
             "inverse kinematics of a pose, eight branches",
-            lambda: planner.tool.solve(poses),
+            lambda: planner.tool.solve_ik(poses),
             len(q),
         )
         timed_as(
-            "distances at joint angles", lambda: [around.close(at, REPORTED) for at in q], len(q)
+            "distances at joint angles",
+            lambda: [around.distances_below(at, MAX_REPORTED_DISTANCE) for at in q],
+            len(q),
         )
         timed_as(
-            "distances with gradients", lambda: [around.gradients(at, NEAR) for at in q], len(q)
+            "distances with gradients",
+            lambda: [around.distances_and_gradients(at, INFLUENCE_DISTANCE) for at in q],
+            len(q),
         )
         timed_as(
-            "timing of a path without load", lambda: timed(smooth(q), default_cell(), Payload())
+            "timing of a path without load",
+            lambda: parameterize_time_optimal(bspline_path(q), default_cell(), Payload()),
         )
         simulation = timed_as("simulation, built", lambda: StationSimulation(default_cell(), scene))
         timed_as("simulation, run", lambda: simulation.execute(plan))
@@ -336,7 +347,7 @@ def holds(
         list[dict[str, Any]](),
     )
     for kind, nodes in (("one object", 4), ("25 nodes", 25)):
-        scenes, plans, number = Scenes(nodes, seed), list[tuple[Scene, Plan]](), 0
+        scenes, plans, number = Scenes(nodes, seed), list[tuple[Scene, PickPlacePlan]](), 0
         while len(plans) < count:
             scene, rng = scenes(number), item_rng(seed, number, 1)
             number += 1
@@ -345,7 +356,7 @@ def holds(
             move = choices[rng.integers(len(choices))]
             command = resolve_placement(move, observation, WORLD.exploration, rng)
             found = executor.plan(scene, command) if command else None
-            if isinstance(found, Plan):
+            if isinstance(found, PickPlacePlan):
                 plans.append((scene, found))
         for hold, jointed in (("WeldGrasp", True), ("CompliantGrasp", False)):
             results, walls = list[PickPlaceResult](), list[float]()

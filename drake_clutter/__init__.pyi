@@ -66,8 +66,11 @@ from .agents.backends import backends as backends
 from .agents.exploration import make_explorers as make_explorers
 
 # The arm: plans and their simulation.
-from .planning.plan import NoPlan as NoPlan, Plan as Plan
-from .planning.planner import PickPlacePlanner as PickPlacePlanner
+from .planning.pick_place_plan import (
+    PickPlacePlan as PickPlacePlan,
+    PlanningFailure as PlanningFailure,
+)
+from .planning.pick_place_planner import PickPlacePlanner as PickPlacePlanner
 from .planning.planner_config import PlannerConfig as PlannerConfig
 from .station.arm_executor import ArmExecutor as ArmExecutor
 from .station.clutter_station import ClutterStation as ClutterStation

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from drake_clutter import (
-    NoPlan,
     PickPlacePlanner,
     PlannerConfig,
+    PlanningFailure,
     Pose,
     Scene,
     SceneObject,
@@ -26,10 +26,10 @@ def main(out: Path) -> None:
 
     planner = PickPlacePlanner(cell, PlannerConfig())
     plan = planner.plan(scene.objects, "sugar_box", Pose((0.2, -0.2, height + 0.001)))
-    if isinstance(plan, NoPlan):
+    if isinstance(plan, PlanningFailure):
         raise SystemExit(f"no plan: {plan}")
-    for phase in plan.phases:
-        print(f"{phase.name}: {phase.duration:.2f} s")
+    for segment in plan.segments:
+        print(f"{segment.name}: {segment.duration:.2f} s")
 
     result = StationSimulation(cell, scene).execute(plan, record=True)
     print(f"simulated: {result}; largest load {result.largest_share:.0%} of what the cup bears")

@@ -15,8 +15,8 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import Plan
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports.arm_pictures import arm_moments, quarter_turn_to_base, strip
 from drake_clutter.reports.recording import write_recording
@@ -37,22 +37,22 @@ SCENE = scene_of(
 PLACE = Pose((0.2, -0.2, 0.0885), SCENE["sugar_box"].X_TO.quaternion)
 
 
-def planned(scene: Scene = SCENE, pick: str = "sugar_box", X_TO: Pose = PLACE) -> Plan:
+def planned(scene: Scene = SCENE, pick: str = "sugar_box", X_TO: Pose = PLACE) -> PickPlacePlan:
     found = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan(scene.objects, pick, X_TO)
-    assert isinstance(found, Plan)
+    assert isinstance(found, PickPlacePlan)
     return found
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan() -> PickPlacePlan:
     return planned()
 
 
-def run(plan: Plan, cell: WorkCell | None = None, jointed: str = "") -> PickPlaceResult:
+def run(plan: PickPlacePlan, cell: WorkCell | None = None, jointed: str = "") -> PickPlaceResult:
     return StationSimulation(cell or DEFAULT_CELL, SCENE, jointed=jointed).execute(plan)
 
 
-def test_placed_where_it_should_be(plan: Plan) -> None:
+def test_placed_where_it_should_be(plan: PickPlacePlan) -> None:
     carried = run(plan)
     assert carried.sealed
     assert math.isnan(carried.dropped)
@@ -67,13 +67,13 @@ def test_placed_where_it_should_be(plan: Plan) -> None:
     assert 0.1 < carried.largest_share < 1
 
 
-def test_a_locked_joint_does_not_slip(plan: Plan) -> None:
+def test_a_locked_joint_does_not_slip(plan: PickPlacePlan) -> None:
     carried = run(plan, jointed=plan.pick)
     assert carried.sealed
     assert carried.slip < 1e-9
 
 
-def test_a_vacuum_that_fails_drops_the_object(plan: Plan) -> None:
+def test_a_vacuum_that_fails_drops_the_object(plan: PickPlacePlan) -> None:
     """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
     carried = run(plan, cell_with("gripper.vacuum=0.1"))
     assert carried.sealed
@@ -82,7 +82,7 @@ def test_a_vacuum_that_fails_drops_the_object(plan: Plan) -> None:
     assert carried.place_error > 0.2
 
 
-def test_without_a_seal_nothing_is_lifted(plan: Plan) -> None:
+def test_without_a_seal_nothing_is_lifted(plan: PickPlacePlan) -> None:
     carried = run(plan, cell_with("gripper.unevenness=0"))
     assert not carried.sealed
     assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
@@ -100,7 +100,7 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
     assert (outcome.result, outcome.instability) == (result, None)
 
 
-def test_the_schedule(plan: Plan) -> None:
+def test_the_schedule(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
     assert [name for name, _ in schedule.starts] == [
         "approach",
@@ -133,9 +133,9 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(
     X_TO = Pose(
         (0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion
     )
-    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08))
+    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     carried = StationSimulation(DEFAULT_CELL, scene_of(stands)).execute(plan)
     assert carried.lowered_distance == pytest.approx(too_tall + 0.003, abs=0.002)
     assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
@@ -146,21 +146,21 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
     box, support = SCENE["sugar_box"], resting("cracker_box", xy=(0.2, -0.2))
     top = support.top
     X_TO = Pose((0.2, -0.2, top - 0.0105 + 0.0875), box.X_TO.quaternion)
-    slow = PlannerConfig(descent=0.08, optimise=False)
+    slow = PlannerConfig(max_guarded_descent=0.08, optimize=False)
     plan = PickPlacePlanner(DEFAULT_CELL, slow).plan([box], box.name, X_TO)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     carried = StationSimulation(DEFAULT_CELL, scene_of(box, support)).execute(plan)
     assert carried.lowered_distance < 0.002
     assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
     assert carried.displaced[support.name] < 0.005
 
 
-def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: Plan) -> None:
-    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(descent=0.08)).plan(
+def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: PickPlacePlan) -> None:
+    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08)).plan(
         SCENE.objects, "sugar_box", PLACE
     )
-    assert isinstance(guarded, Plan)
-    assert guarded.depth == pytest.approx(0.08)
+    assert isinstance(guarded, PickPlacePlan)
+    assert guarded.max_descent == pytest.approx(0.08)
     carried = StationSimulation(cell_with("gripper.unevenness=0"), SCENE).execute(guarded)
     assert carried.lowered_distance < 0.002
 
@@ -195,7 +195,7 @@ def test_an_executor_without_a_plan_stays_at_home() -> None:
     assert executor.GetOutputPort("status").Eval(context) == ExecutorStatus()
 
 
-def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
+def test_a_cloned_context_goes_on_the_same(plan: PickPlacePlan) -> None:
     """The executor's state is in its context, not in the system."""
     executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
@@ -217,7 +217,7 @@ def test_a_cloned_context_goes_on_the_same(plan: Plan) -> None:
     )
 
 
-def test_the_same_plan_has_the_same_outcome(plan: Plan) -> None:
+def test_the_same_plan_has_the_same_outcome(plan: PickPlacePlan) -> None:
     first, second = run(plan), run(plan)
     assert first.poses == second.poses
     assert first.largest_share == second.largest_share
@@ -248,7 +248,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         assert not outcome.result.carried_out
 
 
-def test_pictures_and_recording_show_the_arm(plan: Plan, tmp_path: Path) -> None:
+def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path) -> None:
     motion = StationSimulation(DEFAULT_CELL, SCENE).execute(plan, record=True).motion
     assert motion[0].arm is not None
     assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)

@@ -16,8 +16,12 @@ from drake_clutter.commands.run import play, write
 from drake_clutter.commands.run import scene_of as scenario_scene
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
 from drake_clutter.files import InputError
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
@@ -41,7 +45,7 @@ COVERED = scene_of(
 )
 BEFORE = RayCaster(ClutterConfig().cell.camera).observe(COVERED)[0]
 ASIDE = COVERED.at({"cracker_box": resting("cracker_box", xy=(0.05, 0.25)).X_TO})
-NO_SEAL = NoPlan(PlanFailure.NO_SEAL, "it")
+NO_SEAL = PlanningFailure(PlanningFailureReason.NO_SEAL, "it")
 AFTER = RayCaster(ClutterConfig().cell.camera).observe(ASIDE)[0]
 
 
@@ -77,13 +81,13 @@ class Bench:
         return state
 
 
-def a_plan() -> Plan:
-    made = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimise=False)).plan(
+def a_plan() -> PickPlacePlan:
+    made = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False)).plan(
         COVERED.objects,
         "cracker_box",
         Pose((0.05, 0.25, 0.031), COVERED["cracker_box"].X_TO.quaternion),
     )
-    assert isinstance(made, Plan)
+    assert isinstance(made, PickPlacePlan)
     return made
 
 
@@ -164,7 +168,7 @@ def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) 
     bench, asked, plan = Bench(), list[int](), a_plan()
     request = bench.after(0.1).request
 
-    def answer(*_: object) -> Plan | NoPlan:
+    def answer(*_: object) -> PickPlacePlan | PlanningFailure:
         asked.append(1)
         return plan if len(asked) == 1 else NO_SEAL
 
@@ -197,8 +201,8 @@ def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) 
     system.GetInputPort("request").FixValue(context, replace(request, number=3, command=None))
     simulator.AdvanceTo(1.5)
     found: PlanResponse = response.Eval(context)
-    assert isinstance(found.plan, NoPlan)
-    assert (found.number, found.plan.reason) == (3, PlanFailure.NO_FREE_SPOT)
+    assert isinstance(found.plan, PlanningFailure)
+    assert (found.number, found.plan.reason) == (3, PlanningFailureReason.NO_FREE_SPOT)
 
 
 def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
@@ -286,16 +290,20 @@ def test_a_random_explorer_plays(config: ClutterConfig) -> None:
 def test_without_room_to_go_down_it_is_let_go_at_its_place(
     descent: float, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closed_loop, "GUARDED", PlannerConfig(descent=descent, above=0.007))
+    monkeypatch.setattr(
+        closed_loop,
+        "GUARDED",
+        PlannerConfig(max_guarded_descent=descent, descent_start_offset=0.007),
+    )
     loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
     loop.policy_system.policy = first_allowed
     request = loop.policy_system.decided(PolicyState(), BEFORE).request
     assert request.command is not None
     plan = loop.planner_system._plan(request)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     above = plan.X_TO_place.translation[2] - request.command.X_TO_place.translation[2]
     assert above == pytest.approx(0.007 if descent else 0.0)
-    assert (plan.depth >= 0.007) == (descent > 0)
+    assert (plan.max_descent >= 0.007) == (descent > 0)
 
 
 def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:

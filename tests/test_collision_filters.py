@@ -10,7 +10,7 @@ from test_robot_model import CELLS, robot
 
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.clearance import ClearanceScene
+from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.robot_plant import links_in_place
 from drake_clutter.validation import override_config, to_plain
@@ -75,10 +75,10 @@ def test_a_first_link_that_reaches_out_or_slides_may_hit_a_fixture(
 ) -> None:
     spec = arm(tmp_path, kind, axis, 0.7)
     assert links_in_place(load_robot(spec)) == ("foot",)
-    scene = ClearanceScene(among_posts(spec, p_TF), [])
+    scene = CollisionModel(among_posts(spec, p_TF), [])
 
     def close_to_boom(first: float) -> set[str]:
-        pairs = (here.pair for here in scene.close(np.array([first, 0.0]), 0.01))
+        pairs = (here.pair for here in scene.distances_below(np.array([first, 0.0]), 0.01))
         return {other for link, other in pairs if link == "boom"} & {"post", "pedestal", "floor"}
 
     assert close_to_boom(0.0) == set()
@@ -93,10 +93,12 @@ def test_an_object_may_have_the_name_of_a_link() -> None:
             resting("gelatin_box", floor=0.2, name="held"),
             resting("sugar_box", xy=(0.1, 0.0), name=name),
         )
-        scene = ClearanceScene(DEFAULT_CELL, [(o.name, o.object_class) for o in (held, near)])
-        scene.put([held, near])
+        scene = CollisionModel(DEFAULT_CELL, [(o.name, o.object_class) for o in (held, near)])
+        scene.set_object_poses([held, near])
         q = np.array([-2.9, -1.5, 2.0, -2.0, -1.6, 0.0])
-        scene.hold("held", RigidTransform([0.0, 0.0, -0.02]))
-        found[name] = {here.pair: gradient for here, gradient in scene.gradients(q, 2.0)}
+        scene.attach_object("held", RigidTransform([0.0, 0.0, -0.02]))
+        found[name] = {
+            here.pair: gradient for here, gradient in scene.distances_and_gradients(q, 2.0)
+        }
     assert np.abs(found["other"]["held", "other"]).max() > 0.01
     assert found["cup"]["held", "cup"] == pytest.approx(found["other"]["held", "other"])

@@ -19,11 +19,15 @@ from drake_clutter.commands import feasibility as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.reachability import Reachability, base_scores
-from drake_clutter.planning.tool_kinematics import downwards
+from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
+from drake_clutter.planning.tool_kinematics import downward_pose
 from drake_clutter.reports import feasibility_report
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.ur_kinematics import jacobian, manipulability
@@ -43,7 +47,7 @@ SCENE = scene_of(
 
 def study(cell: WorkCell | None = None) -> FeasibilityStudy:
     return FeasibilityStudy(
-        "it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimise=False), 0
+        "it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimize=False), 0
     )
 
 
@@ -84,24 +88,27 @@ def test_what_points_up_and_what_lies_below() -> None:
 def test_what_no_arm_can_do_is_a_reason() -> None:
     place = Pose((0.1, 0.1, SCENE["tomato_soup_can"].X_TO.p[2] + 0.001))
 
-    def reason(cell: WorkCell) -> NoPlan:
+    def reason(cell: WorkCell) -> PlanningFailure:
         found = PickPlacePlanner(cell, PlannerConfig()).plan(
             SCENE.objects, "tomato_soup_can", place
         )
-        assert isinstance(found, NoPlan)
+        assert isinstance(found, PlanningFailure)
         return found
 
     in_tray = reason(cell_with("robot.base.x=-0.1"))
-    assert (in_tray.reason, in_tray.about) == (PlanFailure.IN_COLLISION, "pedestal and tray")
+    assert (in_tray.reason, in_tray.detail) == (
+        PlanningFailureReason.IN_COLLISION,
+        "pedestal and tray",
+    )
     hanging = cell_with(
         "robot.base.x=-0.1", "robot.base.z=1.2", "robot.base.roll=180", "robot.pedestal_side=0.0"
     )
     planner = PickPlacePlanner(hanging, PlannerConfig())
-    assert isinstance(planner.plan(SCENE.objects, "tomato_soup_can", place), Plan), (
+    assert isinstance(planner.plan(SCENE.objects, "tomato_soup_can", place), PickPlacePlan), (
         "it has no pedestal"
     )
-    assert reason(cell_with("robot.base.x=-5.0")).reason is PlanFailure.UNREACHABLE
-    assert reason(cell_with("robot.payload=1")).reason is PlanFailure.TOO_HEAVY
+    assert reason(cell_with("robot.base.x=-5.0")).reason is PlanningFailureReason.UNREACHABLE
+    assert reason(cell_with("robot.payload=1")).reason is PlanningFailureReason.TOO_HEAVY
 
 
 def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
@@ -119,32 +126,37 @@ def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
 
 
 def test_the_map_agrees_with_the_poses() -> None:
-    reachability = Reachability(DEFAULT_CELL)
-    found = reachability.map((0.1, 1.5), 0.3)
-    assert found.share.shape == (2, 3, 3)
-    assert (found.share[0] == 1).all()
-    assert (found.share[1] < 1).any(), "too high"
-    middle = reachability.poses(downwards(0.0, np.array([0.0, 0.0, 0.1]))[None])
-    assert middle.branches[0] > 0
+    reachability = ReachabilityAnalysis(DEFAULT_CELL)
+    found = reachability.compute_map((0.1, 1.5), 0.3)
+    assert found.reachable_fraction.shape == (2, 3, 3)
+    assert (found.reachable_fraction[0] == 1).all()
+    assert (found.reachable_fraction[1] < 1).any(), "too high"
+    middle = reachability.analyze_poses(downward_pose(0.0, np.array([0.0, 0.0, 0.1]))[None])
+    assert middle.num_solutions[0] > 0
     assert middle.manipulability[0] == pytest.approx(float(manipulability(middle.q[0])))
-    away = reachability.poses(
+    away = reachability.analyze_poses(
         np.array(
-            [downwards(0.0, np.array([3.0, 0.0, 0.1])), downwards(0.0, np.array([0.0, 0.0, -0.3]))]
+            [
+                downward_pose(0.0, np.array([3.0, 0.0, 0.1])),
+                downward_pose(0.0, np.array([0.0, 0.0, -0.3])),
+            ]
         )
     )
-    assert away.branches.tolist() == [0, 0]
-    assert away.in_the_way[0] == ""
-    assert "table" in away.in_the_way[1] or "floor" in away.in_the_way[1], "through the floor"
-    near, in_tray = base_scores(DEFAULT_CELL, [(-0.65, 0.0), (0.0, 0.0)])
+    assert away.num_solutions.tolist() == [0, 0]
+    assert away.blocking_bodies[0] == ""
+    assert "table" in away.blocking_bodies[1] or "floor" in away.blocking_bodies[1], (
+        "through the floor"
+    )
+    near, in_tray = score_base_positions(DEFAULT_CELL, [(-0.65, 0.0), (0.0, 0.0)])
     assert near[0] == 1.0
     assert in_tray == (0.0, 0.0)
 
 
 def test_the_map_covers_the_support_and_no_more() -> None:
-    found = Reachability(cell_with("support.size=[0.4, 0.8]")).map((0.1,), 0.15)
+    found = ReachabilityAnalysis(cell_with("support.size=[0.4, 0.8]")).compute_map((0.1,), 0.15)
     assert found.x == pytest.approx([-0.15, 0.0, 0.15])
     assert found.y == pytest.approx(np.linspace(-0.35, 0.35, 6))
-    assert found.share.shape == found.manipulability.shape == (1, 3, 6)
+    assert found.reachable_fraction.shape == found.manipulability.shape == (1, 3, 6)
 
 
 def test_all_moves_are_in_the_picture_over_the_support() -> None:
@@ -285,7 +297,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert set(setups) == set(names)
     for found in setups.values():
         assert found["planned"] > 0
-        assert set(found["results"]) <= {PLANNED, PlanFailure.NO_FREE_SPOT.value}
+        assert set(found["results"]) <= {PLANNED, PlanningFailureReason.NO_FREE_SPOT.value}
     reach = table(out / "reach.csv")
     for name in names:
         of_setup = [row for row in reach if row["setup"] == name]

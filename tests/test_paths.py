@@ -9,15 +9,15 @@ from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.planning.paths import (
-    MARGIN,
+from drake_clutter.planning.time_parameterization import (
+    LIMIT_FRACTION,
+    bspline_path,
     dynamics_plant,
-    sampled,
-    slowed,
-    smooth,
-    straight,
-    timed,
-    torques,
+    inverse_dynamics,
+    linear_joint_path,
+    parameterize_time_optimal,
+    sample_path,
+    scale_to_limits,
 )
 from drake_clutter.robots.robot_model import load_robot
 
@@ -42,7 +42,11 @@ def test_whole_turns() -> None:
 def test_a_smooth_way_keeps_its_ends_and_cuts_corners() -> None:
     corner = HOME + np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     end = corner + np.array([0.0, 0.4, 0.0, 0.0, 0.0, 0.0])
-    points = sampled(smooth(np.vstack([straight(HOME, corner), straight(corner, end)[1:]])))
+    points = sample_path(
+        bspline_path(
+            np.vstack([linear_joint_path(HOME, corner), linear_joint_path(corner, end)[1:]])
+        )
+    )
     assert points[0] == pytest.approx(HOME)
     assert points[-1] == pytest.approx(end)
     aside = np.abs(points[:, 0] - corner[0]) + np.abs(points[:, 1] - corner[1])
@@ -56,7 +60,7 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
     v, a = (
         np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2)
     )
-    torque = torques(dynamics_plant(ARM, payload), q, v, a)
+    torque = inverse_dynamics(dynamics_plant(ARM, payload), q, v, a)
     pairs = {
         "speed": v / ROBOT.velocity_limits,
         "acceleration": a / ROBOT.acceleration_limits,
@@ -77,8 +81,12 @@ def test_trajectories_keep_the_limits(payload: Payload) -> None:
     draw = rng(0)
     for _ in range(3):
         middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
-        trajectory = timed(
-            smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]])), ARM, payload
+        trajectory = parameterize_time_optimal(
+            bspline_path(
+                np.vstack([linear_joint_path(HOME, middle), linear_joint_path(middle, end)[1:]])
+            ),
+            ARM,
+            payload,
         )
         assert trajectory is not None
         shares = shares_of_limits(trajectory, payload)
@@ -88,15 +96,15 @@ def test_trajectories_keep_the_limits(payload: Payload) -> None:
 
 @pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
 def test_a_motion_that_is_too_fast_is_slowed_until_one_limit_is_met(payload: Payload) -> None:
-    way = smooth(straight(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
+    way = bspline_path(linear_joint_path(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
     too_fast = PathParameterizedTrajectory(
         way, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]])
     )
-    found = slowed(too_fast, ARM, payload)
+    found = scale_to_limits(too_fast, ARM, payload)
     assert found is not None
     assert 0.95 < max(shares_of_limits(found, payload).values()) < 1.01
     assert found.value(found.end_time()) == pytest.approx(too_fast.value(0.3))
-    again = slowed(found, ARM, payload)
+    again = scale_to_limits(found, ARM, payload)
     assert again is not None
     assert again.end_time() == pytest.approx(found.end_time(), rel=0.01), (
         "as it is, if the limits hold"
@@ -107,15 +115,17 @@ def test_as_quick_as_drakes_toppra() -> None:
     draw = rng(1)
     for _ in range(3):
         middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
-        path = smooth(np.vstack([straight(HOME, middle), straight(middle, end)[1:]]))
+        path = bspline_path(
+            np.vstack([linear_joint_path(HOME, middle), linear_joint_path(middle, end)[1:]])
+        )
         toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
         toppra.AddJointVelocityLimit(
-            -MARGIN * ROBOT.velocity_limits, MARGIN * ROBOT.velocity_limits
+            -LIMIT_FRACTION * ROBOT.velocity_limits, LIMIT_FRACTION * ROBOT.velocity_limits
         )
         toppra.AddJointAccelerationLimit(
-            -MARGIN * ROBOT.acceleration_limits, MARGIN * ROBOT.acceleration_limits
+            -LIMIT_FRACTION * ROBOT.acceleration_limits, LIMIT_FRACTION * ROBOT.acceleration_limits
         )
-        found = timed(path, ARM, Payload())
+        found = parameterize_time_optimal(path, ARM, Payload())
         assert found is not None
         assert found.end_time() == pytest.approx(
             toppra.SolvePathParameterization().end_time(), rel=0.01
@@ -124,8 +134,8 @@ def test_as_quick_as_drakes_toppra() -> None:
 
 def test_the_faster_joint_decides() -> None:
     """Over a long way the shoulder runs at its 120 deg/s: the way over the speed, and a little to start and stop."""
-    way = straight(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    trajectory = timed(smooth(way), ARM, Payload())
+    way = linear_joint_path(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    trajectory = parameterize_time_optimal(bspline_path(way), ARM, Payload())
     assert trajectory is not None
     cruise = 2.5 / (0.97 * ROBOT.velocity_limits[0])
     starts = ROBOT.velocity_limits[0] / ROBOT.acceleration_limits[0]

@@ -1,7 +1,9 @@
 """Plans of moves: what they promise, checked again with samples of their own; and every reason why there is none."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +11,18 @@ from conftest import CLASSES, DEFAULT_CELL, cell_with, random_scene, resting, rn
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import rests_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.validation import to_plain, validate
 
 TRAY_SIDE, ALTITUDE = 0.70, 1.60
 LYING = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
@@ -39,14 +46,14 @@ PILE = [
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan() -> PickPlacePlan:
     found = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
-    assert isinstance(found, Plan)
+    assert isinstance(found, PickPlacePlan)
     return found
 
 
-def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
-    approach, carry, retreat = (phase.trajectory for phase in plan.phases)
+def test_the_phases_follow_each_other_from_home_to_home(plan: PickPlacePlan) -> None:
+    approach, carry, retreat = (phase.trajectory for phase in plan.segments)
     home = np.array(DEFAULT_CELL.robot.home)
     assert approach.value(0.0).ravel() == pytest.approx(home)
     assert carry.value(0.0).ravel() == pytest.approx(
@@ -61,8 +68,8 @@ def test_the_phases_follow_each_other_from_home_to_home(plan: Plan) -> None:
             assert np.abs(trajectory.EvalDerivative(time, 1)).max() < 1e-3
 
 
-def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: Plan) -> None:
-    carry, tool = plan.phases[1].trajectory, ToolKinematics(DEFAULT_CELL)
+def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: PickPlacePlan) -> None:
+    carry, tool = plan.segments[1].trajectory, ToolKinematics(DEFAULT_CELL)
     X_TG_pick, X_TG_place = (tool.pose(carry.value(t).ravel()) for t in (0.0, carry.end_time()))
     assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), (
         "the top of the sugar box"
@@ -73,20 +80,20 @@ def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: Plan) -> No
         assert pytest.approx(expected, abs=1e-6) == X_TG
 
 
-def hits_nothing(plan: Plan, objects: list[SceneObject]) -> None:
+def hits_nothing(plan: PickPlacePlan, objects: list[SceneObject]) -> None:
     """At moments of the test's own, three times as dense."""
-    scene = planner().clearance_scene(objects)
-    for phase in plan.phases:
-        scene.put(objects)
+    scene = planner().collision_model(objects)
+    for phase in plan.segments:
+        scene.set_object_poses(objects)
         if phase.name == "carry":
-            scene.hold(plan.pick, plan.X_OG)
+            scene.attach_object(plan.pick, plan.X_OG)
         else:
-            scene.put_one(
+            scene.set_object_pose(
                 plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place
             )
         least = own = math.inf
         for time in np.linspace(0.0, phase.duration, 300):
-            for here in scene.close(phase.trajectory.value(time).ravel(), 0.03):
+            for here in scene.distances_below(phase.trajectory.value(time).ravel(), 0.03):
                 if here.pair == (plan.pick, "floor"):
                     assert here.distance > -0.001
                 elif here.pair == ("cup", plan.pick):
@@ -97,43 +104,43 @@ def hits_nothing(plan: Plan, objects: list[SceneObject]) -> None:
                     own = min(own, here.distance)
                 else:
                     least = min(least, here.distance)
-        assert min(least, own) > PlannerConfig().clearance - 0.001
-        assert least > min(phase.clearance.distance, 0.03) - 0.001
+        assert min(least, own) > PlannerConfig().min_distance - 0.001
+        assert least > min(phase.min_distance.distance, 0.03) - 0.001
 
 
-def test_nothing_is_hit_on_the_way(plan: Plan) -> None:
+def test_nothing_is_hit_on_the_way(plan: PickPlacePlan) -> None:
     hits_nothing(plan, PILE)
 
 
-def test_the_same_question_has_the_same_answer(plan: Plan) -> None:
+def test_the_same_question_has_the_same_answer(plan: PickPlacePlan) -> None:
     again = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
-    assert isinstance(again, Plan)
-    for phase, other in zip(plan.phases, again.phases, strict=True):
+    assert isinstance(again, PickPlacePlan)
+    for phase, other in zip(plan.segments, again.segments, strict=True):
         assert phase.duration == other.duration
         assert (phase.trajectory.value(0.3) == other.trajectory.value(0.3)).all()
-    assert plan.attempts == again.attempts
+    assert plan.num_attempts == again.num_attempts
     assert plan.X_OG.IsExactlyEqualTo(again.X_OG)
 
 
-def reason(found: Plan | NoPlan) -> PlanFailure:
-    assert isinstance(found, NoPlan)
+def reason(found: PickPlacePlan | PlanningFailure) -> PlanningFailureReason:
+    assert isinstance(found, PlanningFailure)
     return found.reason
 
 
 def test_a_marker_does_not_seal() -> None:
     marker = SceneObject("marker", CLASSES["large_marker"], Pose((0.0, 0.0, 0.009), LYING))
     found = planner().plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
-    assert reason(found) is PlanFailure.NO_SEAL
-    assert isinstance(found, NoPlan)
-    assert found.number > DEFAULT_CELL.gripper.unevenness
+    assert reason(found) is PlanningFailureReason.NO_SEAL
+    assert isinstance(found, PlanningFailure)
+    assert found.value > DEFAULT_CELL.gripper.unevenness
     assert str(found) == "no seal: marker"
 
 
 def test_what_carries_something_is_not_picked() -> None:
     found = planner().plan(PILE, "tomato_soup_can", lifted(PILE[1], 0.2, -0.2))
-    assert reason(found) is PlanFailure.CARRIES_OTHERS
-    assert isinstance(found, NoPlan)
-    assert found.about == "gelatin_box"
+    assert reason(found) is PlanningFailureReason.CARRIES_OTHERS
+    assert isinstance(found, PlanningFailure)
+    assert found.detail == "gelatin_box"
     assert rests_on(PILE[3], PILE) == ()
 
 
@@ -142,22 +149,28 @@ def test_too_heavy() -> None:
     weak = cell_with("gripper.vacuum=0.1")
     assert (
         reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
-        is PlanFailure.TOO_HEAVY
+        is PlanningFailureReason.TOO_HEAVY
     )
     frail = cell_with("robot.payload=1")
     assert (
         reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
-        is PlanFailure.TOO_HEAVY
+        is PlanningFailureReason.TOO_HEAVY
     )
 
 
 def test_out_of_reach() -> None:
     far = cell_with("robot.base.x=-2.5")
     found = planner(far).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
-    assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the grasp")
+    assert (reason(found), str(found)) == (
+        PlanningFailureReason.UNREACHABLE,
+        "unreachable: the grasp",
+    )
     nearer = cell_with("robot.base.x=-1.15")
     found = planner(nearer).plan(PILE, "cracker_box", lifted(PILE[2], 0.3, -0.3))
-    assert (reason(found), str(found)) == (PlanFailure.UNREACHABLE, "unreachable: the place")
+    assert (reason(found), str(found)) == (
+        PlanningFailureReason.UNREACHABLE,
+        "unreachable: the place",
+    )
 
 
 def test_a_tower_beside_it_is_in_the_way() -> None:
@@ -169,18 +182,18 @@ def test_a_tower_beside_it_is_in_the_way() -> None:
         for k, (x, z) in enumerate(places)
     ]
     found = planner().plan([low, *walls], "low", lifted(low, 0.2, -0.2))
-    assert reason(found) is PlanFailure.IN_COLLISION
-    assert isinstance(found, NoPlan)
-    assert "at the grasp" in found.about
-    assert found.number < PlannerConfig().clearance
-    assert not planner().ends_exist([low, *walls], "low", lifted(low, 0.2, -0.2))
+    assert reason(found) is PlanningFailureReason.IN_COLLISION
+    assert isinstance(found, PlanningFailure)
+    assert "at the grasp" in found.detail
+    assert found.value < PlannerConfig().min_distance
+    assert not planner().are_endpoints_reachable([low, *walls], "low", lifted(low, 0.2, -0.2))
 
 
 def test_time_may_run_out() -> None:
     found = planner(config=PlannerConfig(time_limit=0.0)).plan(
         PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
     )
-    assert reason(found) is PlanFailure.TIME_OUT
+    assert reason(found) is PlanningFailureReason.TIME_OUT
 
 
 def test_what_reaches_both_ends_is_planned() -> None:
@@ -191,33 +204,39 @@ def test_what_reaches_both_ends_is_planned() -> None:
         for o in scene.objects:
             x, y = draw.uniform(-0.2, 0.2, 2)
             place = Pose((x, y, o.X_TO.translation[2] + 0.5), o.X_TO.quaternion)
-            if planner().ends_exist(scene.objects, o.name, place):
+            if planner().are_endpoints_reachable(scene.objects, o.name, place):
                 tried += 1
-                assert isinstance(planner().plan(scene.objects, o.name, place), Plan), o.name
+                assert isinstance(planner().plan(scene.objects, o.name, place), PickPlacePlan), (
+                    o.name
+                )
     assert tried >= 5
 
 
 def test_turned_by_a_quarter() -> None:
     quarter = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
     place = replace(lifted(PILE[0], 0.2, -0.2), quaternion=quarter)
-    assert isinstance(planner().plan(PILE, "sugar_box", place), Plan)
+    assert isinstance(planner().plan(PILE, "sugar_box", place), PickPlacePlan)
 
 
-def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
+def test_how_distances_change_is_how_they_differ(plan: PickPlacePlan) -> None:
     """Beside the way, where faces are not parallel: between those that are, the nearest points are not unique."""
-    scene, step, draw = planner().clearance_scene(PILE), 1e-4, rng(0)
-    scene.hold(plan.pick, plan.X_OG)
+    scene, step, draw = planner().collision_model(PILE), 1e-4, rng(0)
+    scene.attach_object(plan.pick, plan.X_OG)
     errors: dict[bool, list[float]] = {True: [], False: []}  # of pairs with a cylinder, and without
-    for time in np.linspace(0.0, plan.phases[1].duration, 15):
-        q = plan.phases[1].trajectory.value(time).ravel() + draw.normal(0, 0.1, 6)
-        gradients = scene.gradients(q, 0.2)
-        assert [clearance for clearance, _ in gradients] == scene.close(q, 0.2)
+    for time in np.linspace(0.0, plan.segments[1].duration, 15):
+        q = plan.segments[1].trajectory.value(time).ravel() + draw.normal(0, 0.1, 6)
+        gradients = scene.distances_and_gradients(q, 0.2)
+        assert [clearance for clearance, _ in gradients] == scene.distances_below(q, 0.2)
         pairs = [clearance.pair for clearance, _ in gradients]
         once = {pair for pair in pairs if pairs.count(pair) == 1}  # some parts have several shapes
         found = {c.pair: (c.distance, gradient) for c, gradient in gradients if c.pair in once}
         for joint in range(6):
-            ahead = {c.pair: c.distance for c in scene.close(q + step * np.eye(6)[joint], 0.21)}
-            behind = {c.pair: c.distance for c in scene.close(q - step * np.eye(6)[joint], 0.21)}
+            ahead = {
+                c.pair: c.distance for c in scene.distances_below(q + step * np.eye(6)[joint], 0.21)
+            }
+            behind = {
+                c.pair: c.distance for c in scene.distances_below(q - step * np.eye(6)[joint], 0.21)
+            }
             for pair, (_, gradient) in found.items():
                 sides = (
                     (ahead[pair] - found[pair][0]) / step,
@@ -233,14 +252,14 @@ def test_how_distances_change_is_how_they_differ(plan: Plan) -> None:
     assert max(errors[True]) < 1e-2, "Drake finds the nearest points of curved faces by iteration"
 
 
-def test_optimised_ways_are_quicker(plan: Plan) -> None:
-    sure = planner(config=PlannerConfig(optimise=False)).plan(
+def test_optimised_ways_are_quicker(plan: PickPlacePlan) -> None:
+    sure = planner(config=PlannerConfig(optimize=False)).plan(
         PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
     )
-    assert isinstance(sure, Plan)
-    assert sure.duration == sure.sure == plan.sure
-    assert plan.duration < 0.9 * plan.sure
-    assert all(phase.duration <= phase.sure for phase in plan.phases)
+    assert isinstance(sure, PickPlacePlan)
+    assert sure.duration == sure.unoptimized_duration == plan.unoptimized_duration
+    assert plan.duration < 0.9 * plan.unoptimized_duration
+    assert all(phase.duration <= phase.unoptimized_duration for phase in plan.segments)
 
 
 def test_from_a_height_the_arm_goes_back_before_it_goes_home() -> None:
@@ -249,6 +268,17 @@ def test_from_a_height_the_arm_goes_back_before_it_goes_home() -> None:
     for height in (0.2, 0.35, 0.5):
         high = Pose((0.1, 0.0, height), box.X_TO.quaternion)
         for optimise in (False, True):
-            found = planner(config=PlannerConfig(optimise=optimise)).plan([box], box.name, high)
-            assert isinstance(found, Plan)
+            found = planner(config=PlannerConfig(optimize=optimise)).plan([box], box.name, high)
+            assert isinstance(found, PickPlacePlan)
             hits_nothing(found, [box])
+
+
+def test_results_files_with_earlier_names_load() -> None:
+    """The planner's config in a results file of version 0.1, and what is written today."""
+    path = Path(__file__).parents[1] / "benchmarks" / "results" / "arm_moves.json"
+    earlier = json.loads(path.read_text())["planner"]
+    assert "optimise" in earlier
+    assert validate(PlannerConfig, earlier, str(path)) == PlannerConfig()
+    written = to_plain(PlannerConfig(optimize=False))
+    assert not {"clearance", "rise", "above", "optimise"} & written.keys()
+    assert validate(PlannerConfig, written, "") == PlannerConfig(optimize=False)

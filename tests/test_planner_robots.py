@@ -11,10 +11,15 @@ from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.paths import dynamics_plant, torques
-from drake_clutter.planning.plan import NoPlan, Phase, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+    TrajectorySegment,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.time_parameterization import dynamics_plant, inverse_dynamics
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
@@ -46,47 +51,47 @@ def place_of(o: SceneObject, x: float, y: float, turn: float) -> Pose:
     return Pose.of(R, (x, y, o.X_TO.translation[2] + 0.001))
 
 
-def samples(phase: Phase, order: int = 0) -> np.ndarray:
+def samples(phase: TrajectorySegment, order: int = 0) -> np.ndarray:
     times = np.linspace(0.0, phase.duration, 400)
     values = [phase.trajectory.EvalDerivative(time, order).ravel() for time in times]
     return np.array(values)
 
 
-def limits_hold(planner: PickPlacePlanner, plan: Plan) -> None:
+def limits_hold(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
     robot, loaded = planner.tool.robot, Payload(plan.mass, plan.p_GCm)
     lower, upper = robot.position_limits.T
-    for phase in plan.phases:
+    for phase in plan.segments:
         q, v, a = (samples(phase, order) for order in range(3))
         assert q.shape[1] == robot.num_joints
         assert (q >= lower - 1e-9).all()
         assert (q <= upper + 1e-9).all()
         plant = dynamics_plant(planner.cell, loaded if phase.name == "carry" else Payload())
         assert np.abs(v / robot.velocity_limits).max() < 1.01
-        assert np.abs(torques(plant, q, v, a) / robot.torque_limits).max() < 1.01
+        assert np.abs(inverse_dynamics(plant, q, v, a) / robot.torque_limits).max() < 1.01
         # A sure carry is softened, and so quicker at corners.
-        if phase.name != "carry" or phase.duration < phase.sure:
+        if phase.name != "carry" or phase.duration < phase.unoptimized_duration:
             assert np.abs(a / robot.acceleration_limits).max() < 1.01
 
 
-def nothing_is_hit(planner: PickPlacePlanner, plan: Plan) -> None:
-    scene = planner.clearance_scene(PILE)
-    for phase in plan.phases:
-        scene.put(PILE)
+def nothing_is_hit(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
+    scene = planner.collision_model(PILE)
+    for phase in plan.segments:
+        scene.set_object_poses(PILE)
         if phase.name == "carry":
-            scene.hold(plan.pick, plan.X_OG)
+            scene.attach_object(plan.pick, plan.X_OG)
         else:
             X_TO = plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place
-            scene.put_one(plan.pick, X_TO)
+            scene.set_object_pose(plan.pick, X_TO)
         for q in samples(phase):
-            for here in scene.close(q, 0.0):
+            for here in scene.distances_below(q, 0.0):
                 touching = here.pair in (("cup", plan.pick), (plan.pick, "floor"))
                 assert touching, f"{phase.name}: {here}"
                 assert here.distance > -0.001
 
 
-def ends_are_right(planner: PickPlacePlanner, plan: Plan) -> None:
+def ends_are_right(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
     home = planner.tool.robot.home
-    approach, carry, retreat = (phase.trajectory for phase in plan.phases)
+    approach, carry, retreat = (phase.trajectory for phase in plan.segments)
     assert approach.value(0.0).ravel() == pytest.approx(home)
     assert retreat.value(retreat.end_time()).ravel() == pytest.approx(home)
     for first, second in ((approach, carry), (carry, retreat)):
@@ -99,48 +104,51 @@ def ends_are_right(planner: PickPlacePlanner, plan: Plan) -> None:
 @pytest.mark.parametrize("optimise", [False, True])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_plan_of_another_robot_holds(name: str, optimise: bool) -> None:
-    planner = PickPlacePlanner(cell_of(name), PlannerConfig(optimise=optimise))
+    planner = PickPlacePlanner(cell_of(name), PlannerConfig(optimize=optimise))
     by_name = {o.name: o for o in PILE}
     for pick, x, y, turn in MOVES:
         place = place_of(by_name[pick], x, y, turn)
         plan = planner.plan(PILE, pick, place)
-        assert isinstance(plan, Plan), f"{pick}: {plan}"
+        assert isinstance(plan, PickPlacePlan), f"{pick}: {plan}"
         assert rigid_transform(plan.X_TO_place).IsNearlyEqualTo(rigid_transform(place), 1e-12)
         limits_hold(planner, plan)
         nothing_is_hit(planner, plan)
         ends_are_right(planner, plan)
-        axis = planner.tool.axis(samples(plan.phases[1]))
+        axis = planner.tool.axis(samples(plan.segments[1]))
         tilt = np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), -axis[:, 2])
         assert np.degrees(tilt).max() < 1.0
-        assert plan.duration < (0.95 if optimise else 1.01) * plan.sure
+        assert plan.duration < (0.95 if optimise else 1.01) * plan.unoptimized_duration
 
 
 @pytest.mark.parametrize("name", ["iiwa14", "ur5e"])
 def test_an_object_is_lowered_by_another_robot(name: str) -> None:
-    config = PlannerConfig(optimise=False, descent=0.04, above=0.02)
+    config = PlannerConfig(optimize=False, max_guarded_descent=0.04, descent_start_offset=0.02)
     planner = PickPlacePlanner(cell_of(name), config)
     box = PILE[0]
     plan = planner.plan(PILE, box.name, place_of(box, 0.15, -0.15, 0.3))
-    assert isinstance(plan, Plan)
-    assert plan.descent is not None
-    assert plan.depth >= 0.02
-    q = plan.descent.vector_values(np.linspace(0.0, plan.descent.end_time(), 20)).T
-    carry = plan.phases[1].trajectory
+    assert isinstance(plan, PickPlacePlan)
+    assert plan.guarded_descent is not None
+    assert plan.max_descent >= 0.02
+    q = plan.guarded_descent.vector_values(np.linspace(0.0, plan.guarded_descent.end_time(), 20)).T
+    carry = plan.segments[1].trajectory
     assert q[0] == pytest.approx(carry.value(carry.end_time()).ravel(), abs=1e-9)
     p_TG = planner.tool.pose(q)[:, :3, 3]
     assert np.abs(p_TG[:, :2] - p_TG[0, :2]).max() < 1e-4
-    assert p_TG[0, 2] - p_TG[-1, 2] == pytest.approx(plan.depth, abs=1e-4)
+    assert p_TG[0, 2] - p_TG[-1, 2] == pytest.approx(plan.max_descent, abs=1e-4)
 
 
 def test_gradients_of_distances_of_seven_joints() -> None:
     planner, draw, step = PickPlacePlanner(cell_of("iiwa14"), PlannerConfig()), rng(0), 1e-5
-    scene, checked = planner.clearance_scene(PILE[:2]), 0
+    scene, checked = planner.collision_model(PILE[:2]), 0
     for _ in range(20):
         q = planner.tool.robot.home + draw.normal(0.0, 0.2, 7)
-        for here, gradient in scene.gradients(q, 0.3):
+        for here, gradient in scene.distances_and_gradients(q, 0.3):
             sides = []
             for joint in range(7):
-                moved = [scene.close(q + sign * step * np.eye(7)[joint], 0.31) for sign in (1, -1)]
+                moved = [
+                    scene.distances_below(q + sign * step * np.eye(7)[joint], 0.31)
+                    for sign in (1, -1)
+                ]
                 ahead, behind = (
                     [c.distance for c in found if c.pair == here.pair] for found in moved
                 )
@@ -163,17 +171,17 @@ def test_a_fixture_of_the_cell_is_avoided() -> None:
     free = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan([box], box.name, X_TO)
     passed = between.plan([box], box.name, X_TO)
 
-    def nearest(plan: Plan | NoPlan) -> float:
-        assert isinstance(plan, Plan)
-        scene = between.clearance_scene([box])
-        scene.hold(box.name, plan.X_OG)
-        found = [here for q in samples(plan.phases[1]) for here in scene.close(q, 0.3)]
+    def nearest(plan: PickPlacePlan | PlanningFailure) -> float:
+        assert isinstance(plan, PickPlacePlan)
+        scene = between.collision_model([box])
+        scene.attach_object(box.name, plan.X_OG)
+        found = [here for q in samples(plan.segments[1]) for here in scene.distances_below(q, 0.3)]
         return min(here.distance for here in found if here.pair[1] == "wall")
 
     assert nearest(free) < 0, "the wall is in the way"
-    assert nearest(passed) > PlannerConfig().clearance - 0.001
+    assert nearest(passed) > PlannerConfig().min_distance - 0.001
     there = PickPlacePlanner(with_wall((0.20, -0.25, 0.3), (0.1, 0.1, 0.6)), PlannerConfig())
     found = there.plan([box], box.name, X_TO)
-    assert isinstance(found, NoPlan)
-    assert found.reason is PlanFailure.IN_COLLISION
-    assert "wall" in found.about
+    assert isinstance(found, PlanningFailure)
+    assert found.reason is PlanningFailureReason.IN_COLLISION
+    assert "wall" in found.detail

@@ -10,7 +10,7 @@ from test_docs import ROOT, blocks
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, load_config
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import NoPlan, PlanFailure
+from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand, Verdict
 from drake_clutter.scenes.placement import free_places
@@ -104,9 +104,9 @@ def test_the_arm_reaches_in_or_says_why_not(
     scene = Scene((picked, resting("cracker_box", xy=(0.1, -0.2))), world.cell.support)
     X_TO_place = picked.X_TO.moved((0.02, -0.12, 0.001))
     command = PickPlaceCommand(Move(picked.name), picked.X_TO, X_TO_place)
-    executor = ArmExecutor(world, planner=PlannerConfig(optimise=False))
+    executor = ArmExecutor(world, planner_config=PlannerConfig(optimize=False))
     assert executor.execute(scene, command, rng()).result is result
     plan = executor.plan(scene, command)
-    if isinstance(plan, NoPlan):
-        assert plan.reason is PlanFailure.IN_COLLISION
-        assert "board" in plan.about
+    if isinstance(plan, PlanningFailure):
+        assert plan.reason is PlanningFailureReason.IN_COLLISION
+        assert "board" in plan.detail

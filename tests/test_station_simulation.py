@@ -13,9 +13,9 @@ from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.files import InputError
-from drake_clutter.planning.clearance import ClearanceScene
-from drake_clutter.planning.plan import Plan
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports import recording
 from drake_clutter.resources import resource_path
@@ -38,12 +38,12 @@ CELL = cell_with(
 """Base, tool and camera are elsewhere than in the default cell."""
 
 
-def planned(cell: WorkCell = CELL) -> Plan:
+def planned(cell: WorkCell = CELL) -> PickPlacePlan:
     box = SCENE["pudding_box"].X_TO
     X_TO = Pose((0.0, -0.2, box.translation[2] + 0.001), box.quaternion)
-    planner = PickPlacePlanner(cell, PlannerConfig(optimise=False))
+    planner = PickPlacePlanner(cell, PlannerConfig(optimize=False))
     plan = planner.plan(SCENE.objects, "pudding_box", X_TO)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     return plan
 
 
@@ -103,9 +103,9 @@ def test_one_plan_after_the_other() -> None:
     first = simulation.execute(planned())
     assert (simulation.finished, simulation.is_moving, first.came_off) == (1, False, False)
     place = Pose((0.0, 0.2, 0.0185), simulation.scene["pudding_box"].X_TO.quaternion)
-    planner = PickPlacePlanner(CELL, PlannerConfig(optimise=False))
+    planner = PickPlacePlanner(CELL, PlannerConfig(optimize=False))
     plan = planner.plan(simulation.scene.objects, "pudding_box", place)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     second = simulation.execute(plan, record=True)
     assert simulation.finished == 2
     assert second.poses["pudding_box"].p[:2] == pytest.approx(place.p[:2], abs=0.003)
@@ -155,8 +155,8 @@ def test_a_fixture_with_a_model_is_an_obstacle(tmp_path: Path) -> None:
     for _ in range(8):
         simulation.step()
     assert simulation.scene["gelatin_box"].X_TO.p == pytest.approx(scene["gelatin_box"].X_TO.p)
-    around = ClearanceScene(cell, [])
-    near = around.close(np.array(cell.robot.home), 1.0)
+    around = CollisionModel(cell, [])
+    near = around.distances_below(np.array(cell.robot.home), 1.0)
     assert any("shelf" in clearance.pair for clearance in near)
 
 
@@ -174,8 +174,8 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
         Fixture(name=name, model=str(path), pose=PoseSpec(translation=(0.6, 0.3 * k, 0.25)))
         for k, name in enumerate(names)
     )
-    around = ClearanceScene(CELL.model_copy(update={"fixtures": posts}), [])
-    near = around.close(np.array(CELL.robot.home), 3.0)
+    around = CollisionModel(CELL.model_copy(update={"fixtures": posts}), [])
+    near = around.distances_below(np.array(CELL.robot.home), 3.0)
     assert all(any(name in clearance.pair for clearance in near) for name in names)
     assert around.fixture_tops == pytest.approx([0.5] * 4)
     nailed = tmp_path / "nailed.urdf"
@@ -184,7 +184,7 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"
     ):
-        ClearanceScene(with_board(nailed, 0.3), [])
+        CollisionModel(with_board(nailed, 0.3), [])
 
 
 def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:

@@ -123,12 +123,12 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
     assert told.exit_code == 0, told.output
     planned, refused = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
     assert planned["planned"]
-    assert [phase["name"] for phase in planned["phases"]] == ["approach", "carry", "retreat"]
-    assert planned["phases"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
-    assert len(planned["phases"][1]["q"]) == len(planned["phases"][1]["time"])
-    assert (refused["planned"], refused["reason"], refused["about"]) == (
+    assert [segment["name"] for segment in planned["segments"]] == ["approach", "carry", "retreat"]
+    assert planned["segments"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
+    assert len(planned["segments"][1]["q"]) == len(planned["segments"][1]["time"])
+    assert (refused["planned"], refused["reason"], refused["detail"]) == (
         False,
         "no seal",
         "large_marker",
     )
-    assert refused["number"] is None, "its lip would be partly in the air"
+    assert refused["value"] is None, "its lip would be partly in the air"

@@ -10,8 +10,12 @@ from conftest import DEFAULT_CELL, resting, scene_of
 
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.interfaces import Observation
@@ -76,22 +80,22 @@ def test_what_something_unknown_may_lie_on() -> None:
     assert not under_nameless([LOWER, UPPER], seen([LOWER, UPPER]), EMPTY)
 
 
-def highest(plan: Plan) -> float:
+def highest(plan: PickPlacePlan) -> float:
     """m, of the cup while it carries."""
-    carry = plan.phases[1]
+    carry = plan.segments[1]
     q = carry.trajectory.vector_values(np.linspace(0, carry.duration, 40)).T
     return float(ToolKinematics(DEFAULT_CELL).pose(q)[:, 2, 3].max())
 
 
 def test_plans_keep_clear_of_what_is_unseen() -> None:
-    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimise=False))
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
     place = Pose((0.2, -0.2, LOWER.X_TO.translation[2] + 0.001), LOWER.X_TO.quaternion)
     between = UnseenBlock((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)
     low, high = (planner.plan([LOWER], LOWER.name, place, unseen) for unseen in ((), (between,)))
-    assert isinstance(low, Plan)
-    assert isinstance(high, Plan)
+    assert isinstance(low, PickPlacePlan)
+    assert isinstance(high, PickPlacePlan)
     assert highest(high) > highest(low) + 0.05, "it is carried over the block"
     there = UnseenBlock((0.2, -0.2, 0.1), (0.2, 0.2, 0.2), 0.0)
     blocked = planner.plan([LOWER], LOWER.name, place, (there,))
-    assert isinstance(blocked, NoPlan)
-    assert blocked.reason is PlanFailure.IN_COLLISION
+    assert isinstance(blocked, PlanningFailure)
+    assert blocked.reason is PlanningFailureReason.IN_COLLISION

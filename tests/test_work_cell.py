@@ -14,8 +14,8 @@ from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.commands.render import render_scene
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.planning.plan import Plan
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.station.station_simulation import StationSimulation
 
@@ -105,10 +105,10 @@ def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
     cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
     objects = (resting("sugar_box"), resting("pudding_box", xy=(0.2, 0.0)))
     X_TO_place = objects[0].X_TO.moved((0.0, -0.2, 0.001))
-    plan = PickPlacePlanner(cell, PlannerConfig(optimise=False)).plan(
+    plan = PickPlacePlanner(cell, PlannerConfig(optimize=False)).plan(
         objects, "sugar_box", X_TO_place
     )
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, PickPlacePlan)
     done = StationSimulation(cell, scene_of(*objects)).execute(plan)
     assert done.poses["sugar_box"].p == pytest.approx(
         objects[0].X_TO.moved((0.0, -0.2, 0.0)).p, abs=2e-3

@@ -11,7 +11,11 @@ from drake_clutter.agents.exploration import make_explorers
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, input_error, write_json
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import NoPlan, PlanFailure, plan_fields
+from drake_clutter.planning.pick_place_plan import (
+    PlanningFailure,
+    PlanningFailureReason,
+    plan_to_dict,
+)
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import resolve_placement
@@ -139,14 +143,14 @@ def plan_only(
         _check_names(moves, number, [d.name for d in look.observation.detections], scene)
         command = resolve_placement(move, look.observation, config.exploration, rng)
         found = (
-            NoPlan(PlanFailure.NO_FREE_SPOT, move.place)
+            PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, move.place)
             if command is None
             else executor.plan(
                 scene,
                 command,
             )
         )
-        plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_fields(found)})
+        plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(found)})
     write_json(
         out / "plan.json",
         {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans},

@@ -20,7 +20,7 @@ from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, prepare_output_directory, write_json, write_text
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.reachability import Reachability, base_scores
+from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
 from drake_clutter.reports.feasibility_report import write_report
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, Scene
@@ -219,7 +219,7 @@ class Worker:
         cell = self._job.setups[part.setup]
         if part.base_x is not None:
             places = [(part.base_x, y) for y in BASE_Y]
-            scores = zip(places, base_scores(cell, places), strict=True)
+            scores = zip(places, score_base_positions(cell, places), strict=True)
             return {
                 "bases": [
                     {"x": x, "y": y, "share": share, "manipulability": best}
@@ -231,28 +231,28 @@ class Worker:
         return self._moves(part.setup, part.scene)
 
     def _reach(self, cell: WorkCell) -> dict[str, Any]:
-        reachability = Reachability(cell)
-        found = reachability.map(HEIGHTS, SPACING)
+        reachability = ReachabilityAnalysis(cell)
+        found = reachability.compute_map(HEIGHTS, SPACING)
         targets = []
         for target in self._job.targets:
             X = np.eye(4)
             X[:3, :3], X[:3, 3] = target.X_TG.rotation, target.X_TG.p
-            reach = reachability.poses(X[None])
-            q = reach.q[0].tolist() if reach.branches[0] else None
+            reach = reachability.analyze_poses(X[None])
+            q = reach.q[0].tolist() if reach.num_solutions[0] else None
             targets.append(
                 {
                     "target": target.name,
-                    "branches": int(reach.branches[0]),
+                    "branches": int(reach.num_solutions[0]),
                     "manipulability": float(reach.manipulability[0]),
                     "q": q,
-                    "in_the_way": reach.in_the_way[0],
+                    "in_the_way": reach.blocking_bodies[0],
                 }
             )
         return {
             "x": found.x.tolist(),
             "y": found.y.tolist(),
             "heights": list(found.heights),
-            "share": found.share.tolist(),
+            "share": found.reachable_fraction.tolist(),
             "manipulability": found.manipulability.tolist(),
             "targets": targets,
         }
@@ -264,7 +264,7 @@ class Worker:
             return {"scene": path.stem, "unstable": True, "moves": [], "noise": []}
         if setup not in self._studies:
             world = replace(self._job.world, cell=self._job.setups[setup])
-            planner = PlannerConfig(optimise=False, time_limit=TIME_LIMIT)
+            planner = PlannerConfig(optimize=False, time_limit=TIME_LIMIT)
             self._studies[setup] = FeasibilityStudy(setup, world, planner, self._job.seed)
         study = self._studies[setup]
         rows = study.moves(path.stem, number, scene)

@@ -10,48 +10,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.tool_kinematics import downwards
+from drake_clutter.planning.tool_kinematics import downward_pose
 
 Floats = NDArray[np.float64]
 
-YAWS = 12
-MARGIN = 0.05
+NUM_YAWS = 12
+WALL_MARGIN = 0.05
 """m, from the tray's rim: no object's middle comes closer."""
 
 
 @dataclass(frozen=True)
-class Reach:
+class ReachabilityResult:
     """How poses of the cup are reached.
 
     Attributes:
-        branches: (n,) solutions without collision.
+        num_solutions: (n,) solutions without collision.
         manipulability: (n,) m^3, the best of them; 0 where there is none.
         q: (n, joints) rad, of that one; NaN where there is none.
-        in_the_way: what the arm would hit where it reaches a pose, but only with collision; else "".
+        blocking_bodies: what the arm would hit where it reaches a pose, but only with collision; else "".
     """
 
-    branches: NDArray[np.int64]
+    num_solutions: NDArray[np.int64]
     manipulability: Floats
     q: Floats
-    in_the_way: tuple[str, ...]
+    blocking_bodies: tuple[str, ...]
 
 
-class Reachability:
+class ReachabilityAnalysis:
     """Of an arm in its cell."""
 
     def __init__(self, cell: WorkCell) -> None:
         """Makes the empty cell."""
         self._cell = cell
         self._planner = PickPlacePlanner(cell, PlannerConfig())
-        self._scene = self._planner.clearance_scene(())
-        self._least = self._planner.planner.clearance
+        self._collision_model = self._planner.collision_model(())
+        self._min_distance = self._planner.config.min_distance
 
-    def poses(self, X_TG: Floats) -> Reach:
+    def analyze_poses(self, X_TG: Floats) -> ReachabilityResult:
         """Of poses (n, 4, 4) of the cup."""
         robot = self._planner.tool.robot
-        q = self._planner.tool.solve(X_TG)
+        q = self._planner.tool.solve_ik(X_TG)
         worth = np.nan_to_num(robot.manipulability(q), nan=-1.0)
         count, best = np.zeros(len(q), int), np.zeros(len(q))
         best_q, in_the_way = np.full((len(q), robot.num_joints), np.nan), [""] * len(q)
@@ -60,7 +60,7 @@ class Reachability:
                 if worth[k, branch] < 0:
                     break
                 at = robot.unwrap(q[k, branch], robot.home)
-                if hit := self._scene.close(at, self._least):
+                if hit := self._collision_model.distances_below(at, self._min_distance):
                     in_the_way[k] = in_the_way[k] or " and ".join(
                         min(hit, key=lambda c: c.distance).pair
                     )
@@ -68,14 +68,14 @@ class Reachability:
                 if count[k] == 0:
                     best[k], best_q[k] = worth[k, branch], at
                 count[k] += 1
-        return Reach(
+        return ReachabilityResult(
             count,
             best,
             best_q,
             tuple("" if n else hit for n, hit in zip(count, in_the_way, strict=True)),
         )
 
-    def map(self, heights: Sequence[float], spacing: float) -> "ReachMap":
+    def compute_map(self, heights: Sequence[float], spacing: float) -> "ReachabilityMap":
         """Of a cup that points down, over the tray.
 
         Args:
@@ -83,46 +83,49 @@ class Reachability:
             spacing: m, of the grid.
         """
         half_size = self._cell.support.half_size
-        ends = np.maximum(half_size - MARGIN, half_size / 2).tolist()
+        ends = np.maximum(half_size - WALL_MARGIN, half_size / 2).tolist()
         along_x, along_y = (
             np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in ends
         )
         share, best = np.zeros((2, len(heights), len(along_x), len(along_y)))
-        yaws = np.arange(YAWS) * (2 * np.pi / YAWS)
+        yaws = np.arange(NUM_YAWS) * (2 * np.pi / NUM_YAWS)
         for k, height in enumerate(heights):
             for i, x in enumerate(along_x):
                 for j, y in enumerate(along_y):
-                    found = self.poses(
-                        np.array([downwards(yaw, np.array([x, y, height])) for yaw in yaws])
+                    found = self.analyze_poses(
+                        np.array([downward_pose(yaw, np.array([x, y, height])) for yaw in yaws])
                     )
-                    share[k, i, j] = np.mean(found.branches > 0)
+                    share[k, i, j] = np.mean(found.num_solutions > 0)
                     best[k, i, j] = found.manipulability.max()
-        return ReachMap(tuple(heights), along_x, along_y, share, best)
+        return ReachabilityMap(tuple(heights), along_x, along_y, share, best)
 
 
 @dataclass(frozen=True)
-class ReachMap:
+class ReachabilityMap:
     """Where over the tray a cup that points down can go.
 
     Attributes:
         heights: m. x: (n,) m, in T. y: (m,) m, in T.
-        share: (heights, n, m) of the yaws that are reached; manipulability: m^3, the best at any of them. By height, x, y.
+        reachable_fraction: (heights, n, m) of the yaws that are reached.
+        manipulability: m^3, the best at any of them. By height, x, y.
     """
 
     heights: tuple[float, ...]
     x: Floats
     y: Floats
-    share: Floats
+    reachable_fraction: Floats
     manipulability: Floats
 
 
-def base_scores(cell: WorkCell, places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def score_base_positions(
+    cell: WorkCell, positions: Sequence[tuple[float, float]]
+) -> list[tuple[float, float]]:
     """For bases at (x, y) m, as high and turned as the config's: the mean share that is reached, and the mean manipulability.
 
     A base in or over the tray scores nothing.
     """
     found = []
-    for x, y in places:
+    for x, y in positions:
         base = cell.robot.base.model_copy(
             update={"translation": (x, y, cell.robot.base.translation[2])}
         )
@@ -130,6 +133,8 @@ def base_scores(cell: WorkCell, places: Sequence[tuple[float, float]]) -> list[t
         if moved.pedestal_in_support:
             found.append((0.0, 0.0))
             continue
-        reached = Reachability(moved).map((0.05, 0.25, 0.45), 0.15)
-        found.append((float(reached.share.mean()), float(reached.manipulability.mean())))
+        reached = ReachabilityAnalysis(moved).compute_map((0.05, 0.25, 0.45), 0.15)
+        found.append(
+            (float(reached.reachable_fraction.mean()), float(reached.manipulability.mean()))
+        )
     return found

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.paths import SPACING, straight
+from drake_clutter.planning.time_parameterization import MAX_JOINT_STEP, linear_joint_path
 from drake_clutter.robots.robot_model import RobotModel, load_robot
 
 Floats = NDArray[np.float64]
 
-_STEP = 0.02
+_MAX_POSE_STEP = 0.02
 """Between neighboring poses of a straight line [m]."""
 
 
-def inverse(X_AB: Floats) -> Floats:
+def invert_pose(X_AB: Floats) -> Floats:
     """Return X_BA, (4, 4), of X_AB (4, 4)."""
     X_AB = np.ascontiguousarray(X_AB)
     X = np.eye(4)
@@ -29,7 +29,7 @@ def inverse(X_AB: Floats) -> Floats:
     return X
 
 
-def downwards(yaw: float, p_TG: Floats) -> Floats:
+def downward_pose(yaw: float, p_TG: Floats) -> Floats:
     """Return X_TG, (4, 4), of a gripper that points down.
 
     Args:
@@ -43,26 +43,32 @@ def downwards(yaw: float, p_TG: Floats) -> Floats:
     return X
 
 
-def lifted(X_TG: Floats, height: float) -> Floats:
+def raise_pose(X_TG: Floats, height: float) -> Floats:
     """Return a pose (4, 4) that is higher by `height` [m]."""
     X = X_TG.copy()
     X[2, 3] += height
     return X
 
 
-def _column(X_TG: Floats, top: float) -> Floats:
+def _vertical_line(X_TG: Floats, top: float) -> Floats:
     """Return poses (m, 4, 4) straight up to a height [m]."""
-    heights = np.linspace(X_TG[2, 3], top, max(2, math.ceil((top - X_TG[2, 3]) / _STEP) + 1))
+    heights = np.linspace(
+        X_TG[2, 3], top, max(2, math.ceil((top - X_TG[2, 3]) / _MAX_POSE_STEP) + 1)
+    )
     X = np.broadcast_to(X_TG, (len(heights), 4, 4)).copy()
     X[:, 2, 3] = heights
     return X
 
 
-def _line(X_TG: Floats, X_TG_end: Floats) -> Floats:
+def _straight_line(X_TG: Floats, X_TG_end: Floats) -> Floats:
     """Return poses (m, 4, 4) on a straight line that turn evenly about the vertical."""
     turn = X_TG_end[:3, :3] @ X_TG[:3, :3].T
     angle, shift = math.atan2(turn[1, 0], turn[0, 0]), X_TG_end[:3, 3] - X_TG[:3, 3]
-    count = max(2, math.ceil(max(float(np.linalg.norm(shift)) / _STEP, abs(angle) / SPACING)) + 1)
+    count = max(
+        2,
+        math.ceil(max(float(np.linalg.norm(shift)) / _MAX_POSE_STEP, abs(angle) / MAX_JOINT_STEP))
+        + 1,
+    )
     X = np.empty((count, 4, 4))
     for k, share in enumerate(np.linspace(0.0, 1.0, count)):
         c, s = math.cos(share * angle), math.sin(share * angle)
@@ -73,23 +79,23 @@ def _line(X_TG: Floats, X_TG_end: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class CarryWay:
+class CarryPath:
     """A way from a grasp over a height to a place.
 
     Attributes:
-        up: Straight up from the grasp. Shape (k, n).
-        across: From the end of `up` to that of `down`. Shape (l, n).
-        down: Straight up from the place. Shape (m, n).
+        lift: Straight up from the grasp. Shape (k, n).
+        transfer: From the end of `lift` to that of `reversed_lowering`. Shape (l, n).
+        reversed_lowering: Straight up from the place. Shape (m, n).
     """
 
-    up: Floats
-    across: Floats
-    down: Floats
+    lift: Floats
+    transfer: Floats
+    reversed_lowering: Floats
 
     @property
-    def whole(self) -> Floats:
+    def waypoints(self) -> Floats:
         """From the grasp to the place, each configuration once."""
-        return np.vstack([self.up, self.across[1:-1], self.down[::-1]])
+        return np.vstack([self.lift, self.transfer[1:-1], self.reversed_lowering[::-1]])
 
 
 class ToolKinematics:
@@ -118,25 +124,25 @@ class ToolKinematics:
         """Return the gripper's z axis in T, (..., 3), at joint positions (..., n)."""
         return self.pose(q)[..., :3, 2]
 
-    def solve(self, X_TG: Floats) -> Floats:
+    def solve_ik(self, X_TG: Floats) -> Floats:
         """Return joint positions (..., K, n) at poses (..., 4, 4), see `InverseKinematics`."""
-        return self.robot.ik.solve(self._flange(X_TG))
+        return self.robot.ik.solve(self._flange_pose(X_TG))
 
     def track(self, X_TG: Floats, q_start: Floats) -> Floats | None:
         """Return the path (m, n) along poses (m, 4, 4), see `InverseKinematics`."""
-        return self.robot.ik.track(self._flange(X_TG), q_start)
+        return self.robot.ik.track(self._flange_pose(X_TG), q_start)
 
-    def _flange(self, X_TG: Floats) -> Floats:
+    def _flange_pose(self, X_TG: Floats) -> Floats:
         return np.asarray(self._X_BT @ X_TG @ self._X_GF)
 
-    def carry(
+    def carry_path(
         self,
         X_pick: Floats,
         X_place: Floats,
-        top: float,
+        transfer_height: float,
         q_pick: Floats,
         q_place: Floats,
-    ) -> CarryWay | str:
+    ) -> CarryPath | str:
         """Return a way from a grasp to a place on which the gripper points down.
 
         A robot with `vertical_tool_rows` keeps it so on a straight line in joint space. Any other
@@ -145,29 +151,31 @@ class ToolKinematics:
         Args:
             X_pick: X_TG at the grasp. Shape (4, 4).
             X_place: X_TG at the place. Shape (4, 4).
-            top: Height of G in between [m].
+            transfer_height: Height of G in between [m].
             q_pick: At the grasp. Shape (n,).
             q_place: At the place, for a robot with `vertical_tool_rows`. Shape (n,).
 
         Returns:
             The way, or what is out of reach.
         """
-        up = self.track(_column(X_pick, top), q_pick)
+        up = self.track(_vertical_line(X_pick, transfer_height), q_pick)
         if up is None:
             return "above the grasp"
-        above = _column(X_place, top)
+        above = _vertical_line(X_place, transfer_height)
         if self.robot.vertical_tool_rows is not None:
             down = self.track(above, q_place)
             if down is None:
                 return "above the place"
-            return CarryWay(up, straight(up[-1], down[-1]), down)
-        across = self.track(_line(_column(X_pick, top)[-1], above[-1]), up[-1])
+            return CarryPath(up, linear_joint_path(up[-1], down[-1]), down)
+        across = self.track(
+            _straight_line(_vertical_line(X_pick, transfer_height)[-1], above[-1]), up[-1]
+        )
         if across is None:
             return "between grasp and place"
         lowered = self.track(above[::-1], across[-1])
-        return "above the place" if lowered is None else CarryWay(up, across, lowered[::-1])
+        return "above the place" if lowered is None else CarryPath(up, across, lowered[::-1])
 
-    def homewards(self, q: Floats) -> list[Floats]:
+    def paths_home(self, q: Floats) -> list[Floats]:
         """Return ways home, (m, n) each.
 
         The first is straight. The second stays at the same height until G is, seen from above,
@@ -176,7 +184,7 @@ class ToolKinematics:
         home = self.robot.home
         X_TG_home, X_TG = self.pose(home), self.pose(q)
         X_TG[:2, 3] = X_TG_home[:2, 3]
-        back, direct = self.robot.ik.follow(self._flange(X_TG), q), straight(q, home)
+        back, direct = self.robot.ik.follow(self._flange_pose(X_TG), q), linear_joint_path(q, home)
         if back is None:
             return [direct]
-        return [direct, np.vstack([straight(q, back), straight(back, home)[1:]])]
+        return [direct, np.vstack([linear_joint_path(q, back), linear_joint_path(back, home)[1:]])]

@@ -21,8 +21,8 @@ from pydrake.math import RigidTransform
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_text
-from drake_clutter.planning.plan import Plan
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.reports.arm_pictures import strip
@@ -400,10 +400,10 @@ def _worst(
         pictures = [camera.annotated(scene, Marks(moved=row["pick"], X_T_placed=X_TO))]
         if row["result"] == PLANNED and X_TO is not None:
             planner = PickPlacePlanner(
-                cell.with_support(scene.support), PlannerConfig(optimise=False)
+                cell.with_support(scene.support), PlannerConfig(optimize=False)
             )
             plan = planner.plan(scene.objects, row["pick"], X_TO)
-            if isinstance(plan, Plan):
+            if isinstance(plan, PickPlacePlan):
                 pictures.append(strip(scene, _moments(plan, scene, cell), cell))
         images = "".join(_embedded(_png(picture), told) for picture in pictures)
         parts.append(
@@ -412,9 +412,9 @@ def _worst(
     return parts
 
 
-def _moments(plan: Plan, scene: Scene, cell: WorkCell) -> list[Frame]:
+def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[Frame]:
     """At the grasp, in the middle of the way, and at the place."""
-    carry, frames = plan.phases[1].trajectory, []
+    carry, frames = plan.segments[1].trajectory, []
     tool = ToolKinematics(cell)
     for time in (0.0, carry.end_time() / 2, carry.end_time()):
         q = carry.value(time).ravel()

@@ -30,15 +30,17 @@ def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for plan in plans:
         move = f"{plan['move']['pick']} to {plan['move']['place']}"
         if plan["planned"]:
-            parts = [f"{phase['name']} {phase['duration']:.2f} s" for phase in plan["phases"]]
+            parts = [
+                f"{segment['name']} {segment['duration']:.2f} s" for segment in plan["segments"]
+            ]
             nearest = min(
-                (phase["clearance"] for phase in plan["phases"] if phase["clearance"] is not None),
+                (s["min_distance"] for s in plan["segments"] if s["min_distance"] is not None),
                 default=None,
             )
             clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
-            words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['seconds']:.2f} s"
+            words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['planning_time']:.2f} s"
         else:
             words[move] = (
-                f"no plan: {plan['reason']}{': ' + plan['about'] if plan['about'] else ''}"
+                f"no plan: {plan['reason']}{': ' + plan['detail'] if plan['detail'] else ''}"
             )
     return words

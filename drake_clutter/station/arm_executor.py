@@ -7,8 +7,8 @@ import numpy as np
 
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig, SettleConfig
-from drake_clutter.planning.plan import NoPlan, Plan
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import touching_groups
 from drake_clutter.scenes.interfaces import Instability, MoveResult, Outcome, PickPlaceCommand
@@ -17,7 +17,7 @@ from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import fallen, settle
 from drake_clutter.station.station_simulation import StationSimulation
 
-UNTOUCHED = 1e-4
+MIN_DISPLACEMENT = 1e-4
 """m; what moved less is not settled again."""
 
 
@@ -28,18 +28,20 @@ class ArmExecutor:
     has moved or turned past the limits, or the picked one past them from where it was let go.
     """
 
-    def __init__(self, config: ClutterConfig, *, planner: PlannerConfig | None = None) -> None:
+    def __init__(
+        self, config: ClutterConfig, *, planner_config: PlannerConfig | None = None
+    ) -> None:
         """Makes an executor."""
         self._config = config
-        self._planner_config = planner or PlannerConfig()
+        self._planner_config = planner_config or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
-    def plan(self, scene: Scene, command: PickPlaceCommand) -> Plan | NoPlan:
+    def plan(self, scene: Scene, command: PickPlaceCommand) -> PickPlacePlan | PlanningFailure:
         """Return the plan for a command, or why there is none."""
-        planner = self.planner(scene.support)
+        planner = self.planner_for(scene.support)
         return planner.plan(scene.objects, command.move.pick, command.X_TO_place)
 
-    def planner(self, support: Support) -> PickPlacePlanner:
+    def planner_for(self, support: Support) -> PickPlacePlanner:
         """For a tray; kept."""
         if self._planner is None or self._planner.cell.support != support:
             self._planner = PickPlacePlanner(
@@ -50,7 +52,7 @@ class ArmExecutor:
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         plan = self.plan(scene, command)
-        if isinstance(plan, NoPlan):
+        if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
         done = StationSimulation(self._config.cell, scene).execute(plan, record=True)
         X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -done.lowered_distance))
@@ -78,7 +80,7 @@ def judged(
         moved = {
             o.name
             for o in before.objects
-            if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > UNTOUCHED
+            if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > MIN_DISPLACEMENT
         } | {pick}
         for group in touching_groups(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):

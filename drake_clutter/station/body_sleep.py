@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.systems.framework import Context
 
-from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.geometry import carried, touching_groups
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
@@ -34,7 +34,9 @@ def nearest(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
     return min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - X_TO.p)))
 
 
-def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str], set[str]]:
+def affected_bodies(
+    objects: Sequence[SceneObject], plan: PickPlacePlan
+) -> tuple[set[str], set[str]]:
     """Return the names of what picking, and of what placing may disturb.
 
     These are the stacks that are taken from, put on, or come close to. The picked object is in
@@ -42,7 +44,7 @@ def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[set[str
     """
     picked = nearest(objects, plan.X_TO_pick)
     X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
-    lowered = np.linspace(0.0, plan.depth, math.ceil(plan.depth / _DESCENT_STEP) + 1)
+    lowered = np.linspace(0.0, plan.max_descent, math.ceil(plan.max_descent / _DESCENT_STEP) + 1)
     placed = [
         replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()
     ]

@@ -9,8 +9,12 @@ from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomia
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.paths import dynamics_plant, motion, torques
-from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.time_parameterization import (
+    dynamics_plant,
+    inverse_dynamics,
+    sample_motion,
+)
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +53,7 @@ class CommandSchedule:
 
 
 def build_command_schedule(
-    plan: Plan, cell: WorkCell, contact_time: float = math.inf
+    plan: PickPlacePlan, cell: WorkCell, contact_time: float = math.inf
 ) -> CommandSchedule:
     """Return a plan's phases one after the other, with dwells at the ends of the carry.
 
@@ -58,13 +62,13 @@ def build_command_schedule(
         cell: Where.
         contact_time: When the descent ends [s]; then the arm rises as far as it went down.
     """
-    approach, carry, retreat = plan.phases
+    approach, carry, retreat = plan.segments
     parts, t_parts = list[Floats](), list[Floats]()
     starts, time = list[tuple[str, float]](), 0.0
     empty, loaded = Payload(), Payload(plan.mass, plan.p_GCm)
     put_down = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
-    if plan.descent is not None:
-        down = _until(plan.descent, contact_time)
+    if plan.guarded_descent is not None:
+        down = _until(plan.guarded_descent, contact_time)
         descend, rise = ("descend", down, loaded), ("rise", _reversed(down), empty)
         put_down = [("steady", None, loaded), descend, *put_down, rise]
     for name, trajectory, payload in (
@@ -77,13 +81,15 @@ def build_command_schedule(
         starts.append((name, time))
         duration = float(trajectory.end_time()) if trajectory else DWELL
         if trajectory:
-            q, v, a = motion(trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
+            q, v, a = sample_motion(trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
         else:
             num_joints = approach.trajectory.rows()
             q = np.repeat(parts[-1][-1:, :num_joints], 2, axis=0)
             v = a = np.zeros_like(q)
         t_parts.append(time + np.linspace(0.0, duration, len(q)))
-        parts.append(np.column_stack([q, v, torques(dynamics_plant(cell, payload), q, v, a)]))
+        parts.append(
+            np.column_stack([q, v, inverse_dynamics(dynamics_plant(cell, payload), q, v, a)])
+        )
         time += duration
     at = dict(starts)
     # Neighbouring parts share a time: the later sample is left a moment later.

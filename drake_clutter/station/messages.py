@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from drake_clutter.cell.work_cell import default_cell
-from drake_clutter.planning.plan import NoPlan, Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
 
@@ -56,7 +56,7 @@ class PlanResponse(Message):
         plan: Or why there is none; None in the message with number 0 alone.
     """
 
-    plan: Plan | NoPlan | None = field(default=None, repr=False)
+    plan: PickPlacePlan | PlanningFailure | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PlannedMove(Message):
         plan: None in the message with number 0 alone.
     """
 
-    plan: Plan | None = field(default=None, repr=False)
+    plan: PickPlacePlan | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from pydrake.systems.framework import (
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.paths import dynamics_plant, torques
-from drake_clutter.planning.plan import DESCENT_SPEED, Plan
+from drake_clutter.planning.pick_place_plan import DESCENT_SPEED, PickPlacePlan
+from drake_clutter.planning.time_parameterization import dynamics_plant, inverse_dynamics
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.station.command_schedule import CommandSchedule, build_command_schedule
 from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
@@ -48,7 +48,7 @@ class ExecutorState(Message):
         contact_time: Of the descent, until something was touched [s]; infinite if nothing was.
     """
 
-    plan: Plan | None = None
+    plan: PickPlacePlan | None = None
     schedule: CommandSchedule | None = None
     start_time: float = 0.0
     bellows_extension: float = math.nan
@@ -59,7 +59,7 @@ class ExecutorState(Message):
         """By which the object is let go below its planned pose [m]."""
         if self.plan is None:
             return 0.0
-        return min(self.plan.depth, self.contact_time * DESCENT_SPEED)
+        return min(self.plan.max_descent, self.contact_time * DESCENT_SPEED)
 
     def elapsed(self, time: float) -> float:
         """Return the plan's time at a time of the simulation [s], up to the plan's end."""
@@ -106,7 +106,7 @@ class PickPlaceExecutor(LeafSystem):
         self._cell = cell
         robot = load_robot(cell.robot)
         home, still = robot.home[None], np.zeros((1, robot.num_joints))
-        hold = torques(dynamics_plant(cell, Payload()), home, still, still)
+        hold = inverse_dynamics(dynamics_plant(cell, Payload()), home, still, still)
         self._at_home = np.hstack([home, still, hold]).ravel()
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
         self._bellows = self.DeclareVectorInputPort("bellows", 2)

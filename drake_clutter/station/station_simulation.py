@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import Frame
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
@@ -214,7 +214,7 @@ class StationSimulation:
         time = self.root.get_time() - self.executor_state.start_time
         return Frame(time, self.station.scene.poses(context), arm)
 
-    def execute(self, plan: Plan, *, record: bool = False) -> PickPlaceResult:
+    def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
         """Carry a plan out, until the arm is home and all has come to rest.
 
         Args:
@@ -242,7 +242,7 @@ class StationSimulation:
         return self._result(plan, before, tracking, tuple(motion))
 
     def _result(
-        self, plan: Plan, before: Scene, tracking: float, motion: tuple[Frame, ...]
+        self, plan: PickPlacePlan, before: Scene, tracking: float, motion: tuple[Frame, ...]
     ) -> PickPlaceResult:
         poses, status = self.station.scene.poses(self.plant_context), self.gripper.status
         place, wanted = poses[plan.pick], plan.X_TO_place

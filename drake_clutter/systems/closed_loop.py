@@ -12,8 +12,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome
@@ -40,7 +44,7 @@ from drake_clutter.tasks.exploration import Attempt
 
 LATENCY = 1.15
 """From an observation to the plan [s]: 0.15 for perception, 1 for planning."""
-GUARDED = PlannerConfig(descent=0.08, above=0.007)
+GUARDED = PlannerConfig(max_guarded_descent=0.08, descent_start_offset=0.007)
 """For objects known from images: of a box in a pile they show the top, and with a wrong class its
 height is wrong; what it is to stand on may be a little higher, too."""
 
@@ -188,14 +192,14 @@ class ClosedLoop:
         before, decision, plan = self.scene, state.decision, self._response.plan
         assert decision is not None
         assert plan is not None
-        self._planning += plan.seconds
+        self._planning += plan.planning_time
         if self._perceive is not None:
             observation = state.request.observation
             assert observation is not None
             known = state.request.objects
             decision = in_true_names(decision, known, observation, before.objects)
-        if isinstance(plan, NoPlan):
-            no_spot = plan.reason is PlanFailure.NO_FREE_SPOT
+        if isinstance(plan, PlanningFailure):
+            no_spot = plan.reason is PlanningFailureReason.NO_FREE_SPOT
             result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if no_spot else str(plan))
             return Attempt(decision, outcome, self.look)
@@ -207,7 +211,7 @@ class ClosedLoop:
         self.look = self._detector.look(self.scene)
         return Attempt(decision, replace(outcome, scene=self.scene, motion=motion), self.look)
 
-    def _outcome(self, plan: Plan) -> tuple[str, Outcome]:
+    def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:
         """Return the name of what was picked, and what the move has led to."""
         before, after, grasp = self.scene, self.simulation.scene, self.simulation.gripper.status
         # What hung on the cup may not be what the policy took it for.

@@ -5,8 +5,12 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 
@@ -77,11 +81,11 @@ class PlannerSystem(LeafSystem):
             state.get_mutable_abstract_state(int(self._response)).set_value(response)
         return EventStatus.Succeeded()
 
-    def _plan(self, request: PlanRequest) -> Plan | NoPlan:
+    def _plan(self, request: PlanRequest) -> PickPlacePlan | PlanningFailure:
         assert request.move is not None
         assert request.observation is not None
         if request.command is None:
-            return NoPlan(PlanFailure.NO_FREE_SPOT, request.move.place)
+            return PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, request.move.place)
         unseen = unseen_blocks(request.objects, request.observation, self._empty_depth)
         pick, X_TO_place = request.move.pick, request.command.X_TO_place
         return self._planner.plan(request.objects, pick, X_TO_place, unseen)
@@ -91,6 +95,6 @@ class PlannerSystem(LeafSystem):
 
     def _calc_plan(self, context: Context, output: AbstractValue) -> None:
         response, found = self.response(context), PlannedMove()
-        if isinstance(response.plan, Plan):
+        if isinstance(response.plan, PickPlacePlan):
             found = PlannedMove(response.number, response.plan)
         output.set_value(found)

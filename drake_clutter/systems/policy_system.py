@@ -7,7 +7,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.planning.plan import Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.seeding import item_rng
@@ -147,7 +147,7 @@ class PolicySystem(LeafSystem):
         assert move is not None
         if response.number != now.request.number:
             return now
-        if not isinstance(response.plan, Plan):
+        if not isinstance(response.plan, PickPlacePlan):
             belief = now.belief.record(move, MoveResult.NOT_PLANNED)
             return replace(now, phase=Phase.LOOKING, look_at=time, belief=belief)
         finished, lowered = self._finished.Eval(context)

@@ -1,7 +1,7 @@
 """What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import CannotJudge
 from drake_clutter.scenes.scene import TRAY, Scene
@@ -20,7 +20,7 @@ class ArmCeiling:
     def never_found(self, scene: Scene) -> tuple[str, ...]:
         """What stays hidden behind what no cup holds, and behind what carries that; the scene is at rest."""
         planner = PickPlacePlanner(self._world.cell.with_support(scene.support), PlannerConfig())
-        fixed = {o.name for o in scene.objects if not planner.holds(o)}
+        fixed = {o.name for o in scene.objects if not planner.can_grasp(o)}
         supports = self._judge.supports(scene)
         if not isinstance(supports, CannotJudge):
             while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:

@@ -15,10 +15,14 @@ from drake_clutter.catalog import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.paths import sampled
-from drake_clutter.planning.plan import NoPlan, Plan, PlanFailure
-from drake_clutter.planning.planner import PickPlacePlanner
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.time_parameterization import sample_path
 from drake_clutter.scenes.interfaces import Move, PickPlaceCommand
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -27,7 +31,7 @@ from drake_clutter.simulation.plant import rigid_transform
 from drake_clutter.tasks.belief import legal_moves
 
 PLANNED = "planned"
-"""The result of a move that has a plan; any other is a `PlanFailure`'s value."""
+"""The result of a move that has a plan; any other is a `PlanningFailureReason`'s value."""
 NOISE = (0.002, 0.005, 0.010, 0.020, 0.040)
 """m, standard deviations of the error of a pose along x and along y; its yaw has half a degree for each mm."""
 NOISY_MOVES = 6
@@ -66,7 +70,7 @@ class MoveRow:
     place_x: float = math.nan
     place_y: float = math.nan
     place_z: float = math.nan
-    result: str = PlanFailure.NO_FREE_SPOT.value
+    result: str = PlanningFailureReason.NO_FREE_SPOT.value
     about: str = ""
     number: float = math.nan
     planning_s: float = 0.0
@@ -163,19 +167,20 @@ class FeasibilityStudy:
         row = replace(row, place_x=px, place_y=py, place_z=pz)
         planner = self.planner(scene.support)
         found, robot = planner.plan(scene.objects, move.pick, X_TO), planner.tool.robot
-        row = replace(row, planning_s=round(found.seconds, 4))
-        if isinstance(found, NoPlan):
-            return replace(row, result=found.reason.value, about=found.about, number=found.number)
-        carry = found.phases[1].trajectory
+        row = replace(row, planning_s=round(found.planning_time, 4))
+        if isinstance(found, PlanningFailure):
+            return replace(row, result=found.reason.value, about=found.detail, number=found.value)
+        carry = found.segments[1].trajectory
         ends = carry.vector_values([0.0, carry.end_time()]).T
         nearest = min(
-            (phase.clearance for phase in found.phases), key=lambda clearance: clearance.distance
+            (phase.min_distance for phase in found.segments),
+            key=lambda clearance: clearance.distance,
         )
         return replace(
             row,
             result=PLANNED,
             motion_s=round(found.duration, 4),
-            attempts=found.attempts,
+            attempts=found.num_attempts,
             clearance=round(nearest.distance, 6),
             between=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
             manipulability=float(robot.manipulability(ends).min()),
@@ -200,32 +205,34 @@ class FeasibilityStudy:
                 plan = planner.plan(believed, row.pick, X_TO)
                 result = (
                     "no plan"
-                    if isinstance(plan, NoPlan)
+                    if isinstance(plan, PlanningFailure)
                     else self._holds(plan, scene, planner, error)
                 )
                 found.append(NoiseRow(self._setup, name, row.pick, row.place, error, result))
         return found
 
-    def _holds(self, plan: Plan, scene: Scene, planner: PickPlacePlanner, error: float) -> str:
+    def _holds(
+        self, plan: PickPlacePlan, scene: Scene, planner: PickPlacePlanner, error: float
+    ) -> str:
         """Whether a plan that was made for other poses works with the right ones; else what goes wrong."""
-        q = plan.phases[1].trajectory.value(0.0).ravel()
+        q = plan.segments[1].trajectory.value(0.0).ravel()
         picked, gripper = scene[plan.pick], self._world.cell.gripper
         X_TG = RigidTransform(planner.tool.pose(q))
         X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
         if not gripper.seals(picked.object_class, X_OG):
-            return PlanFailure.NO_SEAL.value
-        around = planner.clearance_scene(scene.objects)
+            return PlanningFailureReason.NO_SEAL.value
+        around = planner.collision_model(scene.objects)
         touching = (*gripper.contact_links, plan.pick)
-        for phase in plan.phases:
-            around.put(scene.objects)
+        for phase in plan.segments:
+            around.set_object_poses(scene.objects)
             if phase.name == "carry":
-                around.hold(plan.pick, X_OG)
+                around.attach_object(plan.pick, X_OG)
             else:
-                around.put_one(
+                around.set_object_pose(
                     plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place
                 )
-            for at in sampled(phase.trajectory):
-                for here in around.close(at, 0.0):
+            for at in sample_path(phase.trajectory):
+                for here in around.distances_below(at, 0.0):
                     # The cup is pressed on; what the object leaves or comes to it may graze by as much as it is misjudged.
                     grazed = plan.pick in here.pair and here.pair[0] in touching
                     if not grazed or here.distance < -error - 0.002:

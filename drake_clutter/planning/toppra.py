@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-_HALVINGS = 50
+_NUM_BISECTIONS = 50
 
 
 @njit(cache=True, nogil=True)
-def _accelerations(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
+def _acceleration_range(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
     """Least and greatest u that the limits at a point allow at x; the least is above the greatest if they allow none."""
     least, greatest = -np.inf, np.inf
     for row in range(len(a)):
@@ -29,8 +29,8 @@ def _accelerations(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
     return least, greatest
 
 
-def squared_speeds(
-    step: float, a: Floats, b: Floats, lower: Floats, upper: Floats, fastest: Floats
+def solve_toppra(
+    step: float, a: Floats, b: Floats, lower: Floats, upper: Floats, max_squared_speeds: Floats
 ) -> Floats:
     """(n,) x at each point of a path, from rest to rest, so that every x is as large as it can be.
 
@@ -39,7 +39,7 @@ def squared_speeds(
     Args:
         step: of the path's parameter, from point to point.
         a, b, lower, upper: (n, rows) limits; lower <= 0 <= upper, so that rest is allowed everywhere.
-        fastest: (n,) x may be no larger.
+        max_squared_speeds: (n,) x may be no larger.
     """
     at_next = a[1:] + 2 * step * b[1:]
     a, b, lower, upper = (
@@ -51,25 +51,25 @@ def squared_speeds(
             (upper[:-1], upper[1:]),
         )
     )
-    found: Floats = _squared_speeds(step, a, b, lower, upper, fastest)
+    found: Floats = _solve_toppra(step, a, b, lower, upper, max_squared_speeds)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _squared_speeds(step, a, b, lower, upper, fastest):  # type: ignore[no-untyped-def]
-    n = len(fastest)
+def _solve_toppra(step, a, b, lower, upper, max_squared_speeds):  # type: ignore[no-untyped-def]
+    n = len(max_squared_speeds)
     controllable = np.zeros(n)  # from more than this, the end cannot be reached
     for i in range(n - 2, -1, -1):
-        allowed, refused, x = 0.0, fastest[i], fastest[i]
-        for _ in range(_HALVINGS):
-            least, greatest = _accelerations(a[i], b[i], lower[i], upper[i], x)
+        allowed, refused, x = 0.0, max_squared_speeds[i], max_squared_speeds[i]
+        for _ in range(_NUM_BISECTIONS):
+            least, greatest = _acceleration_range(a[i], b[i], lower[i], upper[i], x)
             least, greatest = (
                 max(least, -x / (2 * step)),
                 min(greatest, (controllable[i + 1] - x) / (2 * step)),
             )
             if least <= greatest:
                 allowed = x
-                if x == fastest[i]:
+                if x == max_squared_speeds[i]:
                     break
             else:
                 refused = x
@@ -77,6 +77,6 @@ def _squared_speeds(step, a, b, lower, upper, fastest):  # type: ignore[no-untyp
         controllable[i] = allowed
     x = np.zeros(n)
     for i in range(n - 1):
-        _, greatest = _accelerations(a[i], b[i], lower[i], upper[i], x[i])
+        _, greatest = _acceleration_range(a[i], b[i], lower[i], upper[i], x[i])
         x[i + 1] = max(0.0, min(x[i] + 2 * step * greatest, controllable[i + 1]))
     return x

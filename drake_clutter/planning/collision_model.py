@@ -19,7 +19,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.tool_kinematics import inverse
+from drake_clutter.planning.tool_kinematics import invert_pose
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Clearance:
+class SignedDistance:
     """A signed distance.
 
     Attributes:
@@ -42,7 +42,7 @@ class Clearance:
     pair: tuple[str, str] = ("", "")
 
 
-class ClearanceScene:
+class CollisionModel:
     """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put.
 
     Attributes:
@@ -54,7 +54,7 @@ class ClearanceScene:
         self,
         cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
-        unseen: Sequence[UnseenBlock] = (),
+        occluded: Sequence[UnseenBlock] = (),
     ) -> None:
         """Makes a plant of the arm, named objects, and space that must be taken for full."""
         builder = DiagramBuilder()
@@ -63,7 +63,7 @@ class ClearanceScene:
         self._arm: Arm = add_work_cell(
             made.plant, made.scene_graph, cell, compliant=False, visuals=False
         )
-        for k, block in enumerate(unseen):
+        for k, block in enumerate(occluded):
             X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.middle)
             made.plant.RegisterCollisionGeometry(
                 made.plant.world_body(),
@@ -82,20 +82,21 @@ class ClearanceScene:
         )
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
-        self._at, self._v_at = joint_numbers(self.plant, self._arm)
-        self._moved_by = self._joints_by_geometry(load_robot(cell.robot).links)
+        self._q_indices, self._v_indices = joint_numbers(self.plant, self._arm)
+        self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).links)
         self._fixed = (*self._arm.fixed, support_body(self.plant))
         self._names = self._name_geometries()
-        self._parts = {
-            geometry: (name, geometry in self._moved_by) for geometry, name in self._names.items()
+        self._geometry_owners = {
+            geometry: (name, geometry in self._geometry_depths)
+            for geometry, name in self._names.items()
         }
         self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
         standing = self._geometries(*self._fixed, *self._bodies.values())
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
-        self.fixture_tops = self._tops({fixture.name for fixture in cell.fixtures})
-        self._held: tuple[str, Floats] | None = None
-        self._transient: list[object] = []
+        self.fixture_tops = self._highest_points({fixture.name for fixture in cell.fixtures})
+        self._attached: tuple[str, Floats] | None = None
+        self._attachment_filters: list[object] = []
 
     def _geometries(self, *bodies: RigidBody) -> GeometrySet:
         found = GeometrySet()
@@ -103,7 +104,7 @@ class ClearanceScene:
             found.Add(self.plant.GetCollisionGeometriesForBody(body))
         return found
 
-    def _joints_by_geometry(self, links: Mapping[str, int]) -> dict[GeometryId, int]:
+    def _find_geometry_depths(self, link_depths: Mapping[str, int]) -> dict[GeometryId, int]:
         """Return how many of the joints, from the base on, move each geometry of arm and tool.
 
         By geometry, as a link of the arm, one of the tool and an object may have one name.
@@ -111,7 +112,9 @@ class ClearanceScene:
         found = dict[GeometryId, int]()
         for body in self._arm.bodies:
             moved_by = (
-                links[body.name()] if body.model_instance() == self._arm.robot else len(self._at)
+                link_depths[body.name()]
+                if body.model_instance() == self._arm.robot
+                else len(self._q_indices)
             )
             found |= dict.fromkeys(self.plant.GetCollisionGeometriesForBody(body), moved_by)
         return found
@@ -132,7 +135,7 @@ class ClearanceScene:
                 names[geometry] = of_its_own if index in shapes else name
         return names
 
-    def _tops(self, names: Collection[str]) -> tuple[float, ...]:
+    def _highest_points(self, names: Collection[str]) -> tuple[float, ...]:
         query = self._query_port.Eval(self._geometry_context)
         inspector = self._scene_graph.model_inspector()
         tops = dict.fromkeys(names, -np.inf)
@@ -143,21 +146,21 @@ class ClearanceScene:
                 tops[name] = max(tops[name], float(X_TB.translation()[2] + half_height))
         return tuple(tops.values())
 
-    def put(self, objects: Sequence[SceneObject]) -> None:
+    def set_object_poses(self, objects: Sequence[SceneObject]) -> None:
         """Puts objects at their poses; the arm holds nothing any more."""
-        self.release()
+        self.detach_object()
         for o in objects:
             self.plant.SetFreeBodyPose(self._context, self._bodies[o.name], rigid_transform(o.X_TO))
         self._q = self.plant.GetPositions(self._context)
 
-    def put_one(self, name: str, X_TO: Pose) -> None:
+    def set_object_pose(self, name: str, X_TO: Pose) -> None:
         """Puts one object elsewhere."""
         self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
-    def hold(self, name: str, X_OG: RigidTransform) -> None:
+    def attach_object(self, name: str, X_OG: RigidTransform) -> None:
         """From now on the object moves with the gripper."""
-        self.release()
+        self.detach_object()
         held = self._geometries(self._bodies[name])
         others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
         tool = self._geometries(
@@ -166,79 +169,86 @@ class ClearanceScene:
         declaration = (
             CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
         )
-        self._transient.append(self._filters.ApplyTransient(declaration))
-        self._held = name, inverse(X_OG.GetAsMatrix4())
+        self._attachment_filters.append(self._filters.ApplyTransient(declaration))
+        self._attached = name, invert_pose(X_OG.GetAsMatrix4())
 
-    def release(self) -> None:
+    def detach_object(self) -> None:
         """Holds nothing any more."""
-        while self._transient:
-            self._filters.RemoveDeclaration(self._transient.pop())
-        self._held = None
+        while self._attachment_filters:
+            self._filters.RemoveDeclaration(self._attachment_filters.pop())
+        self._attached = None
 
-    def _close(self, q: Floats, within: float) -> list[SignedDistancePair]:
-        self._q[self._at] = q
+    def _pairs_below(self, q: Floats, max_distance: float) -> list[SignedDistancePair]:
+        self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
-        if self._held is not None:
-            name, X_GO = self._held
+        if self._attached is not None:
+            name, X_GO = self._attached
             X_TG = self._arm.cup.CalcPoseInWorld(self._context).GetAsMatrix4()
             self.plant.SetFreeBodyPose(
                 self._context, self._bodies[name], RigidTransform(X_TG @ X_GO)
             )
         found: list[SignedDistancePair] = self._query_port.Eval(
             self._geometry_context
-        ).ComputeSignedDistancePairwiseClosestPoints(within)
+        ).ComputeSignedDistancePairwiseClosestPoints(max_distance)
         return found
 
-    def _named(self, pair: SignedDistancePair) -> Clearance:
-        (first, of_arm), (second, _) = self._parts[pair.id_A], self._parts[pair.id_B]
-        moves = of_arm or (self._held is not None and first == self._held[0])
-        return Clearance(float(pair.distance), (first, second) if moves else (second, first))
+    def _to_signed_distance(self, pair: SignedDistancePair) -> SignedDistance:
+        (first, of_arm), (second, _) = (
+            self._geometry_owners[pair.id_A],
+            self._geometry_owners[pair.id_B],
+        )
+        moves = of_arm or (self._attached is not None and first == self._attached[0])
+        return SignedDistance(float(pair.distance), (first, second) if moves else (second, first))
 
-    def close(self, q: Floats, within: float) -> list[Clearance]:
-        """At joint positions (n,): all that is closer than `within`, m."""
-        return [self._named(pair) for pair in self._close(q, within)]
+    def distances_below(self, q: Floats, max_distance: float) -> list[SignedDistance]:
+        """At joint positions (n,): all that is closer than `max_distance`, m."""
+        return [self._to_signed_distance(pair) for pair in self._pairs_below(q, max_distance)]
 
-    def gradients(self, q: Floats, within: float) -> list[tuple[Clearance, Floats]]:
+    def distances_and_gradients(
+        self, q: Floats, max_distance: float
+    ) -> list[tuple[SignedDistance, Floats]]:
         """As `close`, each with how the distance changes with the joint positions, (n,) m/rad."""
-        pairs = self._close(q, within)
+        pairs = self._pairs_below(q, max_distance)
         if not pairs:
             return []
         query, world = self._query_port.Eval(self._geometry_context), self.plant.world_frame()
         J = self.plant.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, self._arm.flange, np.zeros(3), world, world
-        )[:, self._v_at]
+        )[:, self._v_indices]
         p_TF = self._arm.flange.CalcPoseInWorld(self._context).translation()
         found = []
         for pair in pairs:
-            gradient = np.zeros(len(self._at))
+            gradient = np.zeros(len(self._q_indices))
             for geometry, p_S, sign in (
                 (pair.id_A, pair.p_ACa, 1.0),
                 (pair.id_B, pair.p_BCb, -1.0),
             ):
-                if joints := self._joints_that_move(geometry):
+                if joints := self._num_moving_joints(geometry):
                     nx, ny, nz = sign * pair.nhat_BA_W
                     x, y, z = query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
                     moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
                     gradient[:joints] += (*moment, nx, ny, nz) @ J[:, :joints]
-            found.append((self._named(pair), gradient))
+            found.append((self._to_signed_distance(pair), gradient))
         return found
 
-    def cup_position(self) -> Floats:
+    def gripper_position(self) -> Floats:
         """(3,) m, of the cup in T at the joint angles of the last question."""
         return np.asarray(self._arm.cup.CalcPoseInWorld(self._context).translation())
 
-    def cup_jacobian(self, q: Floats) -> Floats:
+    def gripper_jacobian(self, q: Floats) -> Floats:
         """(6, n) at joint positions (n,): how the cup turns (first three rows) and moves, in T."""
-        self._q[self._at] = q
+        self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
         world = self.plant.world_frame()
         J = self.plant.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, self._arm.cup, np.zeros(3), world, world
         )
-        return np.asarray(J[:, self._v_at])
+        return np.asarray(J[:, self._v_indices])
 
-    def _joints_that_move(self, geometry: GeometryId) -> int:
-        name, of_arm = self._parts[geometry]
+    def _num_moving_joints(self, geometry: GeometryId) -> int:
+        name, of_arm = self._geometry_owners[geometry]
         if of_arm:
-            return self._moved_by[geometry]
-        return len(self._at) if self._held is not None and name == self._held[0] else 0
+            return self._geometry_depths[geometry]
+        return (
+            len(self._q_indices) if self._attached is not None and name == self._attached[0] else 0
+        )
