@@ -55,7 +55,9 @@ def _step_milliseconds(config: ClutterConfig) -> dict[str, float]:
     simulation = StationSimulation(config.cell, scene)
     taken = dict[str, float]()
     for name, awake in (("asleep", set[str]()), ("awake", set(scene.names))):
-        simulation._sleep.update(simulation.root, awake, simulation.gripper.status, must_hold=False)
+        simulation._sleep.update(
+            simulation.root, awake, simulation.gripper.status, expects_grasp=False
+        )
         begin = simulation.root.get_time()
         simulation.simulator.AdvanceTo(begin + 0.1)
         start = time.perf_counter()

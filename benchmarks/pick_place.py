@@ -38,7 +38,7 @@ from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.station.arm_executor import ArmExecutor, worst_fall
+from drake_clutter.station.arm_executor import ArmExecutor, worst_instability
 from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
@@ -91,15 +91,15 @@ class Trial:
 
 def judged(carried: PickPlaceResult) -> str:
     """What became of a plan."""
-    if not carried.sealed:
+    if not carried.grasped:
         return "not sealed"
-    if not math.isnan(carried.dropped):
+    if not math.isnan(carried.drop_time):
         return "dropped"
-    if max(carried.displaced.values(), default=0.0) > UNDISTURBED:
+    if max(carried.displacements.values(), default=0.0) > UNDISTURBED:
         return "disturbed others"
     return (
         "carried out"
-        if carried.place_error < PLACED_WITHIN and carried.turn_error < TURNED_WITHIN
+        if carried.position_error < PLACED_WITHIN and carried.orientation_error < TURNED_WITHIN
         else "misplaced"
     )
 
@@ -111,7 +111,7 @@ def teleported_falls(scene: Scene, plan: PickPlacePlan) -> bool:
     strict = replace(WORLD.settle, max_displacement=UNDISTURBED, max_tilt_deg=3.0)
     return (
         not verdict.stable
-        or worst_fall(after.objects, after.at(verdict.settled), strict) is not None
+        or worst_instability(after.objects, after.at(verdict.settled), strict) is not None
     )
 
 
@@ -184,11 +184,11 @@ class Mover:
                 phase.name for phase in plan.segments if phase.duration < phase.unoptimized_duration
             ),
             wall=wall,
-            place_error=carried.place_error,
-            turn_error=carried.turn_error,
-            disturbed=max(carried.displaced.values(), default=0.0),
+            place_error=carried.position_error,
+            turn_error=carried.orientation_error,
+            disturbed=max(carried.displacements.values(), default=0.0),
             slip=carried.slip,
-            tracking=carried.tracking,
+            tracking=carried.max_tracking_error,
             clearance=min(phase.min_distance.distance for phase in plan.segments),
             unstable_anyway=result != "carried out" and teleported_falls(scene, plan),
         )
@@ -363,7 +363,7 @@ def holds(
             for scene, plan in track(plans, f"{kind}, {hold}", console=console):
                 begun = time.perf_counter()
                 name = plan.pick if jointed else ""
-                simulation = StationSimulation(default_cell(), scene, jointed=name)
+                simulation = StationSimulation(default_cell(), scene, weldable_object=name)
                 results.append(simulation.execute(plan))
                 walls.append(time.perf_counter() - begun)
             rows.append(
@@ -373,7 +373,7 @@ def holds(
                     "moves": count,
                     "results": Counter(judged(c) for c in results),
                     "slip_m": quantiles([c.slip for c in results if not math.isnan(c.slip)]),
-                    "place_error_m": quantiles([c.place_error for c in results]),
+                    "place_error_m": quantiles([c.position_error for c in results]),
                     "wall_s": quantiles(walls),
                 }
             )

@@ -32,7 +32,7 @@ def main(out: Path) -> None:
         print(f"{segment.name}: {segment.duration:.2f} s")
 
     result = StationSimulation(cell, scene).execute(plan, record=True)
-    print(f"simulated: {result}; largest load {result.largest_share:.0%} of what the cup bears")
+    print(f"simulated: {result}; largest load {result.max_load_ratio:.0%} of what the cup bears")
 
     arms = [sample.arm for sample in result.motion if sample.arm is not None]
     rows = [(*arm.q, *arm.v, *arm.torque, arm.suction) for arm in arms]

@@ -36,10 +36,10 @@ def main() -> None:
     simulator = Simulator(builder.Build())
 
     root = simulator.get_mutable_context()
-    station.set_scene(root, home, objects)
+    station.set_state(root, home, objects)
     for time in np.linspace(0.0, 2.0, 9):
         simulator.AdvanceTo(time)
-        q = station.joint_angles(station.plant_context(root))
+        q = station.joint_positions(station.plant_context(root))
         error = np.abs(q - q_desired.value(time).ravel()).max()
         print(f"{time:.2f} s: joint 1 at {q[0]:.3f} rad, largest error {error:.4f} rad")
 

@@ -22,9 +22,9 @@ from drake_clutter.reports.arm_pictures import arm_moments, quarter_turn_to_base
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.station.arm_executor import ArmExecutor, judged
+from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.command_schedule import DWELL, build_command_schedule
+from drake_clutter.station.command_schedule import DWELL_TIME, build_command_schedule
 from drake_clutter.station.messages import ExecutorStatus, PlannedMove
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
 from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
@@ -48,43 +48,47 @@ def plan() -> PickPlacePlan:
     return planned()
 
 
-def run(plan: PickPlacePlan, cell: WorkCell | None = None, jointed: str = "") -> PickPlaceResult:
-    return StationSimulation(cell or DEFAULT_CELL, SCENE, jointed=jointed).execute(plan)
+def run(
+    plan: PickPlacePlan, cell: WorkCell | None = None, weldable_object: str = ""
+) -> PickPlaceResult:
+    return StationSimulation(cell or DEFAULT_CELL, SCENE, weldable_object=weldable_object).execute(
+        plan
+    )
 
 
 def test_placed_where_it_should_be(plan: PickPlacePlan) -> None:
     carried = run(plan)
-    assert carried.sealed
-    assert math.isnan(carried.dropped)
-    assert carried.place_error < 0.003
-    assert carried.turn_error < math.radians(1)
+    assert carried.grasped
+    assert math.isnan(carried.drop_time)
+    assert carried.position_error < 0.003
+    assert carried.orientation_error < math.radians(1)
     assert carried.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), (
         "it stands on the tray"
     )
     assert carried.slip < 0.001
-    assert max(carried.displaced.values()) < 0.001
-    assert carried.tracking < 0.02
-    assert 0.1 < carried.largest_share < 1
+    assert max(carried.displacements.values()) < 0.001
+    assert carried.max_tracking_error < 0.02
+    assert 0.1 < carried.max_load_ratio < 1
 
 
 def test_a_locked_joint_does_not_slip(plan: PickPlacePlan) -> None:
-    carried = run(plan, jointed=plan.pick)
-    assert carried.sealed
+    carried = run(plan, weldable_object=plan.pick)
+    assert carried.grasped
     assert carried.slip < 1e-9
 
 
 def test_a_vacuum_that_fails_drops_the_object(plan: PickPlacePlan) -> None:
     """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
     carried = run(plan, cell_with("gripper.vacuum=0.1"))
-    assert carried.sealed
-    on = build_command_schedule(plan, DEFAULT_CELL).suction_on
-    assert on < carried.dropped < on + DWELL + 0.5, "as soon as it is lifted"
-    assert carried.place_error > 0.2
+    assert carried.grasped
+    on = build_command_schedule(plan, DEFAULT_CELL).suction_on_time
+    assert on < carried.drop_time < on + DWELL_TIME + 0.5, "as soon as it is lifted"
+    assert carried.position_error > 0.2
 
 
 def test_without_a_seal_nothing_is_lifted(plan: PickPlacePlan) -> None:
     carried = run(plan, cell_with("gripper.unevenness=0"))
-    assert not carried.sealed
+    assert not carried.grasped
     assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
 
 
@@ -96,27 +100,27 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
 ) -> None:
     """The shock of touching down may break the seal, a moment before the vacuum is switched off."""
     after = SCENE.at({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
-    outcome = judged(SCENE, after, "sugar_box", PLACE, True, config.settle)
+    outcome = evaluate_outcome(SCENE, after, "sugar_box", PLACE, True, config.settle)
     assert (outcome.result, outcome.instability) == (result, None)
 
 
 def test_the_schedule(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
-    assert [name for name, _ in schedule.starts] == [
+    assert [name for name, _ in schedule.stage_starts] == [
         "approach",
         "grasp",
         "carry",
         "release",
         "retreat",
     ]
-    assert schedule.end == pytest.approx(plan.duration + 2 * DWELL)
-    assert schedule.phase(0.0) == "approach"
-    assert schedule.phase(schedule.suction_on) == "grasp"
-    assert schedule.phase(schedule.suction_off + 0.01) == "release"
-    assert schedule.phase(schedule.end) == "idle"
+    assert schedule.end_time == pytest.approx(plan.duration + 2 * DWELL_TIME)
+    assert schedule.stage_at(0.0) == "approach"
+    assert schedule.stage_at(schedule.suction_on_time) == "grasp"
+    assert schedule.stage_at(schedule.suction_off_time + 0.01) == "release"
+    assert schedule.stage_at(schedule.end_time) == "idle"
     home = np.concatenate([DEFAULT_CELL.robot.home, np.zeros(6)])
     assert schedule.command.value(0.0).ravel()[:12] == pytest.approx(home, abs=1e-3)
-    assert schedule.command.value(schedule.end).ravel()[:12] == pytest.approx(home, abs=1e-3)
+    assert schedule.command.value(schedule.end_time).ravel()[:12] == pytest.approx(home, abs=1e-3)
 
 
 @pytest.mark.parametrize("too_tall", [0.065, 0.0])
@@ -152,7 +156,7 @@ def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
     carried = StationSimulation(DEFAULT_CELL, scene_of(box, support)).execute(plan)
     assert carried.lowered_distance < 0.002
     assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
-    assert carried.displaced[support.name] < 0.005
+    assert carried.displacements[support.name] < 0.005
 
 
 def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: PickPlacePlan) -> None:
@@ -165,20 +169,24 @@ def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: PickPlacePlan) -> 
     assert carried.lowered_distance < 0.002
 
 
-@pytest.mark.parametrize("jointed", ["", "sugar_box"])
-def test_cameras_see_things_where_they_are(jointed: str) -> None:
+@pytest.mark.parametrize("weldable_object", ["", "sugar_box"])
+def test_cameras_see_things_where_they_are(weldable_object: str) -> None:
     classes = [(o.name, o.object_class) for o in SCENE.objects]
-    options: dict[str, Any] = {"time_step": 0.01, "jointed": jointed, "visuals": True}
+    options: dict[str, Any] = {
+        "time_step": 0.01,
+        "weldable_object": weldable_object,
+        "visuals": True,
+    }
     station = ClutterStation(DEFAULT_CELL, classes, **options)
     root = station.CreateDefaultContext()
-    station.set_scene(root, np.array(DEFAULT_CELL.robot.home), SCENE.objects)
+    station.set_state(root, np.array(DEFAULT_CELL.robot.home), SCENE.objects)
     query, poses = (station.GetOutputPort(name).Eval(root) for name in ("query", "body_poses"))
     inspector, compared = query.inspector(), 0
     for geometry in inspector.GetAllGeometryIds():
         name = inspector.GetName(inspector.GetFrameId(geometry))
         for model in (f"{o.name}::{o.object_class.name}" for o in SCENE.objects):
             if name.startswith(model):
-                body = station.scene.bodies[model.split("::")[0]]
+                body = station.scene_plant.bodies[model.split("::")[0]]
                 X_TB = query.GetPoseInWorld(inspector.GetFrameId(geometry))
                 assert X_TB.IsNearlyEqualTo(poses[int(body.index())], 1e-9)
                 compared += 1
@@ -210,7 +218,7 @@ def test_a_cloned_context_goes_on_the_same(plan: PickPlacePlan) -> None:
             executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone)
         )
         assert (first == second).all()
-    phase = build_command_schedule(plan, DEFAULT_CELL).phase(2.0)
+    phase = build_command_schedule(plan, DEFAULT_CELL).stage_at(2.0)
     assert executor.GetOutputPort("status").Eval(clone.get_context()) == ExecutorStatus(1, phase)
     assert executor.GetOutputPort("command").Eval(clone.get_context())[:6] != pytest.approx(
         DEFAULT_CELL.robot.home
@@ -220,7 +228,7 @@ def test_a_cloned_context_goes_on_the_same(plan: PickPlacePlan) -> None:
 def test_the_same_plan_has_the_same_outcome(plan: PickPlacePlan) -> None:
     first, second = run(plan), run(plan)
     assert first.poses == second.poses
-    assert first.largest_share == second.largest_share
+    assert first.max_load_ratio == second.max_load_ratio
 
 
 def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> None:
@@ -291,5 +299,5 @@ def test_what_is_put_on_an_edge_falls() -> None:
     beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
     plan = planned(scene, "gelatin_box", beside)
     carried = StationSimulation(DEFAULT_CELL, scene).execute(plan)
-    assert carried.sealed
+    assert carried.grasped
     assert carried.poses["gelatin_box"].translation[2] < 0.1

@@ -23,7 +23,7 @@ from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.station.messages import PlannedMove
-from drake_clutter.station.station_simulation import STEP, StationSimulation
+from drake_clutter.station.station_simulation import STEP_PERIOD, StationSimulation
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from drake_clutter.validation import config_yaml
 
@@ -101,17 +101,21 @@ def test_it_begins_anew_and_does_the_same() -> None:
 def test_one_plan_after_the_other() -> None:
     simulation = StationSimulation(CELL, SCENE)
     first = simulation.execute(planned())
-    assert (simulation.finished, simulation.is_moving, first.came_off) == (1, False, False)
+    assert (simulation.finished_plan, simulation.is_executing, first.lost_object) == (
+        1,
+        False,
+        False,
+    )
     place = Pose((0.0, 0.2, 0.0185), simulation.scene["pudding_box"].X_TO.quaternion)
     planner = PickPlacePlanner(CELL, PlannerConfig(optimize=False))
     plan = planner.plan(simulation.scene.objects, "pudding_box", place)
     assert isinstance(plan, PickPlacePlan)
     second = simulation.execute(plan, record=True)
-    assert simulation.finished == 2
+    assert simulation.finished_plan == 2
     assert second.poses["pudding_box"].p[:2] == pytest.approx(place.p[:2], abs=0.003)
-    assert 0 < second.motion[0].time <= 2 * STEP
+    assert 0 < second.motion[0].time <= 2 * STEP_PERIOD
     assert second.motion[-1].time == pytest.approx(
-        second.time - simulation.executor_state.start_time
+        second.simulated_time - simulation.executor_state.start_time
     )
 
 
@@ -119,7 +123,7 @@ def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
     cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
     result = StationSimulation(cell, SCENE).execute(planned(cell), record=True)
     assert result.poses["pudding_box"].p[:2] == pytest.approx([0.0, -0.2], abs=0.005)
-    assert result.tracking < 0.02
+    assert result.max_tracking_error < 0.02
     outcome, path = Outcome(MoveResult.PLACED, SCENE, motion=result.motion), tmp_path / "t.h5"
     write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], cell)
     _, read, ((_, frames),) = read_trajectories(path, load_catalog())

@@ -54,28 +54,35 @@ class ArmExecutor:
         plan = self.plan(scene, command)
         if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
-        done = StationSimulation(self._config.cell, scene).execute(plan, record=True)
-        X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -done.lowered_distance))
-        after, pick = scene.at(done.poses), command.move.pick
-        outcome = judged(scene, after, pick, X_TO_place, done.came_off, self._config.settle)
-        return replace(outcome, motion=done.motion, detail=str(done))
+        simulated = StationSimulation(self._config.cell, scene).execute(plan, record=True)
+        X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulated.lowered_distance))
+        after, pick = scene.at(simulated.poses), command.move.pick
+        outcome = evaluate_outcome(
+            scene, after, pick, X_TO_place, simulated.lost_object, self._config.settle
+        )
+        return replace(outcome, motion=simulated.motion, detail=str(simulated))
 
 
-def judged(
-    before: Scene, after: Scene, pick: str, X_TO_place: Pose, came_off: bool, config: SettleConfig
+def evaluate_outcome(
+    before: Scene,
+    after: Scene,
+    pick: str,
+    X_TO_place: Pose,
+    lost_object: bool,
+    config: SettleConfig,
 ) -> Outcome:
     """What a motion of the arm has led to: what it touched is settled, and everything compared with where it should be.
 
     Args:
         before, after: the scene, at rest and after the motion.
-        pick: what was picked; X_TO_place: where it was to be let go; came_off: whether it came off the cup on the way.
+        pick: what was picked; X_TO_place: where it was to be let go; lost_object: whether it came off the cup on the way.
         config: the limits.
     """
     put = before.at({pick: X_TO_place})
     # What comes off the cup only as it touches down, and stays there, has been put down.
-    dropped = came_off and worst_fall([put[pick]], after, config) is not None
+    dropped = lost_object and worst_instability([put[pick]], after, config) is not None
     others = [o for o in put.objects if o.name != pick or not dropped]
-    instability = worst_fall(others, after, config)
+    instability = worst_instability(others, after, config)
     if instability is None and not dropped:
         moved = {
             o.name
@@ -85,16 +92,18 @@ def judged(
         for group in touching_groups(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):
                 after = after.at(settle(group, before.support, config).poses)
-        instability = worst_fall(others, after, config)
+        instability = worst_instability(others, after, config)
     result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
         result = MoveResult.COLLAPSED
     return Outcome(result, after, instability, released=X_TO_place)
 
 
-def worst_fall(
-    before: Sequence[SceneObject], after: Scene, config: SettleConfig
+def worst_instability(
+    expected: Sequence[SceneObject], after: Scene, config: SettleConfig
 ) -> Instability | None:
     """Of the objects that did not stay where they were, the one that went furthest."""
-    found = [fall for o in before if (fall := fallen(o, after[o.name].X_TO, after.support, config))]
+    found = [
+        fall for o in expected if (fall := fallen(o, after[o.name].X_TO, after.support, config))
+    ]
     return max(found, key=lambda fall: fall.displacement, default=None)

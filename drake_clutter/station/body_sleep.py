@@ -16,7 +16,7 @@ from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.plant import support_body
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.command_schedule import DWELL, CommandSchedule
+from drake_clutter.station.command_schedule import DWELL_TIME, CommandSchedule
 from drake_clutter.station.gripper_actuator import GraspStatus
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ _DESCENT_STEP = 0.01
 """Between the heights of a descent at which contacts are looked for [m]."""
 
 
-def nearest(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
+def nearest_object(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
     """Return the object whose origin is nearest to a pose: what is there in truth."""
     return min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - X_TO.p)))
 
@@ -42,7 +42,7 @@ def affected_bodies(
     These are the stacks that are taken from, put on, or come close to. The picked object is in
     both.
     """
-    picked = nearest(objects, plan.X_TO_pick)
+    picked = nearest_object(objects, plan.X_TO_pick)
     X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
     lowered = np.linspace(0.0, plan.max_descent, math.ceil(plan.max_descent / _DESCENT_STEP) + 1)
     placed = [
@@ -72,12 +72,12 @@ def bodies_to_wake(
         at_place: What placing may disturb.
         time: Since the plan began [s].
     """
-    pick_start = schedule.suction_on - WAKE_BEFORE_CONTACT
-    place_start = schedule.descent_start - WAKE_BEFORE_CONTACT
+    pick_start = schedule.suction_on_time - WAKE_BEFORE_CONTACT
+    place_start = schedule.descent_start_time - WAKE_BEFORE_CONTACT
     woken = set[str]()
-    if pick_start <= time <= schedule.suction_on + DWELL + SLEEP_AFTER_DWELL:
+    if pick_start <= time <= schedule.suction_on_time + DWELL_TIME + SLEEP_AFTER_DWELL:
         woken |= at_pick
-    if place_start <= time <= schedule.suction_off + DWELL + SLEEP_AFTER_DWELL:
+    if place_start <= time <= schedule.suction_off_time + DWELL_TIME + SLEEP_AFTER_DWELL:
         woken |= at_place
     return woken
 
@@ -92,7 +92,7 @@ class BodySleepManager:
     MAX_SLEEP_SPEED = 0.002
     """Of an object that falls asleep, on average over some updates [m/s]: contact may make it
     tremble without getting anywhere."""
-    NUM_UPDATES = 4
+    WINDOW = 4
 
     def __init__(self, station: ClutterStation) -> None:
         """Make a manager; see `reset`."""
@@ -102,48 +102,50 @@ class BodySleepManager:
     def reset(self, root: Context) -> None:
         """Lock all objects in a new context."""
         self.awake = set[str]()
-        self._before = deque[tuple[float, dict[str, Floats]]](maxlen=self.NUM_UPDATES)
-        self._hit = deque[set[str]](maxlen=self.NUM_UPDATES)
+        self._position_history = deque[tuple[float, dict[str, Floats]]](maxlen=self.WINDOW)
+        self._contact_history = deque[set[str]](maxlen=self.WINDOW)
         self._locked_filter = None
         self._lock_all_but(root, self.awake)
 
     def update(
-        self, root: Context, wanted: Set[str], grasp: GraspStatus, *, must_hold: bool
+        self, root: Context, required: Set[str], grasp: GraspStatus, *, expects_grasp: bool
     ) -> None:
         """Wake what is wanted, what is held, and what still moves; lock the rest.
 
         Args:
             root: Of the simulation.
-            wanted: Names.
+            required: Names.
             grasp: What the gripper holds.
-            must_hold: Whether the gripper should hold something; if it does not, what falls may
+            expects_grasp: Whether the gripper should hold something; if it does not, what falls may
                 hit anything, and all are woken.
         """
         moving = {name for name, v in self._speeds(root).items() if v > self.MAX_SLEEP_SPEED}
-        lost = grasp.came_off or (must_hold and not grasp.has_held)
+        lost = grasp.lost_object or (expects_grasp and not grasp.has_held)
         # What is run into is woken for long enough to see whether it moves, else it would stand
         # like a rock.
         context = self._station.plant_context(root)
-        self._hit.append(self._station.touched(context) - self.awake if self.awake else set())
-        awake = {*wanted, *moving, *({grasp.held} - {""})}.union(*self._hit)
+        self._contact_history.append(
+            self._station.objects_in_contact(context) - self.awake if self.awake else set()
+        )
+        awake = {*required, *moving, *({grasp.held} - {""})}.union(*self._contact_history)
         if lost:
-            awake = set(self._station.classes)
+            awake = set(self._station.object_classes)
         if awake != self.awake:
             self._lock_all_but(root, awake)
             self.awake = awake
 
     def _speeds(self, root: Context) -> dict[str, float]:
         """Return speeds of what is awake, by name [m/s]."""
-        scene, context = self._station.scene, self._station.plant_context(root)
+        scene, context = self._station.scene_plant, self._station.plant_context(root)
         speeds = scene.speeds(context, self.awake)
         places = {name: X_TO.p for name, X_TO in scene.poses(context, self.awake).items()}
-        if len(self._before) == self.NUM_UPDATES:
-            then, earlier = self._before[0]
+        if len(self._position_history) == self.WINDOW:
+            then, earlier = self._position_history[0]
             time = root.get_time() - then
             for name, p in places.items():
                 if name in earlier:
                     speeds[name] = float(np.linalg.norm(p - earlier[name])) / time
-        self._before.append((root.get_time(), places))
+        self._position_history.append((root.get_time(), places))
         return speeds
 
     def _lock_all_but(self, root: Context, awake: Set[str]) -> None:
@@ -160,13 +162,13 @@ class BodySleepManager:
         for name, joint in station.free_joints.items():
             if name in awake:
                 continue
-            locked.Add(plant.GetCollisionGeometriesForBody(station.scene.bodies[name]))
+            locked.Add(plant.GetCollisionGeometriesForBody(station.scene_plant.bodies[name]))
             if not joint.is_locked(context):
                 velocities, start = plant.GetVelocities(context), joint.velocity_start()
                 velocities[start : start + 6] = 0.0
                 plant.SetVelocities(context, velocities)
                 joint.Lock(context)
-        scene_graph = station.scene.scene_graph
+        scene_graph = station.scene_plant.scene_graph
         filters = scene_graph.collision_filter_manager(
             scene_graph.GetMyMutableContextFromRoot(root)
         )

@@ -21,7 +21,7 @@ from drake_clutter.station.grasp_constraint import CompliantGrasp, GraspConstrai
 
 Floats = NDArray[np.float64]
 
-STIFFNESS, DAMPING = 1e5, 2e3
+JOINT_STIFFNESS, JOINT_DAMPING = 1e5, 2e3
 """Of the joints' position control [N m/rad] and [N m s/rad], as stiff as an industrial arm's."""
 
 
@@ -51,9 +51,9 @@ class ClutterStation(Diagram):
 
     Attributes:
         cell: The cell.
-        classes: Of the objects, by name.
+        object_classes: Of the objects, by name.
         time_step: Of the plant [s].
-        scene: The objects in the plant.
+        scene_plant: The objects in the plant.
         plant: The plant.
         arm: The arm in the plant.
         grasp: Fixes an object to the cup.
@@ -68,7 +68,7 @@ class ClutterStation(Diagram):
         objects: Sequence[tuple[str, ObjectClass]],
         *,
         time_step: float,
-        jointed: str = "",
+        weldable_object: str = "",
         visuals: bool = False,
     ) -> None:
         """Build the diagram.
@@ -77,31 +77,35 @@ class ClutterStation(Diagram):
             cell: What stands around.
             objects: Name and class of each.
             time_step: Of the plant [s].
-            jointed: Name of the one object that the cup can take, by a `WeldGrasp`; "": it takes
+            weldable_object: Name of the one object that the cup can take, by a `WeldGrasp`; "": it takes
                 any, by a `CompliantGrasp`.
             visuals: Whether cameras are to see it.
         """
         super().__init__()
-        self.cell, self.classes, self.time_step = cell, dict(objects), time_step
-        self._jointed = jointed
+        self.cell, self.object_classes, self.time_step = cell, dict(objects), time_step
+        self._weldable_object = weldable_object
         builder = DiagramBuilder()
-        self.scene: ScenePlant = add_scene_plant(
-            builder, objects, cell.support, time_step, visuals=False, jointed=jointed
+        self.scene_plant: ScenePlant = add_scene_plant(
+            builder, objects, cell.support, time_step, visuals=False, jointed=weldable_object
         )
-        self.plant = plant = self.scene.plant
-        graph = self.scene.scene_graph
+        self.plant = plant = self.scene_plant.plant
+        graph = self.scene_plant.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
-        _control_positions(plant, self.arm)
-        self.grasp = _grasp_constraint(plant, self.arm, self.scene.bodies, jointed)
+        _set_position_gains(plant, self.arm)
+        self.grasp = _make_grasp_constraint(
+            plant, self.arm, self.scene_plant.bodies, weldable_object
+        )
         plant.Finalize()
         self.free_joints = {
             name: plant.get_joint(index)
-            for name, body in self.scene.bodies.items()
-            if name != jointed
+            for name, body in self.scene_plant.bodies.items()
+            if name != weldable_object
             for index in plant.GetJointIndices(body.model_instance())
         }
-        self._name_of = {int(body.index()): name for name, body in self.scene.bodies.items()}
-        self._q_at, self._v_at = joint_numbers(plant, self.arm)
+        self._object_names = {
+            int(body.index()): name for name, body in self.scene_plant.bodies.items()
+        }
+        self._q_indices, self._v_indices = joint_numbers(plant, self.arm)
         num_joints = len(self.arm.joints)
         command = builder.AddSystem(Demultiplexer(np.array([2 * num_joints, num_joints])))
         builder.ExportInput(command.get_input_port(), "command")
@@ -128,10 +132,12 @@ class ClutterStation(Diagram):
         )
         twin.RegisterAsSourceForSceneGraph(seen)
         bodies = populated(
-            twin, seen, objects, self.cell.support, visuals=True, jointed=self._jointed
+            twin, seen, objects, self.cell.support, visuals=True, jointed=self._weldable_object
         ).bodies
         arm = add_work_cell(twin, seen, self.cell, compliant=True, visuals=True)
-        _grasp_constraint(twin, arm, bodies, self._jointed)  # with it the states are alike
+        _make_grasp_constraint(
+            twin, arm, bodies, self._weldable_object
+        )  # with it the states are alike
         twin.Finalize()
         poses = builder.AddNamedSystem(
             "poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True)
@@ -142,40 +148,40 @@ class ClutterStation(Diagram):
         return seen
 
     @property
-    def takeable(self) -> tuple[str, ...]:
+    def graspable_objects(self) -> tuple[str, ...]:
         """Names of the objects that the cup can take."""
-        return (self._jointed,) if self._jointed else tuple(self.classes)
+        return (self._weldable_object,) if self._weldable_object else tuple(self.object_classes)
 
     def plant_context(self, root: Context) -> Context:
         """Return the plant's context in that of the diagram that holds the station."""
         return self.plant.GetMyMutableContextFromRoot(root)
 
-    def set_scene(self, root: Context, q: Floats, objects: Sequence[SceneObject]) -> None:
+    def set_state(self, root: Context, q: Floats, objects: Sequence[SceneObject]) -> None:
         """Put the arm at q (n,) [rad] and the objects at their poses, all at rest."""
         context = self.plant_context(root)
         positions = self.plant.GetPositions(context)
-        positions[self._q_at] = q
+        positions[self._q_indices] = q
         self.plant.SetPositions(context, positions)
         self.plant.SetVelocities(context, np.zeros(self.plant.num_velocities()))
         self.grasp.reset(context)
         for o in objects:
             X_TO = rigid_transform(o.X_TO)
-            if isinstance(self.grasp, WeldGrasp) and o.name == self._jointed:
-                self.grasp.put(context, X_TO)
+            if isinstance(self.grasp, WeldGrasp) and o.name == self._weldable_object:
+                self.grasp.set_object_pose(context, X_TO)
             else:
-                self.plant.SetFreeBodyPose(context, self.scene.bodies[o.name], X_TO)
+                self.plant.SetFreeBodyPose(context, self.scene_plant.bodies[o.name], X_TO)
 
-    def joint_angles(self, context: Context) -> Floats:
+    def joint_positions(self, context: Context) -> Floats:
         """Return q (n,) [rad] from the plant's context."""
-        return np.asarray(self.plant.GetPositions(context)[self._q_at])
+        return np.asarray(self.plant.GetPositions(context)[self._q_indices])
 
     def arm_state(self, context: Context, suction: bool) -> ArmState:
         """Return the arm's state from the plant's context, with the torques of the last step."""
         torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
-        q, v = self.joint_angles(context), self.plant.GetVelocities(context)[self._v_at]
+        q, v = self.joint_positions(context), self.plant.GetVelocities(context)[self._v_indices]
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
 
-    def touched(self, context: Context) -> set[str]:
+    def objects_in_contact(self, context: Context) -> set[str]:
         """Return names of objects that touch the arm, its tool, or another object.
 
         Locked objects touch only what is not locked: so of them, those that something free or the
@@ -185,7 +191,7 @@ class ClutterStation(Diagram):
             context: Of the plant.
         """
         results = self.plant.get_contact_results_output_port().Eval(context)
-        inspector = self.scene.scene_graph.model_inspector()
+        inspector = self.scene_plant.scene_graph.model_inspector()
         bodies = list[int]()
         for i in range(results.num_hydroelastic_contacts()):
             surface = results.hydroelastic_contact_info(i).contact_surface()
@@ -196,19 +202,23 @@ class ClutterStation(Diagram):
         for i in range(results.num_point_pair_contacts()):
             pair = results.point_pair_contact_info(i)
             bodies += [int(pair.bodyA_index()), int(pair.bodyB_index())]
-        return {self._name_of[body] for body in bodies if body in self._name_of}
+        return {self._object_names[body] for body in bodies if body in self._object_names}
 
 
-def _control_positions(plant: MultibodyPlant, arm: Arm) -> None:
+def _set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
     """Give the arm's motors position control."""
     motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     for motor in motors:
         if motor.model_instance() == arm.robot:
-            motor.set_controller_gains(PdControllerGains(p=STIFFNESS, d=DAMPING))
+            motor.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS, d=JOINT_DAMPING))
 
 
-def _grasp_constraint(
-    plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], jointed: str
+def _make_grasp_constraint(
+    plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], weldable_object: str
 ) -> GraspConstraint:
     """Return the constraint for the one object that is jointed, or for any."""
-    return WeldGrasp(plant, arm, bodies[jointed]) if jointed else CompliantGrasp(plant, arm)
+    return (
+        WeldGrasp(plant, arm, bodies[weldable_object])
+        if weldable_object
+        else CompliantGrasp(plant, arm)
+    )

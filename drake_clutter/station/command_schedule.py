@@ -18,7 +18,7 @@ from drake_clutter.planning.time_parameterization import (
 
 Floats = NDArray[np.float64]
 
-DWELL = 0.15
+DWELL_TIME = 0.15
 """Time in which the vacuum builds up, and in which it is gone again [s]."""
 SAMPLE_PERIOD = 0.01
 """Between samples of reference and feed-forward torque, interpolated linearly [s]."""
@@ -31,25 +31,25 @@ class CommandSchedule:
     Attributes:
         command: Desired positions [rad] and velocities [rad/s], feed-forward torques [N m], of n
             joints. Shape (3 n,).
-        suction_on: When the vacuum is switched on [s].
-        descent_start: When the descent begins [s]; `suction_off` without a descent.
-        suction_off: When the vacuum is switched off [s].
-        end: When the arm is home again [s].
-        starts: Name and start [s] of each phase and dwell.
+        suction_on_time: When the vacuum is switched on [s].
+        descent_start_time: When the descent begins [s]; `suction_off_time` without a descent.
+        suction_off_time: When the vacuum is switched off [s].
+        end_time: When the arm is home again [s].
+        stage_starts: Name and start [s] of each phase and dwell.
     """
 
     command: PiecewisePolynomial
-    suction_on: float
-    descent_start: float
-    suction_off: float
-    end: float
-    starts: tuple[tuple[str, float], ...]
+    suction_on_time: float
+    descent_start_time: float
+    suction_off_time: float
+    end_time: float
+    stage_starts: tuple[tuple[str, float], ...]
 
-    def phase(self, time: float) -> str:
+    def stage_at(self, time: float) -> str:
         """Return what is done at a time [s]; `idle` afterwards."""
-        if time >= self.end:
+        if time >= self.end_time:
             return "idle"
-        return [name for name, start in self.starts if start <= time + 1e-9][-1]
+        return [name for name, start in self.stage_starts if start <= time + 1e-9][-1]
 
 
 def build_command_schedule(
@@ -68,8 +68,8 @@ def build_command_schedule(
     empty, loaded = Payload(), Payload(plan.mass, plan.p_GCm)
     put_down = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
     if plan.guarded_descent is not None:
-        down = _until(plan.guarded_descent, contact_time)
-        descend, rise = ("descend", down, loaded), ("rise", _reversed(down), empty)
+        down = _truncate(plan.guarded_descent, contact_time)
+        descend, rise = ("descend", down, loaded), ("rise", _reverse(down), empty)
         put_down = [("steady", None, loaded), descend, *put_down, rise]
     for name, trajectory, payload in (
         ("approach", approach.trajectory, empty),
@@ -79,7 +79,7 @@ def build_command_schedule(
         ("retreat", retreat.trajectory, empty),
     ):
         starts.append((name, time))
-        duration = float(trajectory.end_time()) if trajectory else DWELL
+        duration = float(trajectory.end_time()) if trajectory else DWELL_TIME
         if trajectory:
             q, v, a = sample_motion(trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
         else:
@@ -101,14 +101,14 @@ def build_command_schedule(
     return CommandSchedule(command, at["grasp"], descent_start, at["release"], time, tuple(starts))
 
 
-def _until(trajectory: Trajectory, time: float) -> Trajectory:
+def _truncate(trajectory: Trajectory, time: float) -> Trajectory:
     """Return the part up to a time [s]; it may end in motion."""
     end = min(time, trajectory.end_time())
     times = PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]])
     return PathParameterizedTrajectory(trajectory, times)
 
 
-def _reversed(trajectory: Trajectory) -> Trajectory:
+def _reverse(trajectory: Trajectory) -> Trajectory:
     """Return the same way back."""
     end = trajectory.end_time()
     times = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])

@@ -31,14 +31,14 @@ class GraspConstraint(Protocol):
     def attach(self, context: Context, body: RigidBody) -> None:
         """Hold an object where it is."""
 
-    def release(self, context: Context) -> None:
+    def detach(self, context: Context) -> None:
         """Let it go."""
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
         """Return force [N] and moment [N m] of the object on the cup's lip, in G. Shapes (3,)."""
 
 
-def _load_of_cup(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
+def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
     """Return the load of the cup without its own weight, from the reaction in the bellows; in G."""
     bellows = plant.GetJointByName("bellows", arm.tool)
     reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
@@ -61,7 +61,7 @@ class WeldGrasp:
         """See `GraspConstraint`."""
         self._joint.Unlock(context)
 
-    def put(self, context: Context, X_TO: RigidTransform) -> None:
+    def set_object_pose(self, context: Context, X_TO: RigidTransform) -> None:
         """Put the object at a pose."""
         self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
 
@@ -72,31 +72,42 @@ class WeldGrasp:
         self._plant.SetVelocities(context, velocities)
         self._joint.Lock(context)
 
-    def release(self, context: Context) -> None:
+    def detach(self, context: Context) -> None:
         """See `GraspConstraint`."""
         self._joint.Unlock(context)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
         """See `GraspConstraint`."""
-        return _load_of_cup(self._plant, self._arm, context)
+        return _cup_load(self._plant, self._arm, context)
 
 
-_LEVER = 0.08
+_PLATFORM_RADIUS = 0.08
 """Size of the platforms [m]: forces and moments load the legs about equally."""
 _LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
 """[N/m] and [N s/m]: rubber yields a little in every direction; stiff legs would tear at the seal
 with every tracking error."""
 _ANGLE = 2 * math.pi / 3
-_UPPER = np.array(
-    [[_LEVER * math.cos(k * _ANGLE), _LEVER * math.sin(k * _ANGLE), -_LEVER] for k in (0, 1, 2)]
-)
-_LOWER = np.array(
+_UPPER_POINTS = np.array(
     [
-        [_LEVER * math.cos((k + 0.5) * _ANGLE), _LEVER * math.sin((k + 0.5) * _ANGLE), 0.0]
+        [
+            _PLATFORM_RADIUS * math.cos(k * _ANGLE),
+            _PLATFORM_RADIUS * math.sin(k * _ANGLE),
+            -_PLATFORM_RADIUS,
+        ]
         for k in (0, 1, 2)
     ]
 )
-_LEGS = [(_UPPER[k], _LOWER[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
+_LOWER_POINTS = np.array(
+    [
+        [
+            _PLATFORM_RADIUS * math.cos((k + 0.5) * _ANGLE),
+            _PLATFORM_RADIUS * math.sin((k + 0.5) * _ANGLE),
+            0.0,
+        ]
+        for k in (0, 1, 2)
+    ]
+)
+_LEGS = [(_UPPER_POINTS[k], _LOWER_POINTS[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
 
 
 class CompliantGrasp:
@@ -113,7 +124,7 @@ class CompliantGrasp:
 
     def reset(self, context: Context) -> None:
         """See `GraspConstraint`."""
-        self.release(context)
+        self.detach(context)
 
     def attach(self, context: Context, body: RigidBody) -> None:
         """See `GraspConstraint`."""
@@ -126,11 +137,11 @@ class CompliantGrasp:
             self._plant.SetDistanceConstraintParams(context, leg, params)
             self._plant.SetConstraintActiveStatus(context, leg, True)
 
-    def release(self, context: Context) -> None:
+    def detach(self, context: Context) -> None:
         """See `GraspConstraint`."""
         for leg in self._legs:
             self._plant.SetConstraintActiveStatus(context, leg, False)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
         """See `GraspConstraint`."""
-        return _load_of_cup(self._plant, self._arm, context)
+        return _cup_load(self._plant, self._arm, context)

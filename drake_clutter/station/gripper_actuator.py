@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context
 from drake_clutter.cell.suction import surface_under_lip
 from drake_clutter.station.clutter_station import ClutterStation
 
-UPDATE_PERIOD = 0.01
+GRIPPER_UPDATE_PERIOD = 0.01
 """Between two looks at the load, and at whether the gripper is to hold [s]."""
 OVERLOAD_RELEASE_TIME = 0.02
 """Of overload, in which air gets in [s]."""
@@ -49,7 +49,7 @@ class GraspStatus:
         return self.last_held != ""
 
     @property
-    def came_off(self) -> bool:
+    def lost_object(self) -> bool:
         """Whether the object came off by its load."""
         return not math.isnan(self.release_time)
 
@@ -91,7 +91,7 @@ class SuctionActuator:
     def reset(self) -> None:
         """See `GripperActuator`."""
         self.status = GraspStatus()
-        self._on = False
+        self._was_commanded_on = False
         self._num_overloads = 0  # updates in a row
         self._last_update = -math.inf
         self._X_OG = RigidTransform()  # when the object was taken
@@ -99,56 +99,58 @@ class SuctionActuator:
     def update(self, root: Context) -> None:
         """See `GripperActuator`."""
         time = root.get_time()
-        if 0 <= time - self._last_update < UPDATE_PERIOD - self._station.time_step / 2:
+        if 0 <= time - self._last_update < GRIPPER_UPDATE_PERIOD - self._station.time_step / 2:
             return
         self._last_update = time
         context, on = self._station.plant_context(root), self._is_commanded_on(root)
-        if on and not self._on:
+        if on and not self._was_commanded_on:
             self.status, self._num_overloads = GraspStatus(held=self.status.held), 0
-        self._on = on
-        if on and not self.status.held and not self.status.came_off:
-            self._take(context)
+        self._was_commanded_on = on
+        if on and not self.status.held and not self.status.lost_object:
+            self._try_attach(context)
         elif self.status.held and not on:
             self._release(context)
         elif self.status.held:
-            self._bear(context, time)
+            self._check_overload(context, time)
 
-    def _bear(self, context: Context, time: float) -> None:
+    def _check_overload(self, context: Context, time: float) -> None:
         """Let go what has been too heavy for too long."""
         load = self._station.grasp.load(context)
         ratio = float(self._station.cell.gripper.load_ratio(*load))
         largest = max(self.status.max_load_ratio, ratio)
         self.status = replace(self.status, max_load_ratio=largest)
         self._num_overloads = self._num_overloads + 1 if ratio > 1 else 0
-        if self._num_overloads * UPDATE_PERIOD > OVERLOAD_RELEASE_TIME:
+        if self._num_overloads * GRIPPER_UPDATE_PERIOD > OVERLOAD_RELEASE_TIME:
             self.status = replace(self.status, release_time=time)
             self._release(context)
 
-    def _pose_of_cup(self, context: Context, name: str) -> RigidTransform:
+    def _cup_pose_in_object(self, context: Context, name: str) -> RigidTransform:
         """Return X_OG."""
         X_TG = self._station.arm.cup.CalcPoseInWorld(context)
-        X_TO = self._station.scene.bodies[name].EvalPoseInWorld(context)
+        X_TO = self._station.scene_plant.bodies[name].EvalPoseInWorld(context)
         return X_TO.inverse() @ X_TG
 
-    def _take(self, context: Context) -> None:
+    def _try_attach(self, context: Context) -> None:
         """Take the object that is first under the lip, if close enough and the lip seals on it."""
         station, suction = self._station, self._station.cell.gripper
-        grasps = {name: self._pose_of_cup(context, name) for name in station.takeable}
+        grasps = {
+            name: self._cup_pose_in_object(context, name) for name in station.graspable_objects
+        }
         gaps = {
-            name: surface_under_lip(station.classes[name], X_OG, suction.cup_diameter).min()
+            name: surface_under_lip(station.object_classes[name], X_OG, suction.cup_diameter).min()
             for name, X_OG in grasps.items()
         }
         if not gaps:
             return
         first = min(gaps, key=lambda name: gaps[name])
-        seals = suction.seals(station.classes[first], grasps[first])
+        seals = suction.seals(station.object_classes[first], grasps[first])
         if gaps[first] <= MAX_SEAL_GAP and seals:
-            station.grasp.attach(context, station.scene.bodies[first])
+            station.grasp.attach(context, station.scene_plant.bodies[first])
             self.status = replace(self.status, held=first, last_held=first)
             self._X_OG = grasps[first]
 
     def _release(self, context: Context) -> None:
-        X_OG = self._pose_of_cup(context, self.status.held)
+        X_OG = self._cup_pose_in_object(context, self.status.held)
         slip = float(np.linalg.norm(X_OG.translation() - self._X_OG.translation()))
-        self._station.grasp.release(context)
+        self._station.grasp.detach(context)
         self.status = replace(self.status, held="", slip=slip)

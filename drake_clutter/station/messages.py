@@ -77,13 +77,13 @@ class ExecutorStatus(Message):
 
     Attributes:
         number: Of the plan.
-        phase: "idle", or what part of the plan is being carried out.
+        stage: "idle", or what part of the plan is being carried out.
     """
 
-    phase: str = "idle"
+    stage: str = "idle"
 
 
-def no_observation() -> Observation:
+def empty_observation() -> Observation:
     """Return the model value of ports for observations, of which the type alone counts."""
     cell = default_cell()
     return Observation(np.zeros((0, 0), np.float32), (), cell.camera, cell.support)

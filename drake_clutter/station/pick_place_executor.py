@@ -25,7 +25,7 @@ from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
 
 Floats = NDArray[np.float64]
 
-PERIOD = 0.025
+EXECUTOR_UPDATE_PERIOD = 0.025
 """Between two looks for a new plan [s]."""
 CONTACT_COMPRESSION = 0.0005
 """A descent has touched something when the bellows give way so far [m]: 1 N, and three more of
@@ -64,11 +64,11 @@ class ExecutorState(Message):
     def elapsed(self, time: float) -> float:
         """Return the plan's time at a time of the simulation [s], up to the plan's end."""
         assert self.schedule is not None
-        return min(time - self.start_time, self.schedule.end)
+        return min(time - self.start_time, self.schedule.end_time)
 
     def has_ended(self, time: float) -> bool:
         """Whether the arm is home again, or no plan has begun."""
-        return self.schedule is None or time >= self.start_time + self.schedule.end
+        return self.schedule is None or time >= self.start_time + self.schedule.end_time
 
 
 class PickPlaceExecutor(LeafSystem):
@@ -111,7 +111,7 @@ class PickPlaceExecutor(LeafSystem):
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
         self._bellows = self.DeclareVectorInputPort("bellows", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(ExecutorState()))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(EXECUTOR_UPDATE_PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         of = {self.all_state_ticket(), self.time_ticket()}
         self.DeclareVectorOutputPort("command", len(self._at_home), self._calc_command, of)
@@ -136,7 +136,7 @@ class PickPlaceExecutor(LeafSystem):
 
     def _update(self, context: Context, state: State) -> EventStatus:
         now, time = self.state(context), context.get_time()
-        after = self._with_contact(context, now)
+        after = self._detect_contact(context, now)
         has_plan = self._plan.HasValue(context)
         given: PlannedMove = self._plan.Eval(context) if has_plan else PlannedMove()
         if given.plan is not None and given.number != now.number and now.has_ended(time):
@@ -146,13 +146,13 @@ class PickPlaceExecutor(LeafSystem):
             state.get_mutable_abstract_state(int(self._state)).set_value(after)
         return EventStatus.Succeeded()
 
-    def _with_contact(self, context: Context, now: ExecutorState) -> ExecutorState:
+    def _detect_contact(self, context: Context, now: ExecutorState) -> ExecutorState:
         """Return the state with an end of the descent, if the object has touched something."""
         if now.schedule is None or now.plan is None or not self._bellows.HasValue(context):
             return now
-        start = now.schedule.descent_start
+        start = now.schedule.descent_start_time
         descended = context.get_time() - now.start_time - start
-        descending = 0 < descended < now.schedule.suction_off - start
+        descending = 0 < descended < now.schedule.suction_off_time - start
         if not descending or math.isfinite(now.contact_time):
             return now
         extension = float(self._bellows.Eval(context)[0])
@@ -175,7 +175,7 @@ class PickPlaceExecutor(LeafSystem):
         state, on = self.state(context), False
         if state.schedule is not None:
             time = state.elapsed(context.get_time())
-            on = state.schedule.suction_on <= time < state.schedule.suction_off
+            on = state.schedule.suction_on_time <= time < state.schedule.suction_off_time
         output.SetFromVector([float(on)])
 
     def _calc_finished(self, context: Context, output: BasicVector) -> None:
@@ -186,5 +186,5 @@ class PickPlaceExecutor(LeafSystem):
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
         state, phase = self.state(context), "idle"
         if state.schedule is not None:
-            phase = state.schedule.phase(state.elapsed(context.get_time()))
+            phase = state.schedule.stage_at(state.elapsed(context.get_time()))
         output.set_value(ExecutorStatus(state.number, phase))

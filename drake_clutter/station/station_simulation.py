@@ -24,9 +24,9 @@ from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceEx
 
 SETTLE_TIME = 0.1
 """Simulated after the arm is home [s]."""
-STEP = 0.025
+STEP_PERIOD = 0.025
 """Between two decisions which objects are simulated [s]."""
-TIME_STEP = STEP / 10
+TIME_STEP = STEP_PERIOD / 10
 """Of the plant [s]; with twice as much a high stack trembles as soon as it is free, and creeps
 until it falls."""
 POST_MOTION_WAIT = 1.0
@@ -45,43 +45,43 @@ class PickPlaceResult:
 
     Attributes:
         poses: X_TO by name, at the end.
-        sealed: Whether the gripper held an object.
-        dropped: When the object came off by its load [s]; NaN if it did not.
-        largest_share: Largest load over what the gripper can bear.
+        grasped: Whether the gripper held an object.
+        drop_time: When the object came off by its load [s]; NaN if it did not.
+        max_load_ratio: Largest load over what the gripper can bear.
         slip: Between gripper and object [m].
-        place_error: Of the object's place, heights left out [m].
-        turn_error: Of its orientation [rad].
-        displaced: How far each other object was moved, by name [m].
+        position_error: Of the object's place, heights left out [m].
+        orientation_error: Of its orientation [rad].
+        displacements: How far each other object was moved, by name [m].
         lowered_distance: By which the object was let go below its planned pose [m].
-        tracking: Largest error of a joint [rad].
-        time: Simulated [s].
+        max_tracking_error: Largest error of a joint [rad].
+        simulated_time: Simulated [s].
         motion: Recorded samples, if asked for.
     """
 
     poses: dict[str, Pose]
-    sealed: bool
-    dropped: float
-    largest_share: float
+    grasped: bool
+    drop_time: float
+    max_load_ratio: float
     slip: float
-    place_error: float
-    turn_error: float
-    displaced: dict[str, float]
+    position_error: float
+    orientation_error: float
+    displacements: dict[str, float]
     lowered_distance: float
-    tracking: float
-    time: float
+    max_tracking_error: float
+    simulated_time: float
     motion: tuple[Frame, ...] = field(repr=False, default=())
 
     @property
-    def came_off(self) -> bool:
+    def lost_object(self) -> bool:
         """Whether the gripper did not hold the object all the way."""
-        return not self.sealed or not math.isnan(self.dropped)
+        return not self.grasped or not math.isnan(self.drop_time)
 
     def __str__(self) -> str:
-        if not self.sealed:
+        if not self.grasped:
             return "the cup did not seal"
-        if not math.isnan(self.dropped):
-            return f"came off the cup after {self.dropped:.2f} s"
-        millimeters, degrees = 1000 * self.place_error, math.degrees(self.turn_error)
+        if not math.isnan(self.drop_time):
+            return f"came off the cup after {self.drop_time:.2f} s"
+        millimeters, degrees = 1000 * self.position_error, math.degrees(self.orientation_error)
         return f"{millimeters:.1f} mm and {degrees:.1f} deg from where it was to be"
 
 
@@ -104,7 +104,7 @@ class StationSimulation:
         cell: WorkCell,
         scene: Scene,
         *,
-        jointed: str = "",
+        weldable_object: str = "",
         visuals: bool = False,
         add_systems: AddSystems | None = None,
     ) -> None:
@@ -113,7 +113,7 @@ class StationSimulation:
         Args:
             cell: Everything else that stands there.
             scene: The objects, at rest.
-            jointed: Name of the one object that the gripper can take, see `ClutterStation`.
+            weldable_object: Name of the one object that the gripper can take, see `ClutterStation`.
             visuals: Whether cameras are to see the station.
             add_systems: What else is in the diagram; None: plans come by `execute`.
         """
@@ -123,7 +123,11 @@ class StationSimulation:
         self.station: ClutterStation = builder.AddNamedSystem(
             "clutter_station",
             ClutterStation(
-                self.cell, classes, time_step=TIME_STEP, jointed=jointed, visuals=visuals
+                self.cell,
+                classes,
+                time_step=TIME_STEP,
+                weldable_object=weldable_object,
+                visuals=visuals,
             ),
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
@@ -149,7 +153,7 @@ class StationSimulation:
         self._scene = scene
         # The first step initializes it, so that a plan that is there by then begins at time 0.
         self.simulator = Simulator(self.diagram)
-        self.station.set_scene(self.root, np.array(self.cell.robot.home), scene.objects)
+        self.station.set_state(self.root, np.array(self.cell.robot.home), scene.objects)
         self.gripper.reset()
         self._sleep.reset(self.root)
         self._num_steps = 0
@@ -169,7 +173,7 @@ class StationSimulation:
     @property
     def scene(self) -> Scene:
         """The objects where they are now."""
-        return self._scene.at(self.station.scene.poses(self.plant_context))
+        return self._scene.at(self.station.scene_plant.poses(self.plant_context))
 
     @property
     def executor_state(self) -> ExecutorState:
@@ -177,13 +181,13 @@ class StationSimulation:
         return self.executor.state(self.executor.GetMyContextFromRoot(self.root))
 
     @property
-    def finished(self) -> int:
+    def finished_plan(self) -> int:
         """Number of the plan that has ended; 0 while one is carried out."""
         port = self.executor.GetOutputPort("finished")
         return int(port.Eval(self.executor.GetMyContextFromRoot(self.root))[0])
 
     @property
-    def is_moving(self) -> bool:
+    def is_executing(self) -> bool:
         """Whether a plan is being carried out."""
         return not self.executor_state.has_ended(self.root.get_time())
 
@@ -196,15 +200,15 @@ class StationSimulation:
                 self._affected = state.number, *affected_bodies(self.scene.objects, state.plan)
             elapsed = now - state.start_time
             wanted = bodies_to_wake(state.schedule, *self._affected[1:], elapsed)
-            end = state.schedule.end + POST_MOTION_WAIT
-            must_hold = state.schedule.suction_on + STEP <= elapsed < end
-        self._sleep.update(self.root, wanted, self.gripper.status, must_hold=must_hold)
+            end = state.schedule.end_time + POST_MOTION_WAIT
+            must_hold = state.schedule.suction_on_time + STEP_PERIOD <= elapsed < end
+        self._sleep.update(self.root, wanted, self.gripper.status, expects_grasp=must_hold)
         self._num_steps += 1
-        self.simulator.AdvanceTo(self._num_steps * STEP + TIME_STEP / 2)
+        self.simulator.AdvanceTo(self._num_steps * STEP_PERIOD + TIME_STEP / 2)
 
-    def run_until(self, event: Callable[[], bool]) -> None:
+    def run_until(self, condition: Callable[[], bool]) -> None:
         """Step until something is true; it is asked before each step."""
-        while not event():
+        while not condition():
             self.step()
 
     def sample(self) -> Frame:
@@ -212,7 +216,7 @@ class StationSimulation:
         context = self.plant_context
         arm = self.station.arm_state(context, self._is_suction_on(self.root))
         time = self.root.get_time() - self.executor_state.start_time
-        return Frame(time, self.station.scene.poses(context), arm)
+        return Frame(time, self.station.scene_plant.poses(context), arm)
 
     def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
         """Carry a plan out, until the arm is home and all has come to rest.
@@ -227,12 +231,12 @@ class StationSimulation:
         motion, tracking = list[Frame](), 0.0
 
         def at_rest() -> bool:
-            if self.finished != number:
+            if self.finished_plan != number:
                 return False
             state = self.executor_state
             assert state.schedule is not None
-            end = state.start_time + state.schedule.end
-            return self._num_steps * STEP >= end + SETTLE_TIME
+            end = state.start_time + state.schedule.end_time
+            return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
 
         while not at_rest():
             self.step()
@@ -244,30 +248,30 @@ class StationSimulation:
     def _result(
         self, plan: PickPlacePlan, before: Scene, tracking: float, motion: tuple[Frame, ...]
     ) -> PickPlaceResult:
-        poses, status = self.station.scene.poses(self.plant_context), self.gripper.status
+        poses, status = self.station.scene_plant.poses(self.plant_context), self.gripper.status
         place, wanted = poses[plan.pick], plan.X_TO_place
         return PickPlaceResult(
             poses=poses,
-            sealed=status.has_held,
-            dropped=status.release_time,
-            largest_share=status.max_load_ratio,
+            grasped=status.has_held,
+            drop_time=status.release_time,
+            max_load_ratio=status.max_load_ratio,
             slip=status.slip,
-            place_error=float(np.linalg.norm((place.p - wanted.p)[:2])),
-            turn_error=tilt_between(self.station.classes[plan.pick], wanted, place),
-            displaced={
+            position_error=float(np.linalg.norm((place.p - wanted.p)[:2])),
+            orientation_error=tilt_between(self.station.object_classes[plan.pick], wanted, place),
+            displacements={
                 o.name: float(np.linalg.norm(poses[o.name].p - o.X_TO.p))
                 for o in before.objects
                 if o.name != plan.pick
             },
             lowered_distance=self.executor_state.lowered_distance,
-            tracking=tracking,
-            time=self.root.get_time(),
+            max_tracking_error=tracking,
+            simulated_time=self.root.get_time(),
             motion=motion,
         )
 
     def _tracking_error(self) -> float:
         command = self.executor.GetOutputPort("command")
-        q = self.station.joint_angles(self.plant_context)
+        q = self.station.joint_positions(self.plant_context)
         wanted = command.Eval(self.executor.GetMyContextFromRoot(self.root))[: len(q)]
         return float(np.abs(wanted - q).max())
 

@@ -31,18 +31,18 @@ from drake_clutter.scenes.scene_file import scene_from_text, scene_text
 from drake_clutter.validation import config_yaml, override_config
 from drake_clutter.yaml_io import parse_yaml
 
-VERSION = 1
-_ARM = ("q", "v", "torque")
+FORMAT_VERSION = 1
+_ARM_DATASETS = ("q", "v", "torque")
 
 
 def write_trajectories(
-    path: Path, start: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell
+    path: Path, initial_scene: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell
 ) -> int:
     """Writes the moves of which there is an arm's motion, in one step; returns how many there are.
 
     Args:
         path: the file.
-        start: the scene before the first move.
+        initial_scene: the scene before the first move.
         moves: and what they led to.
         cell: in which they were carried out; its support is the scene's.
     """
@@ -50,9 +50,9 @@ def write_trajectories(
     with atomic_write(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
             {
-                "version": VERSION,
-                "scene": scene_text(start, cell),
-                "cell": config_yaml(cell.with_support(start.support)),
+                "version": FORMAT_VERSION,
+                "scene": scene_text(initial_scene, cell),
+                "cell": config_yaml(cell.with_support(initial_scene.support)),
             }
         )
         for move, outcome in moves:
@@ -69,10 +69,14 @@ def write_trajectories(
                     "detail": outcome.detail,
                 }
             )
-            arrays = {name: np.array([getattr(state, name) for state in states]) for name in _ARM}
+            arrays = {
+                name: np.array([getattr(state, name) for state in states]) for name in _ARM_DATASETS
+            }
             arrays["time"] = np.array([frame.time for frame in outcome.motion])
             arrays["suction"] = np.array([state.suction for state in states])
-            poses = [[frame.poses[o.name] for o in start.objects] for frame in outcome.motion]
+            poses = [
+                [frame.poses[o.name] for o in initial_scene.objects] for frame in outcome.motion
+            ]
             arrays["X_TO"] = np.array(
                 [[(*X.quaternion, *X.translation) for X in row] for row in poses]
             )
@@ -96,17 +100,21 @@ def read_trajectories(
             str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})"
         ) from error
     with file:
-        if int(file.attrs.get("version", 0)) != VERSION or "scene" not in file.attrs:
+        if int(file.attrs.get("version", 0)) != FORMAT_VERSION or "scene" not in file.attrs:
             raise InputError(
-                f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {VERSION}"
+                f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {FORMAT_VERSION}"
             )
         scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
-        cell = _cell(path, file.attrs).with_support(scene.support)
+        cell = _read_cell(path, file.attrs).with_support(scene.support)
         joints = load_robot(cell.robot).num_joints
-        return scene, cell, [_move(path, name, file[name], scene, joints) for name in sorted(file)]
+        return (
+            scene,
+            cell,
+            [_read_move(path, name, file[name], scene, joints) for name in sorted(file)],
+        )
 
 
-def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
+def _read_cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
     """Return the cell of a file; files of drake_clutter 0.1 hold the arm alone."""
     field = "cell" if "cell" in attributes else "arm"
     given = parse_yaml(str(attributes.get(field, "{}")), f"{path}:{field}")
@@ -115,11 +123,11 @@ def _cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
     )
 
 
-def _move(
+def _read_move(
     path: Path, name: str, group: h5py.Group, scene: Scene, joints: int
 ) -> tuple[Move, tuple[Frame, ...]]:
     arrays: dict[str, NDArray[np.float64]] = {}
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM, (joints,))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM_DATASETS, (joints,))
     shapes |= {"time": (), "suction": (), "X_TO": (len(scene.objects), 7)}
     for field, shape in shapes.items():
         found = group.get(field)
@@ -133,7 +141,7 @@ def _move(
         raise InputError(f"{path}:{name}: lengths {lengths}; allowed is one and the same")
     frames = []
     for k, time in enumerate(arrays["time"].tolist()):
-        q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM)
+        q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM_DATASETS)
         arm = ArmState(q, v, torque, bool(arrays["suction"][k]))
         rows = arrays["X_TO"][k].tolist()
         poses = {

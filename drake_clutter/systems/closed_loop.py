@@ -22,8 +22,8 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import carried
 from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.station.arm_executor import judged
-from drake_clutter.station.body_sleep import nearest
+from drake_clutter.station.arm_executor import evaluate_outcome
+from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlanResponse
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
@@ -172,7 +172,7 @@ class ClosedLoop:
         self._start_time = time.perf_counter()
         motion, state = list[Frame](), self._state
         while state.phase is not Phase.DONE:
-            is_moving = self.simulation.is_moving
+            is_moving = self.simulation.is_executing
             self.simulation.step()
             if self._record and is_moving:
                 motion.append(self.simulation.sample())
@@ -215,13 +215,13 @@ class ClosedLoop:
         """Return the name of what was picked, and what the move has led to."""
         before, after, grasp = self.scene, self.simulation.scene, self.simulation.gripper.status
         # What hung on the cup may not be what the policy took it for.
-        picked = grasp.last_held or nearest(before.objects, plan.X_TO_pick).name
+        picked = grasp.last_held or nearest_object(before.objects, plan.X_TO_pick).name
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
         lowered = self.simulation.executor_state.lowered_distance
         X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         X_TO_place = X_TO_place.moved((0.0, 0.0, -lowered))
-        came_off = not grasp.has_held or grasp.came_off
-        outcome = judged(before, after, picked, X_TO_place, came_off, self._world.settle)
+        came_off = not grasp.has_held or grasp.lost_object
+        outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         detail = "came off the cup" if came_off else "put down"
         detail += f", {1000 * error:.1f} mm from where it was to be"

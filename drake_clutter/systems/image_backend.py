@@ -18,7 +18,7 @@ from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.station.body_sleep import nearest
+from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.systems.action_filter import InfeasibleMoves
 from drake_clutter.systems.perception_system import Perceive, for_who_sees
 from drake_clutter.systems.tracking import in_true_names, tracked
@@ -80,7 +80,7 @@ class ImageBackend(SteppedBackend):
 
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `SteppedBackend.execute`."""
-        picked = nearest(self.scene.objects, command.X_TO_pick)
+        picked = nearest_object(self.scene.objects, command.X_TO_pick)
         X_TO_place = carried(command.X_TO_pick, command.X_TO_place, picked.X_TO)
         move = replace(command.move, pick=picked.name)
         outcome = super().execute(PickPlaceCommand(move, picked.X_TO, X_TO_place), rng)

@@ -20,7 +20,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.messages import no_observation
+from drake_clutter.station.messages import empty_observation
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation]
 """From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned
@@ -80,7 +80,7 @@ class PerceptionSystem(LeafSystem):
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
         self.DeclareAbstractOutputPort(
-            "observation", lambda: AbstractValue.Make(no_observation()), self._calc_observation
+            "observation", lambda: AbstractValue.Make(empty_observation()), self._calc_observation
         )
 
     @staticmethod
@@ -125,7 +125,9 @@ class LabelPerception:
     def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
         """For the objects of a scene."""
         self._scene, self._detector = scene, LabelDetector(world.cell.camera)
-        self._numbers = {o.name: int(station.scene.bodies[o.name].index()) for o in scene.objects}
+        self._numbers = {
+            o.name: int(station.scene_plant.bodies[o.name].index()) for o in scene.objects
+        }
 
     def __call__(
         self,

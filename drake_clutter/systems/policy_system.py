@@ -11,7 +11,7 @@ from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.seeding import item_rng
-from drake_clutter.station.messages import PlanRequest, PlanResponse, no_observation
+from drake_clutter.station.messages import PlanRequest, PlanResponse, empty_observation
 from drake_clutter.tasks.belief import (
     ActionFilter,
     Belief,
@@ -109,7 +109,7 @@ class PolicySystem(LeafSystem):
         self.policy, self._config, self._seed, self._rest = policy, config, seed, rest
         self._tracker, self._action_filter = tracker, action_filter
         self._observation = self.DeclareAbstractInputPort(
-            "observation", AbstractValue.Make(no_observation())
+            "observation", AbstractValue.Make(empty_observation())
         )
         self._response = self.DeclareAbstractInputPort(
             "response", AbstractValue.Make(PlanResponse())

@@ -34,7 +34,7 @@ def empty_depth(cell: WorkCell) -> NDArray[np.float32]:
     sensor = add_camera(builder, station)
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
-    station.set_scene(root, np.array(cell.robot.home), [])
+    station.set_state(root, np.array(cell.robot.home), [])
     context = sensor.GetMyContextFromRoot(root)
     image: ImageDepth32F = sensor.depth_image_32F_output_port().Eval(context)
     depth: NDArray[np.float32] = image.data[..., 0].copy()

@@ -12,7 +12,7 @@ from drake_clutter.perception.explaining import explanation
 from drake_clutter.scenes.geometry import penetration
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
-from drake_clutter.station.body_sleep import nearest
+from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.tasks.belief import Decision
 
 NEAR = 0.04
@@ -154,7 +154,7 @@ def in_true_names(
         objects: The true ones.
     """
     assert decision.move is not None
-    name = {TRAY: TRAY} | {o.name: nearest(objects, o.X_TO).name for o in known}
+    name = {TRAY: TRAY} | {o.name: nearest_object(objects, o.X_TO).name for o in known}
     return Decision(
         Move(name[decision.move.pick], name[decision.move.place]),
         {name[pick]: chance for pick, chance in decision.picks.items()},
