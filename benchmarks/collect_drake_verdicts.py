@@ -184,7 +184,7 @@ class DrakeMoves:
     def __call__(self, item: RandomMove) -> dict[str, Any]:
         """The record of a move."""
         scene = settled_scene(laid_out(item.batch, item.index)[0], item.record)
-        observation = self._detector.look(scene).observation
+        observation = self._detector.perceive(scene).observation
         move = random_move(observation, item)
         rng = move_rng(item)
         command = resolve_placement(move, observation, ClutterConfig().exploration, rng)

@@ -143,7 +143,7 @@ class Mover:
     def __call__(self, number: int) -> list[Trial]:
         """Moves in the scene of a number."""
         scene, rng = self._scenes(number), item_rng(self._seed, number, 1)
-        observation = self._detector.look(scene).observation
+        observation = self._detector.perceive(scene).observation
         moves = legal_moves(observation)
         for executor in (self._executor, self._sure):
             executor.planner_for(scene.support).collision_model(
@@ -278,7 +278,7 @@ def parts(
 
     def move_timed(number: int) -> bool:
         scene, rng = scenes(number), item_rng(seed, number, 1)
-        observation = detector.look(scene).observation
+        observation = detector.perceive(scene).observation
         choices = legal_moves(observation)
         move = choices[rng.integers(len(choices))]
         command = resolve_placement(move, observation, WORLD.exploration, rng)
@@ -351,7 +351,7 @@ def holds(
         while len(plans) < count:
             scene, rng = scenes(number), item_rng(seed, number, 1)
             number += 1
-            observation = detector.look(scene).observation
+            observation = detector.perceive(scene).observation
             choices = legal_moves(observation)
             move = choices[rng.integers(len(choices))]
             command = resolve_placement(move, observation, WORLD.exploration, rng)

@@ -238,7 +238,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         resting("gelatin_box", floor=0.035),
         resting("large_marker", xy=(0.2, 0.2)),
     )
-    executor, observation = ArmExecutor(config), detector.look(scene).observation
+    executor, observation = ArmExecutor(config), detector.perceive(scene).observation
     placed = executed(executor, scene, observation, Move("gelatin_box"), rng())
     assert placed.result is MoveResult.PLACED
     assert placed.instability is None

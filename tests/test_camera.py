@@ -234,10 +234,10 @@ def test_the_detector_reports_what_is_not_hidden(detector: LabelDetector) -> Non
         ),
         resting("large_marker", Orientation.FLAT_90, (0.2, 0.1), name="marker"),
     )
-    look, images = detector.look(scene), detector.camera.render(scene)
+    look, images = detector.perceive(scene), detector.camera.render(scene)
     observation = look.observation
     assert [d.name for d in observation.detections] == ["cover", "marker"]
-    assert look.visible_share == {"gelatin": 0.0, "cover": 1.0, "marker": 1.0}
+    assert look.visible_fractions == {"gelatin": 0.0, "cover": 1.0, "marker": 1.0}
     for detection in observation.detections:
         o = scene[detection.name]
         assert (detection.object_class, detection.X_TO) == (o.object_class, o.X_TO)
@@ -264,7 +264,7 @@ def test_detections_of_a_random_heap_are_those_above_the_threshold(detector: Lab
             for k in range(8)
         )
     )
-    look = detector.look(heap)
-    expected = [name for name, share in look.visible_share.items() if share >= 0.30]
+    look = detector.perceive(heap)
+    expected = [name for name, share in look.visible_fractions.items() if share >= 0.30]
     assert [d.name for d in look.observation.detections] == expected
     assert 0 < len(expected) < 8

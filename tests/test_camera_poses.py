@@ -21,10 +21,10 @@ from drake_clutter.commands.render import render_scene
 from drake_clutter.config import upgrade
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.perception.explaining import explanation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.perception.pose_fit import PoseFitter, pose_error
-from drake_clutter.perception.segmentation import Window
+from drake_clutter.perception.pose_selection import evaluate_pose
+from drake_clutter.perception.segmentation import ImageWindow
 from drake_clutter.reports.detections_picture import SIDE, detections_picture
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.placement import has_clear_top, seen_through
@@ -132,9 +132,9 @@ def test_the_floor_s_depth_and_its_horizon() -> None:
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: LabelDetector) -> None:
     """As `test_rays.py` has it for a vertical one, by the same tolerances."""
-    look, rendered = tilted.look(scene), tilted.camera.label(scene)
+    look, rendered = tilted.perceive(scene), tilted.camera.label(scene)
     observation, shares = RAYS.observe(scene)
-    assert shares == pytest.approx(look.visible_share, abs=0.003)
+    assert shares == pytest.approx(look.visible_fractions, abs=0.003)
     assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
     cast = labels(scene, OPEN_MINDED)
     assert (cast == rendered).mean() >= 0.9999
@@ -193,8 +193,8 @@ def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(
         resting("cracker_box", Orientation.UPRIGHT_0, (0.0, 0.0), name="wall"),
         resting("gelatin_box", xy=(0, 0.08)),
     )
-    assert tilted.look(scene).visible_share["gelatin_box"] < 0.3
-    assert detector.look(scene).visible_share["gelatin_box"] == 1.0
+    assert tilted.perceive(scene).visible_fractions["gelatin_box"] < 0.3
+    assert detector.perceive(scene).visible_fractions["gelatin_box"] == 1.0
 
 
 def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
@@ -224,14 +224,14 @@ def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelD
     p_error, angle = pose_error(true.object_class, found.X_TO, true.X_TO)
     assert p_error < 0.003
     assert angle < math.radians(2.0)
-    explained = explanation(true.object_class, true.X_TO, depth, CAMERA)
-    assert (explained.mask(depth.shape) != (label == 0)).sum() <= 0.02 * explained.alone
-    assert explained.past <= 0.02 * explained.alone
+    explained = evaluate_pose(true.object_class, true.X_TO, depth, CAMERA)
+    assert (explained.mask(depth.shape) != (label == 0)).sum() <= 0.02 * explained.unoccluded_pixels
+    assert explained.free_space_violations <= 0.02 * explained.unoccluded_pixels
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DEFAULT_CELL.camera], ids=["tilted", "vertical"])
 def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
-    window = Window.of(camera, tray(0.70))
+    window = ImageWindow.around_support(camera, tray(0.70))
     corners = camera.project(
         np.array([[x, y, z] for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)])
     )
@@ -241,7 +241,7 @@ def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
 
 
 def test_detections_are_drawn(tilted: LabelDetector) -> None:
-    picture = detections_picture(tilted.look(SCENES["laid out"]).observation)
+    picture = detections_picture(tilted.perceive(SCENES["laid out"]).observation)
     assert picture.shape == (SIDE, SIDE, 3)
 
 
@@ -252,7 +252,7 @@ def test_detections_are_drawn(tilted: LabelDetector) -> None:
 def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetector) -> None:
     """Free of what is seen and of what is hidden."""
     scene = random_scene(seed)
-    observation, generator = tilted.look(scene).observation, rng(seed)
+    observation, generator = tilted.perceive(scene).observation, rng(seed)
     moves = legal_moves(observation)
     checked = 0
     for move in [moves[i] for i in generator.permutation(len(moves))[:40]]:
@@ -265,7 +265,7 @@ def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetecto
 
 def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
     """Behind a wall the air is unseen although nothing is above it, and so it is out of the frame."""
-    observation = tilted.look(
+    observation = tilted.perceive(
         scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))
     ).observation
     points = np.array(
@@ -286,8 +286,8 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
     """All that a hidden object fills, save beside the known one, is in a block; nothing before it is."""
     wall = resting("cracker_box", Orientation.UPRIGHT_0, name="wall")
     hidden = resting("gelatin_box", xy=(0.0, 0.072), name="hidden")
-    empty = tilted.look(scene_of()).observation.depth
-    observation = tilted.look(scene_of(wall, hidden)).observation
+    empty = tilted.perceive(scene_of()).observation.depth
+    observation = tilted.perceive(scene_of(wall, hidden)).observation
     assert [d.name for d in observation.detections] == ["wall"]
     blocks = unseen_blocks([wall], observation, empty)
     grid = np.stack(np.meshgrid(*(np.linspace(-0.9, 0.9, 9) for _ in range(3))), axis=-1).reshape(
@@ -308,10 +308,10 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
 
 def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
     """Something nameless of 28 mm is a block; floor and rim, at a depth that changes, are none."""
-    empty = tilted.look(scene_of()).observation.depth
-    assert unseen_blocks([], tilted.look(scene_of()).observation, empty) == ()
+    empty = tilted.perceive(scene_of()).observation.depth
+    assert unseen_blocks([], tilted.perceive(scene_of()).observation, empty) == ()
     stranger = resting("gelatin_box", xy=(0.1, 0.1), name="stranger")
-    (block,) = unseen_blocks([], tilted.look(scene_of(stranger)).observation, empty)
+    (block,) = unseen_blocks([], tilted.perceive(scene_of(stranger)).observation, empty)
     assert block.top == pytest.approx(0.028, abs=2e-3)
     assert np.hypot(block.middle[0] - 0.1, block.middle[1] - 0.1) < 0.02
 
@@ -379,7 +379,7 @@ def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(
     )
     empty = np.where(camera.floor_depth < 5, camera.floor_depth, np.float32(np.inf))
     blocks = unseen_blocks(
-        [], replace(detector.look(scene_of(stranger)).observation, detections=()), empty
+        [], replace(detector.perceive(scene_of(stranger)).observation, detections=()), empty
     )
     assert blocks
     for block in blocks:

@@ -32,7 +32,7 @@ def executor(config: ClutterConfig) -> SettleExecutor:
 def carried_out(
     executor: SettleExecutor, detector: LabelDetector, scene: Scene, move: Move, seed: int = 0
 ) -> Outcome:
-    return executed(executor, scene, detector.look(scene).observation, move, rng(seed))
+    return executed(executor, scene, detector.perceive(scene).observation, move, rng(seed))
 
 
 def how_far(before: Scene, after: Scene, name: str) -> float:
@@ -101,13 +101,13 @@ def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
 def test_what_loses_its_support_falls(
     pick: str, falls: str, executor: SettleExecutor, detector: LabelDetector
 ) -> None:
-    observation = detector.look(STACKS).observation
+    observation = detector.perceive(STACKS).observation
     scene = STACKS
     if pick not in {
         d.name for d in observation.detections
     }:  # the can is all but covered: seen here by an open-minded detector
         config = world_with("camera.visibility_threshold=0")
-        observation = LabelDetector(config.cell.camera).look(STACKS).observation
+        observation = LabelDetector(config.cell.camera).perceive(STACKS).observation
     outcome = executed(executor, scene, observation, Move(pick), rng())
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None

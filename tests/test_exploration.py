@@ -171,7 +171,7 @@ def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
 
 def test_nothing_hidden_is_found_at_once(detector: LabelDetector) -> None:
     scene = scene_of(resting("large_marker", name="marker"))
-    task = ExplorationTask(scene, detector.look(scene), REWARDS, 10)
+    task = ExplorationTask(scene, detector.perceive(scene), REWARDS, 10)
     assert (task.end, task.hidden_at_start, task.found) == (EpisodeEnd.ALL_FOUND, (), ())
 
 
@@ -184,7 +184,7 @@ def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
 
 
 def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> None:
-    observation = detector.look(HIDING).observation
+    observation = detector.perceive(HIDING).observation
     moves = legal_moves(observation)
     names = {"cover 1", "cover 2", "marker"}
     assert len(moves) == len(set(moves)) == 9
@@ -263,7 +263,7 @@ def test_invalid_moves_are_those_since_anything_last_changed(detector: LabelDete
 
 def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) -> None:
     """All its moves are invalid then, and what failed before stays so."""
-    before = detector.look(HIDING).observation
+    before = detector.perceive(HIDING).observation
     belief = Belief().update(before).record(Move("marker"), MoveResult.NOT_PLANNED)
     place = Pose((-0.2, 0.25, 0.1), HIDING["cover 1"].X_TO.quaternion)
     placed = belief.record(Move("cover 1"), MoveResult.PLACED, place)
@@ -273,14 +273,14 @@ def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) 
     assert stuck.invalid_moves == (Move("marker"), *its)
     assert stuck.update(before) == stuck
     aside = HIDING.at({"cover 1": resting("cracker_box", xy=ASIDE["cover 1"]).X_TO})
-    assert placed.update(detector.look(aside).observation).invalid_moves == ()
+    assert placed.update(detector.perceive(aside).observation).invalid_moves == ()
     unseen = replace(before, detections=())
     assert placed.update(unseen).invalid_moves == ()
     assert {o.name: o.X_TO for o in placed.update(unseen).objects}["cover 1"] == place
 
 
 def test_nothing_is_said_of_what_is_lost(detector: LabelDetector) -> None:
-    belief = Belief().update(detector.look(HIDING).observation)
+    belief = Belief().update(detector.perceive(HIDING).observation)
     for move in (Move("marker"), Move("cover 1", "marker"), Move("cover 1")):
         belief = belief.record(move, MoveResult.NOT_PLANNED)
     left = belief.forget(["marker"])
@@ -359,13 +359,13 @@ def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) ->
         *(resting("cracker_box", name="below"), resting("large_marker", floor=0.060, name="on it")),
         resting("pudding_box", xy=(0.2, 0.2), name="aside"),
     )
-    observation = detector.look(scene).observation
+    observation = detector.perceive(scene).observation
     assert sweep(largest_first, observation, 3) == ["below", "aside", "on it"]
     assert sweep(largest_clear, observation, 3) == ["aside", "on it", "aside"]
 
 
 def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> None:
-    observation = detector.look(HIDING).observation
+    observation = detector.perceive(HIDING).observation
     covered = replace(observation, depth=np.full_like(observation.depth, 0.5))
     move = largest_clear(Belief(), covered, rng()).move
     assert move is not None
@@ -387,7 +387,7 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
 
 @pytest.mark.parametrize("name", sorted(BASELINES))
 def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
-    observation = detector.look(HIDING).observation
+    observation = detector.perceive(HIDING).observation
 
     def choices(seed: int) -> tuple[Move, ...]:
         policy, generator = BASELINES[name], rng(seed)

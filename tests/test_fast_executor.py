@@ -269,7 +269,7 @@ def test_drake_lets_it_go_at_the_same_place(
 ) -> None:
     """From the ray caster's observation as from the rendered one. A box then creeps by less than 0.1 mm; a fall goes on in Drake,
     whose motion begins where the object was let go, 1 mm higher."""
-    rendered, cast = detector.look(STACKS).observation, seen(STACKS)
+    rendered, cast = detector.perceive(STACKS).observation, seen(STACKS)
     mine = executed(EXECUTOR, STACKS, rendered, move, rng(3))
     same = executed(EXECUTOR, STACKS, cast, move, rng(3))
     assert mine == same

@@ -29,7 +29,7 @@ COVERED = scene_of(
 
 def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
     """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
-    observation = LabelDetector(config.cell.camera).look(scene).observation
+    observation = LabelDetector(config.cell.camera).perceive(scene).observation
     shifted = [
         replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0)))
         for k, d in enumerate(observation.detections)

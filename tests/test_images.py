@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
-from drake_clutter.perception.depth_noise import D435, DepthNoise, noisy_depth
-from drake_clutter.perception.image_set import ImageSet, LabelledImage, run_lengths, write_images
+from drake_clutter.perception.depth_noise import D435_DEPTH_NOISE, DepthNoise, add_depth_noise
+from drake_clutter.perception.image_dataset import (
+    ImageDataset,
+    LabeledImage,
+    encode_run_lengths,
+    write_images,
+)
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
@@ -31,7 +36,7 @@ def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 @pytest.fixture(scope="module")
-def images(camera: OverheadCamera) -> list[LabelledImage]:
+def images(camera: OverheadCamera) -> list[LabeledImage]:
     """Two images of the scene, the second without what lies on top."""
     known: dict[SceneObject, int] = {}
     photograph, generator = training_script("render_image_dataset").photograph, rng()
@@ -41,7 +46,7 @@ def images(camera: OverheadCamera) -> list[LabelledImage]:
 
 @pytest.mark.parametrize(("distance", "expected"), [(1.0, 0.0010), (1.6, 0.0025)])
 def test_noise_grows_with_the_square_of_the_distance(distance: float, expected: float) -> None:
-    measured = noisy_depth(np.full((480, 640), distance, np.float32), rng())
+    measured = add_depth_noise(np.full((480, 640), distance, np.float32), rng())
     held = measured[measured > 0]
     assert measured.dtype == np.float32
     assert held.size > 0.995 * measured.size
@@ -54,8 +59,13 @@ def test_noise_grows_with_the_square_of_the_distance(distance: float, expected: 
 
 
 def test_disparity_comes_in_steps() -> None:
-    measured = noisy_depth(np.full((48, 64), 1.2, np.float32), rng())
-    steps = D435.focal_length * D435.baseline / measured[measured > 0] / D435.step
+    measured = add_depth_noise(np.full((48, 64), 1.2, np.float32), rng())
+    steps = (
+        D435_DEPTH_NOISE.focal_length
+        * D435_DEPTH_NOISE.baseline
+        / measured[measured > 0]
+        / D435_DEPTH_NOISE.disparity_step
+    )
     assert steps == pytest.approx(steps.round(), abs=1e-2)
 
 
@@ -64,23 +74,27 @@ def test_holes_are_shadows_and_speckles() -> None:
     depth = np.full((480, 640), 1.6, np.float32)
     depth[100:300, 200:400] = 1.3
     depth[400:] = np.inf
-    holes = noisy_depth(depth, rng(), DepthNoise(speckles=0)) == 0
+    holes = add_depth_noise(depth, rng(), DepthNoise(mean_speckle_count=0)) == 0
     assert holes[400:].all()
     rows, columns = np.nonzero(holes[:400])
     assert 100 <= rows.min() <= rows.max() < 300
     assert 196 <= columns.min() <= columns.max() == 199
     assert 200 * 2 < rows.size < 200 * 4, "ragged"
-    speckled = noisy_depth(depth, rng()) == 0
+    speckled = add_depth_noise(depth, rng()) == 0
     extra = np.count_nonzero(speckled & ~holes)
-    assert 0 < extra < 3 * D435.speckles * np.pi * D435.speckle_radius**2
-    assert np.array_equal(noisy_depth(depth, rng(1)), noisy_depth(depth, rng(1)))
+    assert (
+        0
+        < extra
+        < 3 * D435_DEPTH_NOISE.mean_speckle_count * np.pi * D435_DEPTH_NOISE.max_speckle_radius**2
+    )
+    assert np.array_equal(add_depth_noise(depth, rng(1)), add_depth_noise(depth, rng(1)))
 
 
-def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabelledImage]) -> None:
+def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabeledImage]) -> None:
     (tmp_path / ".000000").mkdir()  # of an interrupted run
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     assert [path.name for path in tmp_path.iterdir()] == ["000000"]
-    read = ImageSet(tmp_path)
+    read = ImageDataset(tmp_path)
     assert len(read) == 2
     for written, again in zip(images, (read[0], read[1]), strict=True):
         assert np.array_equal(written.color, again.color)
@@ -88,23 +102,23 @@ def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[Labelled
         assert np.allclose(written.depth, again.depth, rtol=0, atol=0.51e-4)
         assert np.array_equal(written.label, again.label)
         assert written.classes == again.classes
-        assert np.array_equal(written.alone, again.alone)
+        assert np.array_equal(written.unoccluded_pixels, again.unoccluded_pixels)
         for X, Y in zip(written.X_TO, again.X_TO, strict=True):
             assert pytest.approx(X.p) == Y.p
             assert pytest.approx(X.rotation, abs=1e-7) == Y.rotation
-    assert read[0].visible_share == pytest.approx([0, 1, 1, 1])
-    assert read[1].visible_share == pytest.approx([1, 1, 1])
+    assert read[0].visible_fractions == pytest.approx([0, 1, 1, 1])
+    assert read[1].visible_fractions == pytest.approx([1, 1, 1])
     with pytest.raises(InputError, match="holds no images"):
-        ImageSet(tmp_path / "000000")
+        ImageDataset(tmp_path / "000000")
 
 
-def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabelledImage]) -> None:
-    assert dict(zip(SCENE.names, images[0].visible_share, strict=True)) == camera.visible_shares(
-        SCENE
-    )
+def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabeledImage]) -> None:
+    assert dict(
+        zip(SCENE.names, images[0].visible_fractions, strict=True)
+    ) == camera.visible_shares(SCENE)
 
 
-def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabelledImage]) -> None:
+def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabeledImage]) -> None:
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     gt, info, eye, coco = (
         json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text())
@@ -138,9 +152,9 @@ def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[Labell
 
 def test_run_lengths() -> None:
     """By hand: they run down the columns, and begin with what is outside."""
-    assert run_lengths(np.array([[False, True], [True, True]])) == [1, 3]
-    assert run_lengths(np.array([[True, False], [False, False]])) == [0, 1, 3]
-    assert run_lengths(np.zeros((2, 3), bool)) == [6]
+    assert encode_run_lengths(np.array([[False, True], [True, True]])) == [1, 3]
+    assert encode_run_lengths(np.array([[True, False], [False, False]])) == [0, 1, 3]
+    assert encode_run_lengths(np.zeros((2, 3), bool)) == [6]
 
 
 def test_a_heap() -> None:

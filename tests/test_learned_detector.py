@@ -48,7 +48,7 @@ def test_it_sees_what_is_there_and_is_sure_of_it(
         nearest = min(seen.detections, key=lambda d: float(np.linalg.norm(d.X_TO.p - o.X_TO.p)))
         assert nearest.object_class.name == o.object_class.name
         assert np.linalg.norm(nearest.X_TO.p - o.X_TO.p) < 0.005
-    assert sum(d.sure for d in seen.detections) >= len(scene.objects) - 1
+    assert sum(d.is_confident for d in seen.detections) >= len(scene.objects) - 1
 
 
 def test_an_empty_tray_is_empty(detector: LearnedDetector, config: ClutterConfig) -> None:

@@ -28,7 +28,7 @@ UPRIGHT = Orientation.UPRIGHT_0
 
 
 def seen(detector: LabelDetector, scene: Scene) -> Observation:
-    return detector.look(scene).observation
+    return detector.perceive(scene).observation
 
 
 def placement(
@@ -235,7 +235,7 @@ def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> Non
         resting("tomato_soup_can", name="can"),
         resting("gelatin_box", xy=(0.0805, 0.0), name="picked"),
     )
-    X_TO = placed_at(detector.look(scene).observation, Move("picked", "can"), rng())
+    X_TO = placed_at(detector.perceive(scene).observation, Move("picked", "can"), rng())
     assert X_TO is not None
     assert X_TO.p[:2] == pytest.approx([0.0, 0.0], abs=0.0075)
 

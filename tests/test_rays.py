@@ -79,10 +79,10 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
     scene: Scene, detector: LabelDetector
 ) -> None:
     """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
-    look, rendered = detector.look(scene), detector.camera.label(scene)
+    look, rendered = detector.perceive(scene), detector.camera.label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == RAYS.visible_shares(scene.objects)
-    assert shares == pytest.approx(look.visible_share, abs=0.003)
+    assert shares == pytest.approx(look.visible_fractions, abs=0.003)
     assert min(shares.values()) < 0.9 < 1.0 <= max(shares.values())
     cast = labels(scene)
     assert (cast == rendered).mean() >= 0.9999
@@ -103,7 +103,7 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
 def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> None:
     """In 32 bit a depth of 1.6 m is known to 0.12 um, and its inverse to as much: 1 um. On a face that is seen at a grazing angle
     the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
-    look = detector.look(scene)
+    look = detector.perceive(scene)
     observation, _ = RAYS.observe(scene)
     rendered, cast = detector.camera.label(scene), labels(scene)
     assert observation.depth.dtype == look.observation.depth.dtype == np.float32
@@ -254,7 +254,7 @@ def test_out_of_the_frame_nothing_is_hidden() -> None:
 
 def test_only_what_a_ray_meets_is_detected() -> None:
     """As `LabelDetector` has it, from which an explorer that is to carry out a plan knows what is in view."""
-    assert [d.name for d in LabelDetector(CAMERA).look(FAR).observation.detections] == ["near"]
+    assert [d.name for d in LabelDetector(CAMERA).perceive(FAR).observation.detections] == ["near"]
     assert [d.name for d in RAYS.observe(FAR)[0].detections] == ["near"]
 
 

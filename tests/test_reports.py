@@ -198,7 +198,9 @@ def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) ->
 
 def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
     alone = Scene((GELATIN,), TRAY)
-    write_episode_page(tmp_path, "Nothing to do", alone, detector.look(alone), [], {}, DEFAULT_CELL)
+    write_episode_page(
+        tmp_path, "Nothing to do", alone, detector.perceive(alone), [], {}, DEFAULT_CELL
+    )
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert "Nothing is hidden." in text
     assert "No move was made." in text

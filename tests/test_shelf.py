@@ -83,7 +83,7 @@ def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
     scene = Scene(
         (resting("pudding_box"), resting("sugar_box", xy=(0.0, 0.25))), shelf.cell.support
     )
-    observation = LabelDetector(shelf.cell.camera).look(scene).observation
+    observation = LabelDetector(shelf.cell.camera).perceive(scene).observation
     for o in scene.objects:
         places = free_places(observation, Move(o.name), shelf.exploration)
         assert places is not None

@@ -109,7 +109,7 @@ def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
         resting("sugar_box", Orientation.FLAT_0, (0.0, y), name=f"sugar_box_{k}")
         for k, y in ((1, -apart), (2, apart))
     ]
-    seen = LabelDetector(CAMERA).look(scene_of(*first)).observation
+    seen = LabelDetector(CAMERA).perceive(scene_of(*first)).observation
     both = np.any([d.mask for d in seen.detections], axis=0)
     west = both & (np.arange(both.shape[1]) < np.nonzero(both)[1].mean())
     across = [
@@ -142,7 +142,9 @@ def test_what_is_known_stands_until_something_explains_more() -> None:
 
 def test_what_is_known_gives_way_to_what_a_detector_is_sure_of() -> None:
     known, _, across = side_by_side()
-    sure = replace(across, detections=tuple(replace(d, sure=True) for d in across.detections))
+    sure = replace(
+        across, detections=tuple(replace(d, is_confident=True) for d in across.detections)
+    )
     observation, lost = tracked(known, sure)
     assert {d.X_TO for d in observation.detections} == {d.X_TO for d in across.detections}
     assert lost == ()

@@ -30,7 +30,7 @@ MOVES = (Move("gelatin_box"), Move("large_marker"))
 
 @pytest.fixture(scope="module")
 def outcomes(config: ClutterConfig, detector: LabelDetector) -> list[tuple[Move, Outcome]]:
-    observation, executor = detector.look(SCENE).observation, ArmExecutor(config)
+    observation, executor = detector.perceive(SCENE).observation, ArmExecutor(config)
     return [(move, executed(executor, SCENE, observation, move, rng())) for move in MOVES]
 
 

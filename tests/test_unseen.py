@@ -23,13 +23,13 @@ from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
 
 CAMERA = DEFAULT_CELL.camera
-EMPTY = LabelDetector(CAMERA).look(scene_of()).observation.depth
+EMPTY = LabelDetector(CAMERA).perceive(scene_of()).observation.depth
 LOWER = resting("sugar_box", Orientation.FLAT_0)
 UPPER = resting("cracker_box", Orientation.FLAT_0, floor=LOWER.top)
 
 
 def seen(objects: Sequence[SceneObject]) -> Observation:
-    return LabelDetector(CAMERA).look(scene_of(*objects)).observation
+    return LabelDetector(CAMERA).perceive(scene_of(*objects)).observation
 
 
 def test_a_block_is_the_least_upright_one() -> None:

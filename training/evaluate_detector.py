@@ -22,8 +22,8 @@ from drake_clutter.catalog import Catalog, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.perception.depth_noise import noisy_depth
-from drake_clutter.perception.image_set import ImageSet, LabelledImage
+from drake_clutter.perception.depth_noise import add_depth_noise
+from drake_clutter.perception.image_dataset import ImageDataset, LabeledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
@@ -55,10 +55,10 @@ class Seen:
 
 
 def compared(
-    image: LabelledImage, detector: LearnedDetector, catalog: Catalog, rng: np.random.Generator
+    image: LabeledImage, detector: LearnedDetector, catalog: Catalog, rng: np.random.Generator
 ) -> tuple[list[Seen], int, float]:
     """The objects of an image, how many detections are none of them, and s that the detector took."""
-    depth = noisy_depth(image.depth, rng)
+    depth = add_depth_noise(image.depth, rng)
     begun = time.perf_counter()
     said = detector.detect(depth, image.color).detections
     spent = time.perf_counter() - begun
@@ -69,7 +69,7 @@ def compared(
     rows, columns = linear_sum_assignment(-overlap)
     pairs = {int(k): said[d] for k, d in zip(rows, columns, strict=True) if overlap[k, d] >= 0.5}
     objects = []
-    for k, (name, share) in enumerate(zip(image.classes, image.visible_share, strict=True)):
+    for k, (name, share) in enumerate(zip(image.classes, image.visible_fractions, strict=True)):
         if not masks[k].any():
             continue
         detection = pairs.get(k)
@@ -142,7 +142,7 @@ def main(
         dict[str, Any](),
     )
 
-    def shown(path: Path) -> tuple[list[str], list[LabelledImage]]:
+    def shown(path: Path) -> tuple[list[str], list[LabeledImage]]:
         held = load_scene_set(path, catalog)
         found = []
         for k in track(range(min(count, len(held.scenes))), path.stem, console=console):
@@ -158,7 +158,7 @@ def main(
             )
             names = tuple(o.object_class.name for o in scene.objects)
             found.append(
-                LabelledImage(
+                LabeledImage(
                     image.color,
                     image.depth,
                     image.label,
@@ -169,7 +169,7 @@ def main(
             )
         return [c.name for c in held.classes], found
 
-    def told(names: list[str], given: list[LabelledImage]) -> dict[str, Any]:
+    def told(names: list[str], given: list[LabeledImage]) -> dict[str, Any]:
         eye = LearnedDetector(
             network, [catalog.classes[n] for n in names], config.cell.camera, config.cell.support
         )
@@ -183,7 +183,7 @@ def main(
     for path in scenes:
         rows[path.stem] = told(*shown(path))
     if images is not None:
-        held_out = ImageSet(images)
+        held_out = ImageDataset(images)
         rows["images"] = told(
             list(network.classes), [held_out[k] for k in range(min(count, len(held_out)))]
         )

@@ -2,7 +2,7 @@
 
     python training/render_image_dataset.py --out runs/images --count 20000 --workers 2
 
-A work item is one scene, in a folder of its own (see `drake_clutter.perception.image_set`):
+A work item is one scene, in a folder of its own (see `drake_clutter.perception.image_dataset`):
 
     a heap       20 objects of random classes, turned at random, that Drake drops on the tray; at one of the last moments of the
                  fall, and with objects taken away from the top
@@ -38,7 +38,7 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, prepare_output_directory, write_json
-from drake_clutter.perception.image_set import LabelledImage, write_images
+from drake_clutter.perception.image_dataset import LabeledImage, write_images
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
@@ -221,7 +221,7 @@ def random_lamps(rng: np.random.Generator) -> RenderEngineVtkParams:
 
 def photograph(
     camera: OverheadCamera, scene: Scene, known: dict[SceneObject, int], rng: np.random.Generator
-) -> LabelledImage:
+) -> LabeledImage:
     """An image of a scene, with colours drawn anew.
 
     Args:
@@ -238,7 +238,7 @@ def photograph(
     classes = tuple(o.object_class.name for o in scene.objects)
     alone = np.array([known[o] for o in scene.objects], np.int64)
     color = recoloured(images, len(classes), rng)
-    return LabelledImage(
+    return LabeledImage(
         color, images.depth, images.label, classes, tuple(o.X_TO for o in scene.objects), alone
     )
 

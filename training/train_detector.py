@@ -19,12 +19,12 @@ from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade
 from drake_clutter.files import cli_error_handler
 from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.perception.image_set import ImageSet
-from drake_clutter.perception.segmentation import DETECTOR, SegmentationNetwork, Window
-from drake_clutter.perception.segmentation_learning import (
+from drake_clutter.perception.image_dataset import ImageDataset
+from drake_clutter.perception.segmentation import CHECKPOINT_KIND, ImageWindow, SegmentationNetwork
+from drake_clutter.perception.segmentation_training import (
     SegmentationConfig,
     SegmentationLearner,
-    example,
+    make_example,
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.validation import Flag, InRange, config_class, load_config_as, renamed_fields
@@ -33,14 +33,14 @@ CHECKPOINT = "detector.safetensors"
 
 
 @config_class
-@renamed_fields(catalogue="catalog")
+@renamed_fields(catalogue="catalog", looks_at_color="use_color")
 class DetectorTrainingConfig:
     """A training.
 
     Attributes:
         images: folder of `render_image_dataset.py`; held_out: of its last images are not learned from, but looked at as it goes.
         objects: name of the object set; catalog: a folder with object classes of one's own, or "".
-        looks_at_color: whether the network is given colour beside depth.
+        use_color: whether the network is given colour beside depth.
         warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
         seed: same seed, same weights (on the same kind of machine).
         evaluate_every: steps.
@@ -51,7 +51,7 @@ class DetectorTrainingConfig:
     held_out: Annotated[int, InRange(0)] = 200
     objects: str = "pantry14"
     catalog: str = ""
-    looks_at_color: Flag = False
+    use_color: Flag = False
     warm_start: str = ""
     seed: Annotated[int, InRange(0)] = 0
     evaluate_every: Annotated[int, InRange(1)] = 250
@@ -89,32 +89,35 @@ def main(
             given.objects
         )
     ]
-    images = ImageSet(Path(given.images))
+    images = ImageDataset(Path(given.images))
     learned = len(images) - given.held_out
     torch.manual_seed(given.seed)
-    network = SegmentationNetwork(classes, given.looks_at_color)
+    network = SegmentationNetwork(classes, given.use_color)
     if given.warm_start:
-        network.begin_with(SegmentationNetwork.load(Path(given.warm_start)))
+        network.warm_start(SegmentationNetwork.load(Path(given.warm_start)))
     learner = SegmentationLearner(
         network, images.__getitem__, learned, given.learning, camera, support, given.seed, chosen
     )
-    run, window = TrainingRun(out, given, learner, given.learning.steps), Window.of(camera, support)
+    run, window = (
+        TrainingRun(out, given, learner, given.learning.steps),
+        ImageWindow.around_support(camera, support),
+    )
 
     def figures() -> dict[str, float]:
         """Of the images held out: share of the pixels whose class is right, over the union, mean of classes; error of votes."""
         network.eval()
         both, either, errors = np.zeros(len(classes)), np.zeros(len(classes)), list[float]()
         for k in range(learned, len(images)):
-            shown = example(
-                images[k], classes, camera, window, item_rng(given.seed, 1, k), given.looks_at_color
+            shown = make_example(
+                images[k], classes, camera, window, item_rng(given.seed, 1, k), given.use_color
             )
             with torch.inference_mode():
                 logits, votes = network(torch.from_numpy(shown.image)[None].to(chosen))
             kind = logits[0].argmax(dim=0).cpu().numpy()
             for c in range(len(classes)):
-                is_, said = shown.kind == c + 1, kind == c + 1
+                is_, said = shown.class_map == c + 1, kind == c + 1
                 both[c], either[c] = both[c] + (is_ & said).sum(), either[c] + (is_ | said).sum()
-            error = np.linalg.norm(votes[0].cpu().numpy() - shown.to_middle, axis=0)[kind > 0]
+            error = np.linalg.norm(votes[0].cpu().numpy() - shown.center_offsets, axis=0)[kind > 0]
             errors.append(float(np.nanmedian(error)) if np.isfinite(error).any() else np.nan)
         return {
             "iou": float(np.mean(both / np.maximum(either, 1))),
@@ -122,14 +125,14 @@ def main(
         }
 
     while learner.step < given.learning.steps:
-        learner.advance()
+        learner.train_iteration()
         if learner.step == given.learning.steps or learner.step % given.evaluate_every == 0:
             run.report(figures(), learner.losses)
             run.save()
     about = {
-        "kind": DETECTOR,
+        "kind": CHECKPOINT_KIND,
         "classes": classes,
-        "looks_at_color": given.looks_at_color,
+        "use_color": given.use_color,
         "images": learned,
     }
     run.finish(CHECKPOINT, network, about)

@@ -134,7 +134,7 @@ def plan_only(
         InputError: as `carry_out`.
     """
     look, rng, executor = (
-        LabelDetector(config.cell.camera).look(scene),
+        LabelDetector(config.cell.camera).perceive(scene),
         item_rng(seed),
         ArmExecutor(config),
     )
@@ -191,7 +191,7 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
                 "newly_found": list(step.newly_found),
                 "picks": dict(step.decision.picks),
                 "known": list(step.decision.known),
-                "visible_share": step.look.visible_share,
+                "visible_share": step.look.visible_fractions,
                 "reward": step.reward,
             }
         )
@@ -205,7 +205,7 @@ def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) 
         "hidden_at_start": list(task.hidden_at_start),
         "found": list(task.found),
         "total_reward": sum(step.reward for step in task.steps),
-        "visible_share_at_start": task.first_look.visible_share,
+        "visible_share_at_start": task.first_look.visible_fractions,
         "moves": moves,
     }
 

@@ -9,25 +9,25 @@ from drake_clutter.simulation.camera import OverheadCamera
 
 
 @dataclass(frozen=True)
-class Look:
+class PerceptionResult:
     """One look at a scene.
 
     Attributes:
         observation: what an explorer may know.
-        visible_share: the truth behind it, by name: of each object's unoccluded pixels, the share that is seen.
+        visible_fractions: the truth behind it, by name: of each object's unoccluded pixels, the share that is seen.
     """
 
     observation: Observation
-    visible_share: dict[str, float]
+    visible_fractions: dict[str, float]
 
 
 class LabelDetector:
     """Detects every object that is in the frame and not hidden, with its true class and pose."""
 
-    def __init__(self, config: Camera) -> None:
-        self.camera = OverheadCamera(config)
+    def __init__(self, camera: Camera) -> None:
+        self.camera = OverheadCamera(camera)
 
-    def look(self, scene: Scene) -> Look:
+    def perceive(self, scene: Scene) -> PerceptionResult:
         """What the camera shows of a scene."""
         depth, label = self.camera.depth_and_label(scene)
         shares = self.camera.visible_shares(scene, label)
@@ -37,4 +37,6 @@ class LabelDetector:
             for index, o in enumerate(scene.objects)
             if o.name not in hidden and (mask := label == index).any()
         )
-        return Look(Observation(depth, detections, self.camera.config, scene.support), shares)
+        return PerceptionResult(
+            Observation(depth, detections, self.camera.config, scene.support), shares
+        )

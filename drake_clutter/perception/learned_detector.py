@@ -13,83 +13,91 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
-from drake_clutter.perception.explaining import Explanation, chosen, explanation
-from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
-from drake_clutter.perception.pose_score import FLOOR_SLACK
-from drake_clutter.perception.second_look import (
-    LEAST,
+from drake_clutter.perception.hypothesis_refinement import (
+    MIN_SEGMENT_CELLS,
     Mask,
-    doubtful,
-    halves,
-    possible,
-    surfaces,
-    unexplained,
+    candidate_classes,
+    find_ambiguous_regions,
+    find_unexplained_surfaces,
+    label_surfaces,
+    split_mask,
+)
+from drake_clutter.perception.pose_fit import FittedPose, PoseFitter
+from drake_clutter.perception.pose_score import MAX_FLOOR_PENETRATION
+from drake_clutter.perception.pose_selection import (
+    PoseEvidence,
+    evaluate_pose,
+    select_consistent_poses,
 )
 from drake_clutter.perception.segmentation import (
+    ImageWindow,
     Segment,
     SegmentationNetwork,
-    Window,
-    coarse,
-    fine,
-    network_input,
-    points,
-    segments,
-    without_holes,
+    backproject_window,
+    downsample,
+    extract_segments,
+    fill_holes,
+    make_network_input,
+    upsample,
 )
 from drake_clutter.scenes.geometry import penetration
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 
-LEAST_SCORE = 0.3
+MIN_SCORE = 0.3
 """Of a fitted pose; what is worse is no detection."""
-SURE_SCORE, CLAIMED = 0.6, 0.7
+CONFIDENT_SCORE, MAX_CLAIMED_FRACTION = 0.6, 0.7
 """A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
-RIM_SLACK = 0.02
+MAX_RIM_OVERHANG = 0.02
 """m, by which what is recognised may reach past the rim; the arm does, and it is no object."""
-SIDE_BY_SIDE = 2
+CONCURRENT_FITS = 2
 """Segments that are fitted at the same time; always so many, so that the number of cores changes no result."""
-FLOOR_WITHIN = 0.008
+FLOOR_DEPTH_TOLERANCE = 0.008
 """m, of the floor; what is measured there is the floor: nothing that lies on it is so flat."""
-IN_EACH_OTHER = 0.010
+MAX_PENETRATION = 0.010
 """m; what penetrates deeper is not there together."""
-LEAST_SHARE = 0.2
+MIN_VISIBLE_FRACTION = 0.2
 """Of the pixels that an object would cover alone, that must be seen of it."""
-SURE_VOTES, VOTE_WITHIN = 0.8, 0.03
+CONFIDENT_VOTE_FRACTION, VOTE_RADIUS = 0.8, 0.03
 """A detection is sure if such a share of its pixels, by their chances of its class, votes for its middle within so many m."""
-TWO_INSTEAD = 0.1
+SPLIT_FREE_SPACE_RATIO = 0.1
 """Of the pixels in which a pose is seen, that in which the camera sees past it, if two may be there instead."""
 
 
 class _Candidate(NamedTuple):
     object_class: ObjectClass
     fitted: FittedPose
-    explains: Explanation
+    evidence: PoseEvidence
 
 
-def _seen_past(explains: Explanation) -> bool:
+def _may_be_two_objects(explains: PoseEvidence) -> bool:
     """Whether the camera sees past so much of a pose that two smaller objects may lie side by side there."""
-    return explains.past > TWO_INSTEAD * int(np.count_nonzero(explains.seen))
+    return explains.free_space_violations > SPLIT_FREE_SPACE_RATIO * int(
+        np.count_nonzero(explains.consistent)
+    )
 
 
-def _sure(X_TO: Pose, chances: NDArray[np.float32], votes_T: NDArray[np.float32]) -> bool:
+def _is_confident(X_TO: Pose, chances: NDArray[np.float32], votes_T: NDArray[np.float32]) -> bool:
     """Whether the network's answers, chances (n,) of the class and votes (n, 3) m for the middle, say so of a pose."""
-    here = np.linalg.norm(votes_T - X_TO.p, axis=1) < VOTE_WITHIN  # false where it is NaN
-    return bool((here * chances).sum() > SURE_VOTES * len(chances))
+    here = np.linalg.norm(votes_T - X_TO.p, axis=1) < VOTE_RADIUS  # false where it is NaN
+    return bool((here * chances).sum() > CONFIDENT_VOTE_FRACTION * len(chances))
 
 
-def _best(candidates: Sequence[_Candidate], shape: tuple[int, int]) -> list[_Candidate]:
+def _select_candidates(
+    candidates: Sequence[_Candidate], shape: tuple[int, int]
+) -> list[_Candidate]:
     """Those that together explain an image best, and of which no two are in the same place."""
     objects = [SceneObject(str(k), c.object_class, c.fitted.X_TO) for k, c in enumerate(candidates)]
 
     @cache
     def clash(a: int, b: int) -> bool:
-        return penetration(objects[a], objects[b]) > IN_EACH_OTHER
+        return penetration(objects[a], objects[b]) > MAX_PENETRATION
 
-    numbers = chosen(
-        [c.explains for c in candidates],
+    numbers = select_consistent_poses(
+        [c.evidence for c in candidates],
         [c.fitted.score for c in candidates],
         shape,
-        LEAST_SHARE,
+        MIN_VISIBLE_FRACTION,
         clash,
     )
     return [candidates[k] for k in numbers]
@@ -112,7 +120,10 @@ class LearnedDetector:
         """With a trained network, for objects of these classes, of which it must know all."""
         self._network, self._camera, self._support = network, camera, support
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._classes, self._window = {c.name: c for c in classes}, Window.of(camera, support)
+        self._classes, self._window = (
+            {c.name: c for c in classes},
+            ImageWindow.around_support(camera, support),
+        )
         self._unknown = torch.tensor(
             [False] + [name not in self._classes for name in self._network.classes]
         )
@@ -120,7 +131,7 @@ class LearnedDetector:
             min(self._classes[n].size) / 2 if n in self._classes else 0.0
             for n in self._network.classes
         ]
-        self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(SIDE_BY_SIDE)
+        self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(CONCURRENT_FITS)
 
     def detect(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> Observation:
         """What two images show; names count the objects of each class, and mean nothing beyond this image.
@@ -132,9 +143,9 @@ class LearnedDetector:
             color: (height, width, 3).
         """
         window, network = self._window, self._network
-        p_TP = points(depth, self._camera, window)
-        given = network_input(
-            p_TP, color[window.rows, window.columns] if network.looks_at_color else None
+        p_TP = backproject_window(depth, self._camera, window)
+        given = make_network_input(
+            p_TP, color[window.rows, window.columns] if network.use_color else None
         )
         with torch.inference_mode():
             logits, votes = network(
@@ -142,40 +153,44 @@ class LearnedDetector:
             )
             logits = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf)
             kind, chances = logits.argmax(dim=0).numpy(), torch.softmax(logits, dim=0)[1:].numpy()
-        votes_T = coarse(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
-        poses = self._sure_first(
-            segments(kind, votes_T, self._radii, network.classes, window, depth.shape, LEAST), depth
+        votes_T = downsample(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
+        poses = self._fit_largest_first(
+            extract_segments(
+                kind, votes_T, self._radii, network.classes, window, depth.shape, MIN_SEGMENT_CELLS
+            ),
+            depth,
         )
-        surface = surfaces(coarse(p_TP)[..., 2])
+        surface = label_surfaces(downsample(p_TP)[..., 2])
         for again in (1, 2):
-            best = _best(poses, depth.shape)
+            best = _select_candidates(poses, depth.shape)
             explained = [
-                coarse(one.explains.mask(depth.shape)[window.rows, window.columns]) for one in best
+                downsample(one.evidence.mask(depth.shape)[window.rows, window.columns])
+                for one in best
             ]
-            masks = unexplained(surface, explained)
+            masks = find_unexplained_surfaces(surface, explained)
             if again == 1:
                 classes = [network.classes.index(one.object_class.name) for one in best]
-                masks += doubtful(surface, explained, classes, chances)
+                masks += find_ambiguous_regions(surface, explained, classes, chances)
             else:
                 masks += [
                     mask
                     for one, mask in zip(best, explained, strict=True)
-                    if _seen_past(one.explains)
+                    if _may_be_two_objects(one.evidence)
                 ]
-                masks = [half for mask in masks for half in halves(mask, votes_T)]
-            poses += self._fitted(self._guessed(masks, chances, votes_T, depth.shape), depth)
+                masks = [half for mask in masks for half in split_mask(mask, votes_T)]
+            poses += self._fit(self._propose_segments(masks, chances, votes_T, depth.shape), depth)
         counted, found = Counter[str](), list[Detection]()
-        clean = without_holes(np.where(depth > 0, depth, np.nan))
+        clean = fill_holes(np.where(depth > 0, depth, np.nan))
         floor = self._camera.floor_depth
-        at_floor = np.abs(clean - floor) < FLOOR_WITHIN
+        at_floor = np.abs(clean - floor) < FLOOR_DEPTH_TOLERANCE
         clean[at_floor] = floor[at_floor]
-        for candidate in _best(poses, depth.shape):
-            name, e = candidate.object_class.name, candidate.explains
+        for candidate in _select_candidates(poses, depth.shape):
+            name, e = candidate.object_class.name, candidate.evidence
             mask = e.mask(depth.shape)
             counted[name] += 1
-            clean[mask] = e.away[e.seen]
-            answers = coarse(mask[window.rows, window.columns])
-            sure = _sure(
+            clean[mask] = e.rendered_depth[e.consistent]
+            answers = downsample(mask[window.rows, window.columns])
+            sure = _is_confident(
                 candidate.fitted.X_TO,
                 chances[network.classes.index(name)][answers],
                 votes_T[answers],
@@ -191,7 +206,7 @@ class LearnedDetector:
             )
         return Observation(clean, tuple(found), self._camera, self._support)
 
-    def _guessed(
+    def _propose_segments(
         self,
         masks: Sequence[Mask],
         chances: NDArray[np.float32],
@@ -203,33 +218,36 @@ class LearnedDetector:
         for mask in masks:
             votes = votes_T[mask]
             votes = votes[np.isfinite(votes).all(axis=1)]
-            if len(votes) >= LEAST:
+            if len(votes) >= MIN_SEGMENT_CELLS:
                 whole, p_TO = (
-                    fine(mask, self._window, shape),
+                    upsample(mask, self._window, shape),
                     np.median(votes.astype(np.float64), axis=0),
                 )
                 found += [
-                    Segment(self._network.classes[k], whole, p_TO) for k in possible(mask, chances)
+                    Segment(self._network.classes[k], whole, p_TO)
+                    for k in candidate_classes(mask, chances)
                 ]
         return found
 
-    def _sure_first(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+    def _fit_largest_first(
+        self, found: Sequence[Segment], depth: NDArray[np.float32]
+    ) -> list[_Candidate]:
         """Poses of segments, the largest first; what a sure pose has explained already is left out."""
         fitted, claimed = list[_Candidate](), np.zeros(depth.shape, bool)
         left = deque(sorted(found, key=lambda segment: -np.count_nonzero(segment.mask)))
         while left:
             next_ones = list[Segment]()
-            while left and len(next_ones) < SIDE_BY_SIDE:
+            while left and len(next_ones) < CONCURRENT_FITS:
                 segment = left.popleft()
-                if claimed[segment.mask].mean() <= CLAIMED:
+                if claimed[segment.mask].mean() <= MAX_CLAIMED_FRACTION:
                     next_ones.append(segment)
-            for candidate in self._fitted(next_ones, depth):
+            for candidate in self._fit(next_ones, depth):
                 fitted.append(candidate)
-                if candidate.fitted.score >= SURE_SCORE:
-                    claimed |= candidate.explains.mask(depth.shape)
+                if candidate.fitted.score >= CONFIDENT_SCORE:
+                    claimed |= candidate.evidence.mask(depth.shape)
         return fitted
 
-    def _fitted(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+    def _fit(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
         """The poses of segments that are good enough."""
         classes = [self._classes[segment.name] for segment in found]
         poses = self._workers.map(
@@ -237,18 +255,18 @@ class LearnedDetector:
         )
         return [
             _Candidate(
-                object_class, pose, explanation(object_class, pose.X_TO, depth, self._camera)
+                object_class, pose, evaluate_pose(object_class, pose.X_TO, depth, self._camera)
             )
             for object_class, pose in zip(classes, poses, strict=True)
             if pose is not None
-            and pose.score >= LEAST_SCORE
-            and self._on_tray(object_class, pose.X_TO)
+            and pose.score >= MIN_SCORE
+            and self._is_on_support(object_class, pose.X_TO)
         ]
 
-    def _on_tray(self, object_class: ObjectClass, X_TO: Pose) -> bool:
+    def _is_on_support(self, object_class: ObjectClass, X_TO: Pose) -> bool:
         """Whether an object can be there: within the rim, and not below the floor."""
         corners = X_TO.apply(object_class.corners)
         return bool(
-            (np.abs(corners[:, :2]) < self._support.half_size + RIM_SLACK).all()
-            and corners[:, 2].min() > -2 * FLOOR_SLACK
+            (np.abs(corners[:, :2]) < self._support.half_size + MAX_RIM_OVERHANG).all()
+            and corners[:, 2].min() > -2 * MAX_FLOOR_PENETRATION
         )

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from drake_clutter.cell.pinhole import Floats, Pinhole, pose_in_camera, project
 
-WITHIN = 0.006
+DEPTH_TOLERANCE = 0.006
 """m along the optical axis, within which what is seen agrees with a pose."""
-_PRIOR = 0.001
+CENTER_PRIOR_WEIGHT = 0.001
 """What a centre 1 cm away from the guess costs a score: little, it decides only what the image leaves open."""
-_BELOW = 20.0
+FLOOR_PENALTY = 20.0
 """What 1 m below the floor costs a score: 5 cm, the whole of it."""
-FLOOR_SLACK = 0.006
+MAX_FLOOR_PENETRATION = 0.006
 """m, by which a pose may reach below the floor: as much as depth may be wrong."""
 COARSE_RAYS, FINE_RAYS = 350, 1500
-_LONG_STEP = 0.0015
+MIN_COARSE_STEP = 0.0015
 """m; a step that is at least so long is judged by few rays."""
 
 
-class View(NamedTuple):
+class SegmentView(NamedTuple):
     """An object in the image.
 
     Attributes:
@@ -87,7 +87,7 @@ def _cylinder_distances(h, e, ray, step, first, stride, away):  # type: ignore[n
 
 
 @njit(cache=True)
-def distances_along(cylinder, h, e, ray, step, first, stride, away):  # type: ignore[no-untyped-def]
+def cast_ray_row(cylinder, h, e, ray, step, first, stride, away):  # type: ignore[no-untyped-def]
     """Fills away (n,) with distances, m along the optical axis, to a box or a cylinder of half sizes h; inf where it is missed.
 
     Ray k goes from the eye e along ray + (first + k stride) step, all three in O.
@@ -99,7 +99,7 @@ def distances_along(cylinder, h, e, ray, step, first, stride, away):  # type: ig
 
 
 @njit(cache=True)
-def eye_in(R, p):  # type: ignore[no-untyped-def]
+def camera_position_in_object(R, p):  # type: ignore[no-untyped-def]
     """Where the camera is in O, of a pose R_CO (3, 3), p_CO (3) m."""
     return (
         -R[0, 0] * p[0] - R[1, 0] * p[1] - R[2, 0] * p[2],
@@ -133,7 +133,7 @@ def image_bounds(half, R, p, shape, camera):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def rays_of_row(R, v, camera):  # type: ignore[no-untyped-def]
+def ray_row(R, v, camera):  # type: ignore[no-untyped-def]
     """In O, of a pose R_CO (3, 3): the ray in row v and column u0, and the step to the next column."""
     y, focal = (v - camera.v0) / camera.focal_length, camera.focal_length
     ray = (R[1, 0] * y + R[2, 0], R[1, 1] * y + R[2, 1], R[1, 2] * y + R[2, 2])
@@ -141,7 +141,7 @@ def rays_of_row(R, v, camera):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
+def pose_consistency(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
     camera, window = view.camera, view.window
     R, p = pose_in_camera(camera, R, p)
@@ -151,17 +151,17 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
     row, row_end = min(window[0], top), max(window[1], bottom)
     column, column_end = min(window[2], left), max(window[3], right)
     stride = max(1, round(math.sqrt((window[1] - window[0]) * (window[3] - window[2]) / rays)))
-    e = eye_in(R, p)
+    e = camera_position_in_object(R, p)
     h = (half[0], half[1], half[2])
     speaks_for, against = 0.0, 0.0
     row_of_rays = np.empty((column_end - column) // stride + 2)
     for v in range(row - row % stride, row_end, stride):
         if v < row:
             continue
-        ray, step = rays_of_row(R, v, camera)
+        ray, step = ray_row(R, v, camera)
         first = column - column % stride + (v // stride) % stride
         distances = row_of_rays[: max(0, (column_end - first + stride - 1) // stride)]
-        distances_along(cylinder, h, e, ray, step, first - camera.u0, stride, distances)
+        cast_ray_row(cylinder, h, e, ray, step, first - camera.u0, stride, distances)
         for k in range(len(distances)):
             u, away = first + k * stride, distances[k]
             seen, ours = view.depth[v, u], view.mask[v, u]
@@ -182,7 +182,7 @@ def share_explained(cylinder, half, R, p, view, rays, within):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
+def pose_objective(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """The score, less what the distance to the guess costs, and what reaching below the tray's floor does."""
     off = p - view.p_TO_guess
     if cylinder:
@@ -191,37 +191,39 @@ def worth(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-
         )
     else:
         lowest = p[2] - half[0] * abs(R[2, 0]) - half[1] * abs(R[2, 1]) - half[2] * abs(R[2, 2])
-    cost = _PRIOR * (off * off).sum() / 1e-4 + _BELOW * max(0.0, -lowest - FLOOR_SLACK)
-    return share_explained(cylinder, half, R, p, view, rays, within) - cost
+    cost = CENTER_PRIOR_WEIGHT * (off * off).sum() / 1e-4 + FLOOR_PENALTY * max(
+        0.0, -lowest - MAX_FLOOR_PENETRATION
+    )
+    return pose_consistency(cylinder, half, R, p, view, rays, within) - cost
 
 
 @njit(cache=True)
-def turned(R, axis, angle):  # type: ignore[no-untyped-def]
+def rotate_about_axis(R, axis, angle):  # type: ignore[no-untyped-def]
     """R (3, 3) turned about a unit axis (3,) of T by an angle, rad."""
     c, s = math.cos(angle), math.sin(angle)
-    turned = np.empty((3, 3))
+    rotated = np.empty((3, 3))
     for i in range(3):
         column = R[:, i]
         along = axis[0] * column[0] + axis[1] * column[1] + axis[2] * column[2]
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
-            turned[j, i] = (
+            rotated[j, i] = (
                 c * column[j]
                 + s * (axis[k] * column[m] - axis[m] * column[k])
                 + (1 - c) * along * axis[j]
             )
-    return turned
+    return rotated
 
 
 @njit(cache=True, nogil=True)
-def search(cylinder, half, R, p, view, first_step, steps, resting):  # type: ignore[no-untyped-def]
+def refine_pose(cylinder, half, R, p, view, first_step, steps, resting):  # type: ignore[no-untyped-def]
     """Moves and turns a pose to a greater value, in steps that are halved; a resting one turns about the vertical only."""
     step, reach, rays, best = first_step, half.max(), 0, 0.0
     vertical = np.array([0.0, 0.0, 1.0])
     for _ in range(steps):
         if rays != FINE_RAYS:
-            rays = FINE_RAYS if step < _LONG_STEP else COARSE_RAYS
-            best = worth(cylinder, half, R, p, view, rays, WITHIN)
+            rays = FINE_RAYS if step < MIN_COARSE_STEP else COARSE_RAYS
+            best = pose_objective(cylinder, half, R, p, view, rays, DEPTH_TOLERANCE)
         for _ in range(3):
             better = False
             for way in range(6):
@@ -238,8 +240,10 @@ def search(cylinder, half, R, p, view, first_step, steps, resting):  # type: ign
                         new_p[way] += sign * step
                     else:
                         axis = vertical if resting else R[:, turn].copy()
-                        new_R = turned(R, axis, sign * step / reach)
-                    value = worth(cylinder, half, new_R, new_p, view, rays, WITHIN)
+                        new_R = rotate_about_axis(R, axis, sign * step / reach)
+                    value = pose_objective(
+                        cylinder, half, new_R, new_p, view, rays, DEPTH_TOLERANCE
+                    )
                     if value > best + 1e-6:
                         best, R, p, better = value, new_R, new_p, True
                         break

@@ -1,7 +1,7 @@
 """The perfect detector without rendering: it casts the camera's rays at the true objects, which is what training needs."""
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.perception.label_detector import Look
+from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.visibility import RayCaster
 
@@ -9,10 +9,10 @@ from drake_clutter.stability.visibility import RayCaster
 class RayDetector:
     """Detects what `LabelDetector` does (a `Detector`), of convex objects, without a renderer."""
 
-    def __init__(self, config: Camera) -> None:
-        self._rays = RayCaster(config)
+    def __init__(self, camera: Camera) -> None:
+        self._rays = RayCaster(camera)
 
-    def look(self, scene: Scene) -> Look:
+    def perceive(self, scene: Scene) -> PerceptionResult:
         """What the camera shows of a scene."""
         observation, shares = self._rays.observe(scene)
-        return Look(observation, shares)
+        return PerceptionResult(observation, shares)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import atomic_write, write_text
-from drake_clutter.perception.label_detector import Look
+from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.reports.arm_pictures import arm_moments, strip
 from drake_clutter.reports.detections_picture import detections_picture
 from drake_clutter.reports.pictures import Mark, Marks, PictureCamera, humanised
@@ -43,7 +43,7 @@ def write_episode_page(
     out: Path,
     title: str,
     start: Scene,
-    first_look: Look,
+    first_look: PerceptionResult,
     steps: Sequence[Step],
     summary: Mapping[str, Any],
     cell: WorkCell,
@@ -126,7 +126,7 @@ def _move(
     pictures: _Pictures,
     number: int,
     scene: Scene,
-    look: Look,
+    look: PerceptionResult,
     step: Step,
     known: frozenset[str],
     cell: WorkCell,
@@ -196,7 +196,7 @@ def _move(
         f'<div class="pair">{figures}</div>'
         f"{_beliefs(step.decision, scene, step.newly_found)}"
         f"<h4>Visible share of each object, before &rarr; after (hidden below {threshold:.0%})</h4>"
-        f"{_shares(look.visible_share, step.look.visible_share, threshold, step.newly_found)}</article>"
+        f"{_shares(look.visible_fractions, step.look.visible_fractions, threshold, step.newly_found)}</article>"
     )
 
 
@@ -304,7 +304,7 @@ def _percent(share: float) -> str:
     return f"{100 * min(max(share, 0.0), 1.0):.1f}%"
 
 
-def _in_view(look: Look) -> tuple[str, ...]:
+def _in_view(look: PerceptionResult) -> tuple[str, ...]:
     return tuple(detection.name for detection in look.observation.detections)
 
 

@@ -218,14 +218,14 @@ class Detection:
         object_class: its class.
         X_TO: its pose in the tray frame.
         mask: (height, width) bool, its pixels.
-        sure: whether all that was looked at says so; without that, what was known before may be right.
+        is_confident: whether all that was looked at says so; without that, what was known before may be right.
     """
 
     name: str
     object_class: ObjectClass
     X_TO: Pose
     mask: NDArray[np.bool_]
-    sure: bool = False
+    is_confident: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,7 @@ class ClosedLoop:
         world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else for_who_sees(world)
         self._detector = LabelDetector(world.cell.camera)
-        self.look = self._detector.look(scene)
+        self.look = self._detector.perceive(scene)
         ways = PlannerConfig() if perceive is None else GUARDED
         self._planner, empty = PickPlacePlanner(world.cell, ways), empty_depth(world.cell)
         self.policy_system = PolicySystem(
@@ -208,7 +208,7 @@ class ClosedLoop:
         decision = replace(decision, move=replace(decision.move, pick=picked))
         # The simulation goes on from where things are in it.
         self.scene = self.simulation.scene
-        self.look = self._detector.look(self.scene)
+        self.look = self._detector.perceive(self.scene)
         return Attempt(decision, replace(outcome, scene=self.scene, motion=motion), self.look)
 
     def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:

@@ -13,7 +13,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
-from drake_clutter.perception.depth_noise import DepthNoise, noisy_depth
+from drake_clutter.perception.depth_noise import DepthNoise, add_depth_noise
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Scene
@@ -113,7 +113,7 @@ class LearnedPerception:
     ) -> Observation:
         """See `Perceive`; the same image gets the same noise."""
         if self._noise:
-            depth = noisy_depth(
+            depth = add_depth_noise(
                 depth, item_rng(self._seed, zlib.crc32(depth.tobytes())), self._noise
             )
         return self._detect(depth, color)
@@ -137,7 +137,7 @@ class LabelPerception:
     ) -> Observation:
         """See `Perceive`."""
         poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
-        told = self._detector.look(self._scene.at(poses)).observation
+        told = self._detector.perceive(self._scene.at(poses)).observation
         unobstructed = depth > told.depth - 0.01  # the arm may be in the way
         in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
         return Observation(

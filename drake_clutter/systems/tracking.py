@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from drake_clutter.perception.explaining import explanation
+from drake_clutter.perception.pose_selection import evaluate_pose
 from drake_clutter.scenes.geometry import penetration
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
@@ -102,11 +102,11 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
     for o in known:
         if o.name in recognised_now:
             continue
-        e = explanation(o.object_class, o.X_TO, observation.depth, observation.camera)
-        for_it = np.count_nonzero(e.seen)
+        e = evaluate_pose(o.object_class, o.X_TO, observation.depth, observation.camera)
+        for_it = np.count_nonzero(e.consistent)
         if for_it >= max(
-            1, observation.camera.visibility_threshold * e.alone
-        ) and for_it >= STILL * (for_it + e.past):
+            1, observation.camera.visibility_threshold * e.unoccluded_pixels
+        ) and for_it >= STILL * (for_it + e.free_space_violations):
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
 
@@ -121,7 +121,11 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
             explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within)
         )
 
-    kept = [d for d in observation.detections if d.name in familiar or d.sure or not no_better(d)]
+    kept = [
+        d
+        for d in observation.detections
+        if d.name in familiar or d.is_confident or not no_better(d)
+    ]
     taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
     steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
     return replace(
@@ -177,15 +181,15 @@ def _matched(
 
 def _gone(known: SceneObject, observation: Observation) -> bool:
     """Whether an object that was not recognised is not where it was: the camera sees past it, or sees something else there."""
-    e = explanation(known.object_class, known.X_TO, observation.depth, observation.camera)
-    as_expected = np.count_nonzero(e.seen)
-    if e.past > SEEN_PAST * (e.past + as_expected):
+    e = evaluate_pose(known.object_class, known.X_TO, observation.depth, observation.camera)
+    as_expected = np.count_nonzero(e.consistent)
+    if e.free_space_violations > SEEN_PAST * (e.free_space_violations + as_expected):
         return True
     others = np.zeros(observation.depth.shape, bool)
     for detection in observation.detections:
         others |= detection.mask
-    taken = np.count_nonzero(e.seen & others[e.window])
+    taken = np.count_nonzero(e.consistent & others[e.window])
     return bool(
         taken > TAKEN * as_expected
-        and as_expected >= observation.camera.visibility_threshold * e.alone
+        and as_expected >= observation.camera.visibility_threshold * e.unoccluded_pixels
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.files import InputError
-from drake_clutter.perception.label_detector import LabelDetector, Look
+from drake_clutter.perception.label_detector import LabelDetector, PerceptionResult
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.interfaces import (
     Move,
@@ -47,7 +47,7 @@ class Backend(Protocol):
         """The true objects, now."""
 
     @property
-    def look(self) -> Look:
+    def look(self) -> PerceptionResult:
         """What a perfect detector sees, now."""
 
     @property
@@ -89,7 +89,7 @@ def run_episode(
 class Detector(Protocol):
     """A perfect detector."""
 
-    def look(self, scene: Scene) -> Look:
+    def perceive(self, scene: Scene) -> PerceptionResult:
         """Return what the camera shows of a scene."""
 
 
@@ -130,7 +130,7 @@ class SteppedBackend:
         """
         self._tracker, self._action_filter = tracker, action_filter
         self._executor, self._detector, self._rng = executor, detector, rng
-        self.config, self.scene, self.look = config, scene, detector.look(scene)
+        self.config, self.scene, self.look = config, scene, detector.perceive(scene)
         self.belief = Belief()
         self.update_belief()
 
@@ -152,7 +152,7 @@ class SteppedBackend:
         """Carry out a command."""
         outcome = self._executor.execute(self.scene, command, rng)
         if outcome.result.carried_out:
-            self.scene, self.look = outcome.scene, self._detector.look(outcome.scene)
+            self.scene, self.look = outcome.scene, self._detector.perceive(outcome.scene)
         return outcome
 
     def known_result(self, outcome: Outcome) -> MoveResult:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.perception.label_detector import Look
+from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.belief import Decision
@@ -31,7 +31,7 @@ class Attempt:
 
     decision: Decision
     outcome: Outcome
-    look: Look
+    look: PerceptionResult
 
     @property
     def move(self) -> Move:
@@ -72,7 +72,7 @@ class ExplorationTask:
     def __init__(
         self,
         scene: Scene,
-        first_look: Look,
+        first_look: PerceptionResult,
         config: ExplorationConfig,
         max_moves: int,
     ) -> None:

@@ -118,7 +118,7 @@ class FeasibilityStudy:
             number: of the scene: with the seed it decides where on the tray or on an object things are put.
             scene: at rest.
         """
-        observation = self._detector.look(scene).observation
+        observation = self._detector.perceive(scene).observation
         return [
             self._row(
                 name,

@@ -6,8 +6,8 @@ import numpy as np
 from conftest import CLASSES, DEFAULT_CELL, resting, scene_of
 
 from drake_clutter.grammar import Orientation
-from drake_clutter.perception.explaining import chosen, explanation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.perception.pose_selection import evaluate_pose, select_consistent_poses
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 CAMERA = DEFAULT_CELL.camera
@@ -19,9 +19,9 @@ BESIDE = resting("gelatin_box", xy=(0.2, 0.1))
 def found(
     there: list[SceneObject], said: list[SceneObject], scores: list[float] | None = None
 ) -> list[int]:
-    depth = LabelDetector(CAMERA).look(scene_of(*there)).observation.depth
-    explained = [explanation(o.object_class, o.X_TO, depth, CAMERA) for o in said]
-    return sorted(chosen(explained, scores or [0.8] * len(said), depth.shape, 0.2))
+    depth = LabelDetector(CAMERA).perceive(scene_of(*there)).observation.depth
+    explained = [evaluate_pose(o.object_class, o.X_TO, depth, CAMERA) for o in said]
+    return sorted(select_consistent_poses(explained, scores or [0.8] * len(said), depth.shape, 0.2))
 
 
 def test_what_is_there_is_found() -> None:
@@ -29,15 +29,17 @@ def test_what_is_there_is_found() -> None:
 
 
 def test_an_explanation_counts_pixels_as_the_label_image_does() -> None:
-    look = LabelDetector(CAMERA).look(scene_of(BOX, ON_TOP))
+    look = LabelDetector(CAMERA).perceive(scene_of(BOX, ON_TOP))
     by_name = {d.name: d.mask for d in look.observation.detections}
     for o in (BOX, ON_TOP):
-        e = explanation(o.object_class, o.X_TO, look.observation.depth, CAMERA)
+        e = evaluate_pose(o.object_class, o.X_TO, look.observation.depth, CAMERA)
         mask = np.zeros(look.observation.depth.shape, bool)
-        mask[e.window] = e.seen
+        mask[e.window] = e.consistent
         either = np.count_nonzero(mask | by_name[o.name])
         assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * either
-    assert e.alone > 0.97 * np.count_nonzero(e.seen), "nothing stands before the can"
+    assert e.unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), (
+        "nothing stands before the can"
+    )
 
 
 def test_an_object_that_is_fitted_twice_is_one() -> None:

@@ -16,23 +16,23 @@ from scipy.sparse.csgraph import connected_components
 
 Mask = NDArray[np.bool_]
 
-LEAST = 20
+MIN_SEGMENT_CELLS = 20
 """Answers that make a segment."""
-_STEP = 0.008
+MAX_SURFACE_STEP = 0.008
 """m; neighbours that differ more in height belong to different surfaces, and what is lower is the floor."""
-_BY_ALL, _BY_ONE = 0.95, 0.9
+EXPLAINED_FRACTION, EXPLAINED_FRACTION_BY_ONE_POSE = 0.95, 0.9
 """Share of a surface that poses together, or one of them, must explain for it to be left alone."""
-_WORTH_A_LOOK = 50
+MIN_UNEXPLAINED_CELLS = 50
 """Answers of a surface that no pose explains, fewer than which are left alone: with so little no object is believed."""
-_DOUBT = 0.2
+AMBIGUITY_THRESHOLD = 0.2
 """Mean chance of another class that makes a class doubtful."""
-_POSSIBLE, _MOST = 0.15, 3
+MIN_CLASS_PROBABILITY, MAX_CANDIDATE_CLASSES = 0.15, 3
 """Mean chance with which a class is tried on a mask, and how many are."""
-_MARGIN = 5
+DILATION_CELLS = 5
 """Answers by which the mask of a doubtful pose is widened: the right class may be larger."""
 
 
-def surfaces(height: NDArray[np.float32]) -> NDArray[np.int64]:
+def label_surfaces(height: NDArray[np.float32]) -> NDArray[np.int64]:
     """(h, w) the number of the surface that hangs together there; -1 for the floor and what is not measured.
 
     Args:
@@ -42,54 +42,60 @@ def surfaces(height: NDArray[np.float32]) -> NDArray[np.int64]:
     number = np.arange(z.size).reshape(z.shape)
     ends = list[NDArray[np.int64]]()
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        joined = np.abs(z[a] - z[b]) < _STEP
+        joined = np.abs(z[a] - z[b]) < MAX_SURFACE_STEP
         ends.append(np.stack([number[a][joined], number[b][joined]]))
     pairs = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), shape=(z.size, z.size))
     _, found = connected_components(graph, directed=False)
-    return np.where(z > _STEP, found.reshape(z.shape), -1)
+    return np.where(z > MAX_SURFACE_STEP, found.reshape(z.shape), -1)
 
 
-def unexplained(surface: NDArray[np.int64], explained: Sequence[Mask]) -> list[Mask]:
+def find_unexplained_surfaces(surface: NDArray[np.int64], explained: Sequence[Mask]) -> list[Mask]:
     """The surfaces that poses do not explain, given what each explains."""
     size = np.bincount(surface[surface >= 0], minlength=1)
     by_all = np.any([np.zeros(surface.shape, bool), *explained], axis=0)
     found = []
-    for number in np.flatnonzero(size >= LEAST):
+    for number in np.flatnonzero(size >= MIN_SEGMENT_CELLS):
         mine = surface == number
         by_one = max((each[mine].mean() for each in explained), default=0.0)
         left = np.count_nonzero(mine & ~by_all)
-        if left >= max(_WORTH_A_LOOK, (1 - _BY_ALL) * size[number]) and by_one <= _BY_ONE:
+        if (
+            left >= max(MIN_UNEXPLAINED_CELLS, (1 - EXPLAINED_FRACTION) * size[number])
+            and by_one <= EXPLAINED_FRACTION_BY_ONE_POSE
+        ):
             found.append(mine)
     return found
 
 
-def doubtful(
+def find_ambiguous_regions(
     surface: NDArray[np.int64],
     explained: Sequence[Mask],
     classes: Sequence[int],
-    chances: NDArray[np.float32],
+    class_probabilities: NDArray[np.float32],
 ) -> list[Mask]:
     """Of what each pose explains, where its class is doubtful, all of the surface about it that no other explains.
 
     Args:
         surface: see `surfaces`.
-        explained: by each pose; classes: of each, numbers of `chances`.
-        chances: (classes, h, w) of each class.
+        explained: by each pose; classes: of each, numbers of `class_probabilities`.
+        class_probabilities: (classes, h, w) of each class.
     """
     found = []
     for k, (mine, own) in enumerate(zip(explained, classes, strict=True)):
-        if mine.sum() < LEAST or np.delete(chances[:, mine].mean(axis=1), own).max() < _DOUBT:
+        if (
+            mine.sum() < MIN_SEGMENT_CELLS
+            or np.delete(class_probabilities[:, mine].mean(axis=1), own).max() < AMBIGUITY_THRESHOLD
+        ):
             continue
         others = np.any([np.zeros_like(mine), *explained[:k], *explained[k + 1 :]], axis=0)
-        about = binary_dilation(mine, iterations=_MARGIN) & np.isin(
+        about = binary_dilation(mine, iterations=DILATION_CELLS) & np.isin(
             surface, np.unique(surface[mine & (surface >= 0)])
         )
         found.append(mine | about & ~others)
     return found
 
 
-def halves(mask: Mask, votes_T: NDArray[np.float32]) -> list[Mask]:
+def split_mask(mask: Mask, votes_T: NDArray[np.float32]) -> list[Mask]:
     """A mask cut in two in three ways: along and across it, and where the votes (h, w, 3) m for an object's middle part."""
     places, votes = np.argwhere(mask).astype(float), np.nan_to_num(votes_T[mask]).astype(float)
     places, votes = places - places.mean(axis=0), votes - votes.mean(axis=0)
@@ -103,12 +109,14 @@ def halves(mask: Mask, votes_T: NDArray[np.float32]) -> list[Mask]:
         for side in (value < middle, value >= middle):
             half = np.zeros_like(mask)
             half[mask] = side
-            if side.sum() >= LEAST:
+            if side.sum() >= MIN_SEGMENT_CELLS:
                 found.append(half)
     return found
 
 
-def possible(mask: Mask, chances: NDArray[np.float32]) -> list[int]:
+def candidate_classes(mask: Mask, class_probabilities: NDArray[np.float32]) -> list[int]:
     """The classes that may be in a mask, the likeliest first; see `doubtful`."""
-    mean = chances[:, mask].mean(axis=1)
-    return [int(k) for k in np.argsort(-mean)[:_MOST] if mean[k] > _POSSIBLE]
+    mean = class_probabilities[:, mask].mean(axis=1)
+    return [
+        int(k) for k in np.argsort(-mean)[:MAX_CANDIDATE_CLASSES] if mean[k] > MIN_CLASS_PROBABILITY
+    ]

@@ -15,57 +15,62 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import pose_in_camera
-from drake_clutter.perception.pose_score import distances_along, eye_in, image_bounds, rays_of_row
+from drake_clutter.perception.pose_score import (
+    camera_position_in_object,
+    cast_ray_row,
+    image_bounds,
+    ray_row,
+)
 from drake_clutter.scenes.scene import Pose
 
-_AGREES = 0.008
+DEPTH_TOLERANCE = 0.008
 """m along the optical axis, within which a pose is said to be seen."""
-_UNDECIDED, _SEEN, _SEEN_PAST = 0, 1, 2
-_OWN = 0.5
+_INCONCLUSIVE, _CONSISTENT, _FREE_SPACE = 0, 1, 2
+MIN_UNCLAIMED_FRACTION = 0.5
 """Of the pixels of a pose that agree, the share that no better pose has claimed; with fewer it is no object."""
-_PAST = 0.25
+MAX_FREE_SPACE_FRACTION = 0.25
 """Of the pixels that speak for or against a pose, the share that the camera may see past it."""
-_FEWEST = 25
+MIN_UNCLAIMED_PIXELS = 25
 """Pixels of its own."""
-_EACH = 200
+OBJECT_COST = 200
 """Pixels that another object must explain for more objects to be the better explanation of an image."""
 
 
 @dataclass(frozen=True)
-class Explanation:
+class PoseEvidence:
     """What of the image a pose explains.
 
     Attributes:
-        top, left: pixel where `seen` begins.
-        seen: (rows, columns) bool, where the depth is as it should be.
-        away: (rows, columns) float32 m, where it is `seen`, how far along the optical axis the pose says it is.
-        past: pixels where the camera sees past it.
-        alone: pixels that it would cover if nothing stood before it.
+        top, left: pixel where `consistent` begins.
+        consistent: (rows, columns) bool, where the depth is as it should be.
+        rendered_depth: (rows, columns) float32 m, where it is `consistent`, how far along the optical axis the pose says it is.
+        free_space_violations: pixels where the camera sees past it.
+        unoccluded_pixels: pixels that it would cover if nothing stood before it.
     """
 
     top: int
     left: int
-    seen: NDArray[np.bool_]
-    away: NDArray[np.float32]
-    past: int
-    alone: int
+    consistent: NDArray[np.bool_]
+    rendered_depth: NDArray[np.float32]
+    free_space_violations: int
+    unoccluded_pixels: int
 
     @property
     def window(self) -> tuple[slice, slice]:
         """Rows and columns of the image that `seen` is of."""
-        return slice(self.top, self.top + self.seen.shape[0]), slice(
-            self.left, self.left + self.seen.shape[1]
+        return slice(self.top, self.top + self.consistent.shape[0]), slice(
+            self.left, self.left + self.consistent.shape[1]
         )
 
-    def mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def mask(self, image_shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Where in the whole image, of a shape, it is `seen`."""
-        found = np.zeros(shape, bool)
-        found[self.window] = self.seen
+        found = np.zeros(image_shape, bool)
+        found[self.window] = self.consistent
         return found
 
 
 @njit(cache=True, error_model="numpy")
-def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-def]
+def _compare_with_depth(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-def]
     """What the pixels say of a pose.
 
     Returns:
@@ -78,11 +83,11 @@ def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-d
         np.zeros((bottom - top, right - left), np.int8),
         np.zeros((bottom - top, right - left), np.float32),
     )
-    e, h, alone = eye_in(R, p), (half[0], half[1], half[2]), 0
+    e, h, alone = camera_position_in_object(R, p), (half[0], half[1], half[2]), 0
     distances = np.empty(right - left)
     for v in range(top, bottom):
-        ray, step = rays_of_row(R, v, camera)
-        distances_along(cylinder, h, e, ray, step, left - camera.u0, 1, distances)
+        ray, step = ray_row(R, v, camera)
+        cast_ray_row(cylinder, h, e, ray, step, left - camera.u0, 1, distances)
         for u in range(left, right):
             away = distances[u - left]
             if away == np.inf:
@@ -92,16 +97,16 @@ def _compared(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-d
             seen = depth[v, u]
             if not 0.05 < seen < 50.0:
                 continue
-            if seen > away + _AGREES:
-                said[v - top, u - left] = _SEEN_PAST
-            elif seen > away - _AGREES:
-                said[v - top, u - left] = _SEEN
+            if seen > away + DEPTH_TOLERANCE:
+                said[v - top, u - left] = _FREE_SPACE
+            elif seen > away - DEPTH_TOLERANCE:
+                said[v - top, u - left] = _CONSISTENT
     return top, left, said, far, alone
 
 
-def explanation(
+def evaluate_pose(
     object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera
-) -> Explanation:
+) -> PoseEvidence:
     """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
     half, R, p = (
         np.asarray(object_class.size) / 2,
@@ -109,41 +114,43 @@ def explanation(
         np.asarray(X_TO.p, float),
     )
     depth, cylinder = np.ascontiguousarray(depth, np.float32), object_class.shape is Shape.CYLINDER
-    top, left, said, away, alone = _compared(cylinder, half, R, p, depth, camera.pinhole)
-    return Explanation(
-        top, left, said == _SEEN, away, int(np.count_nonzero(said == _SEEN_PAST)), int(alone)
+    top, left, said, away, alone = _compare_with_depth(cylinder, half, R, p, depth, camera.pinhole)
+    return PoseEvidence(
+        top, left, said == _CONSISTENT, away, int(np.count_nonzero(said == _FREE_SPACE)), int(alone)
     )
 
 
-def chosen(
-    explanations: Sequence[Explanation],
+def select_consistent_poses(
+    evidence: Sequence[PoseEvidence],
     scores: Sequence[float],
-    shape: tuple[int, int],
-    least_share: float,
-    clash: Callable[[int, int], bool] = lambda a, b: False,
+    image_shape: tuple[int, int],
+    min_visible_fraction: float,
+    conflict: Callable[[int, int], bool] = lambda a, b: False,
 ) -> list[int]:
     """The numbers of those that are taken for objects, the surest first.
 
     Greedily, and again with each of those that were left out as the first; of all these, what explains most with fewest.
 
     Args:
-        explanations: of poses.
+        evidence: of poses.
         scores: 0 to 1, how well each fits the segment that it was fitted to: a pixel of a pose that does counts for more.
-        shape: of the image.
-        least_share: of the pixels that an object would cover alone, that must be seen.
-        clash: whether two, by their numbers, cannot both be there.
+        image_shape: of the image.
+        min_visible_fraction: of the pixels that an object would cover alone, that must be seen.
+        conflict: whether two, by their numbers, cannot both be there.
     """
-    plausible = [k for k, e in enumerate(explanations) if _plausible(e, least_share)]
-    found, most = _greedy(explanations, scores, shape, plausible, clash, None)
+    plausible = [k for k, e in enumerate(evidence) if _is_plausible(e, min_visible_fraction)]
+    found, most = _select_greedily(evidence, scores, image_shape, plausible, conflict, None)
     for first in [k for k in plausible if k not in found]:
-        other, explained = _greedy(explanations, scores, shape, plausible, clash, first)
+        other, explained = _select_greedily(
+            evidence, scores, image_shape, plausible, conflict, first
+        )
         if explained > most:
             found, most = other, explained
     return found
 
 
-def _greedy(
-    explanations: Sequence[Explanation],
+def _select_greedily(
+    explanations: Sequence[PoseEvidence],
     scores: Sequence[float],
     shape: tuple[int, int],
     left: Sequence[int],
@@ -158,8 +165,10 @@ def _greedy(
     while own:
         best = first if first in own else max(own, key=lambda k: (own[k], -k))
         e = explanations[best]
-        mine = int(np.count_nonzero(e.seen & ~claimed[e.window])) - e.past
-        if mine < max(_FEWEST, _OWN * np.count_nonzero(e.seen)):
+        mine = int(np.count_nonzero(e.consistent & ~claimed[e.window])) - e.free_space_violations
+        if mine < max(
+            MIN_UNCLAIMED_PIXELS, MIN_UNCLAIMED_FRACTION * np.count_nonzero(e.consistent)
+        ):
             del own[best]
             continue
         if best != first and scores[best] * mine < own[best]:
@@ -168,12 +177,15 @@ def _greedy(
         del own[best]
         if any(clash(best, other) for other in found):
             continue
-        claimed[e.window] |= e.seen
+        claimed[e.window] |= e.consistent
         found.append(best)
-        explained += mine - _EACH
+        explained += mine - OBJECT_COST
     return found, explained
 
 
-def _plausible(e: Explanation, least_share: float) -> bool:
-    seen = int(np.count_nonzero(e.seen))
-    return seen >= max(1.0, least_share * e.alone) and e.past <= _PAST * (seen + e.past)
+def _is_plausible(e: PoseEvidence, min_visible_fraction: float) -> bool:
+    consistent = int(np.count_nonzero(e.consistent))
+    violations = e.free_space_violations
+    return consistent >= max(
+        1.0, min_visible_fraction * e.unoccluded_pixels
+    ) and violations <= MAX_FREE_SPACE_FRACTION * (consistent + violations)

@@ -19,60 +19,61 @@ from drake_clutter.learning.checkpoint import (
     restore_learner,
     save_tensors,
 )
-from drake_clutter.perception.depth_noise import noisy_depth
-from drake_clutter.perception.image_set import LabelledImage
+from drake_clutter.perception.depth_noise import add_depth_noise
+from drake_clutter.perception.image_dataset import LabeledImage
 from drake_clutter.perception.segmentation import (
+    ImageWindow,
     SegmentationNetwork,
-    Window,
+    backproject_window,
     class_weights,
-    coarse,
-    loss,
-    network_input,
-    points,
+    downsample,
+    make_network_input,
+    segmentation_loss,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import InRange, NonNegative, config_class
+from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
 
-RISING = 0.1
+WARM_UP_FRACTION = 0.1
 """Share of the steps in which the learning rate rises."""
-_COUNTED = 200
+MAX_IMAGES_COUNTED = 200
 """Images, at most, whose pixels are counted for the weights of the classes."""
 
 
 @config_class
+@renamed_fields(batch="batch_size")
 class SegmentationConfig:
     """How the network learns.
 
     Attributes:
-        steps: batches in all. batch: images of each.
+        steps: batches in all. batch_size: images of each.
         learning_rate: at its highest; it rises over the first tenth, and falls to nothing along a cosine.
         weight_decay: see AdamW.
         vote_weight: of a vote's error, per m, against the classes' cross entropy.
     """
 
     steps: Annotated[int, InRange(1)] = 5000
-    batch: Annotated[int, InRange(1)] = 8
+    batch_size: Annotated[int, InRange(1)] = 8
     learning_rate: NonNegative = 3e-3
     weight_decay: NonNegative = 1e-4
     vote_weight: NonNegative = 5.0
 
 
-class Example(NamedTuple):
+class TrainingExample(NamedTuple):
     """Arrays of one image, or tensors of a batch: what the network is given, and what it should answer, see `loss`."""
 
     image: NDArray[np.float32]
-    kind: NDArray[np.int64]
-    to_middle: NDArray[np.float32]
+    class_map: NDArray[np.int64]
+    center_offsets: NDArray[np.float32]
 
 
-def example(
-    image: LabelledImage,
+def make_example(
+    image: LabeledImage,
     classes: Sequence[str],
     camera: Camera,
-    window: Window,
+    window: ImageWindow,
     rng: np.random.Generator | None,
-    looks_at_color: bool,
-) -> Example:
+    use_color: bool,
+) -> TrainingExample:
     """What is learned from an image: with the depth camera's noise, turned by quarters and mirrored at random.
 
     Args:
@@ -80,11 +81,11 @@ def example(
         classes: that the network knows.
         camera, window: what is looked at.
         rng: of the noise and the turns; None: neither.
-        looks_at_color: whether colour is given.
+        use_color: whether colour is given.
     """
-    depth = image.depth if rng is None else noisy_depth(image.depth, rng)
+    depth = image.depth if rng is None else add_depth_noise(image.depth, rng)
     p_TP, color, label = (
-        points(depth, camera, window),
+        backproject_window(depth, camera, window),
         image.color[window.rows, window.columns],
         image.label,
     )
@@ -101,10 +102,12 @@ def example(
         p_TP, middle = (p_TP @ R.T).astype(np.float32), middle @ R.T
         light = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.4)
         color = np.clip(np.rot90(color, turns)[:, ::step] * light, 0, 255).astype(np.uint8)
-    kind = np.array([0] + [classes.index(name) + 1 for name in image.classes])[coarse(label) + 1]
-    to_middle = np.vstack([np.full(3, np.nan), middle])[coarse(label) + 1] - coarse(p_TP)
-    given = network_input(p_TP, color if looks_at_color else None)
-    return Example(
+    kind = np.array([0] + [classes.index(name) + 1 for name in image.classes])[
+        downsample(label) + 1
+    ]
+    to_middle = np.vstack([np.full(3, np.nan), middle])[downsample(label) + 1] - downsample(p_TP)
+    given = make_network_input(p_TP, color if use_color else None)
+    return TrainingExample(
         given,
         np.ascontiguousarray(kind),
         np.ascontiguousarray(np.moveaxis(to_middle, 2, 0), np.float32),
@@ -121,32 +124,34 @@ class SegmentationLearner:
     def __init__(
         self,
         network: SegmentationNetwork,
-        read: Callable[[int], LabelledImage],
-        count: int,
+        read_image: Callable[[int], LabeledImage],
+        num_images: int,
         config: SegmentationConfig,
         camera: Camera,
         support: Support,
         seed: int,
         device: torch.device,
     ) -> None:
-        """Begins a training with `count` images, each of which `read` reads."""
+        """Begins a training with `num_images` images, each of which `read_image` reads."""
         self.step, self.losses = 0, dict[str, float]()
         self._read, self._count, self._config, self._camera, self._seed = (
-            read,
-            count,
+            read_image,
+            num_images,
             config,
             camera,
             seed,
         )
-        self._window, self._device = Window.of(camera, support), device
+        self._window, self._device = ImageWindow.around_support(camera, support), device
         self.network = network.to(device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(
             network.parameters(), config.learning_rate, weight_decay=config.weight_decay
         )
         counted = [
-            example(read(k), network.classes, camera, self._window, None, False).kind
-            for k in range(min(count, _COUNTED))
+            make_example(
+                read_image(k), network.classes, camera, self._window, None, False
+            ).class_map
+            for k in range(min(num_images, MAX_IMAGES_COUNTED))
         ]
         self._weights = class_weights(counted, len(network.classes)).to(device)
         self._readers = ThreadPoolExecutor(1)
@@ -157,30 +162,30 @@ class SegmentationLearner:
         """Of the present step."""
         done = self.step / self._config.steps
         share = (
-            done / RISING
-            if done < RISING
-            else 0.5 + 0.5 * math.cos(math.pi * (done - RISING) / (1 - RISING))
+            done / WARM_UP_FRACTION
+            if done < WARM_UP_FRACTION
+            else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP_FRACTION) / (1 - WARM_UP_FRACTION))
         )
         return self._config.learning_rate * share
 
-    def _batch(self, step: int) -> Example:
+    def _batch(self, step: int) -> TrainingExample:
         rng = item_rng(self._seed, step)
-        numbers = rng.integers(self._count, size=self._config.batch)
+        numbers = rng.integers(self._count, size=self._config.batch_size)
         network = self.network
         examples = [
-            example(
+            make_example(
                 self._read(int(k)),
                 network.classes,
                 self._camera,
                 self._window,
                 rng,
-                network.looks_at_color,
+                network.use_color,
             )
             for k in numbers
         ]
-        return Example(*(np.stack(arrays) for arrays in zip(*examples, strict=True)))
+        return TrainingExample(*(np.stack(arrays) for arrays in zip(*examples, strict=True)))
 
-    def advance(self) -> None:
+    def train_iteration(self) -> None:
         """One batch."""
         given = self._ahead.pop(self.step, None)
         batch = given.result() if given else self._batch(self.step)
@@ -188,7 +193,7 @@ class SegmentationLearner:
         self.network.train()
         image, kind, to_middle = (torch.from_numpy(array).to(self._device) for array in batch)
         logits, votes = self.network(image.to(memory_format=torch.channels_last))
-        of_classes, of_votes = loss(logits, votes, kind, to_middle, self._weights)
+        of_classes, of_votes = segmentation_loss(logits, votes, kind, to_middle, self._weights)
         total: Tensor = of_classes + self._config.vote_weight * of_votes
         for group in self._optimizer.param_groups:
             group["lr"] = self.learning_rate

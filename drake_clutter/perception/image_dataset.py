@@ -1,4 +1,4 @@
-"""Sets of labelled images on disk, in the layout of BOP (https://bop.felk.cvut.cz), for networks that learn to see.
+"""Sets of labeled images on disk, in the layout of BOP (https://bop.felk.cvut.cz), for networks that learn to see.
 
 A folder of the set holds the images of one scene, `000000/`:
 
@@ -32,14 +32,14 @@ from drake_clutter.scenes.scene import Pose
 COLOR, DEPTH, LABEL = "rgb", "depth", "label"
 CAMERA_FILE, POSES_FILE = "scene_camera.json", "scene_gt.json"
 INFO_FILE, COCO_FILE = "scene_gt_info.json", "scene_gt_coco.json"
-MOST_INSTANCES = 255
+MAX_INSTANCES = 255
 _NO_INSTANCE = 255
 _DEPTH_UNIT = 1e-4
 """m."""
 
 
 @dataclass(frozen=True)
-class LabelledImage:
+class LabeledImage:
     """An image and what it shows.
 
     Attributes:
@@ -48,7 +48,7 @@ class LabelledImage:
         label: (H, W) int, number of the instance, -1 for the tray and the background.
         classes: name of the class of each of the N instances.
         X_TO: pose of each in the tray frame.
-        alone: (N,) int, pixels that each would cover alone on the tray.
+        unoccluded_pixels: (N,) int, pixels that each would cover alone on the tray.
     """
 
     color: NDArray[np.uint8]
@@ -56,21 +56,21 @@ class LabelledImage:
     label: NDArray[np.int64]
     classes: tuple[str, ...]
     X_TO: tuple[Pose, ...]
-    alone: NDArray[np.int64]
+    unoccluded_pixels: NDArray[np.int64]
 
     @property
-    def seen(self) -> NDArray[np.int64]:
+    def visible_pixels(self) -> NDArray[np.int64]:
         """(N,) pixels of each instance."""
         return np.bincount(self.label.ravel() + 1, minlength=len(self.classes) + 1)[1:]
 
     @property
-    def visible_share(self) -> NDArray[np.float64]:
+    def visible_fractions(self) -> NDArray[np.float64]:
         """(N,) of the pixels that each instance would cover alone, the share that is seen."""
-        return np.asarray(self.seen / np.maximum(self.alone, 1))
+        return np.asarray(self.visible_pixels / np.maximum(self.unoccluded_pixels, 1))
 
 
 def write_images(
-    folder: Path, images: Iterable[LabelledImage], camera: Camera, class_names: Sequence[str]
+    folder: Path, images: Iterable[LabeledImage], camera: Camera, class_names: Sequence[str]
 ) -> None:
     """Writes the images of one scene to a folder that is there once it is complete.
 
@@ -109,9 +109,10 @@ def write_images(
         ids = [class_names.index(class_name) + 1 for class_name in image.classes]
         eyes[str(number)] = eye
         poses[str(number)] = [
-            {"obj_id": k, **_in_camera(X, camera)} for k, X in zip(ids, image.X_TO, strict=True)
+            {"obj_id": k, **_pose_in_camera(X, camera)}
+            for k, X in zip(ids, image.X_TO, strict=True)
         ]
-        infos[str(number)] = info = _infos(image)
+        infos[str(number)] = info = _visibility_info(image)
         coco["images"].append(
             {
                 "id": number,
@@ -128,11 +129,14 @@ def write_images(
                         "id": len(coco["annotations"]) + 1,
                         "image_id": number,
                         "category_id": category,
-                        "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
+                        "segmentation": {
+                            "size": list(mask.shape),
+                            "counts": encode_run_lengths(mask),
+                        },
                         "bbox": about["bbox_visib"],
                         "area": about["px_count_visib"],
                         "iscrowd": 0,
-                        "visible_share": about["visib_fract"],
+                        "visible_fraction": about["visib_fract"],
                     }
                 )
     for file, value in (
@@ -153,14 +157,14 @@ def _write_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> No
     )  # a fifth larger than by default, written in a fraction of the time
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
+def encode_run_lengths(mask: NDArray[np.bool_]) -> list[int]:
     """COCO's uncompressed counts of a mask (H, W): down the columns, pixels outside and inside in turn, outside first."""
     flat = np.concatenate([[False], mask.ravel(order="F")])
     ends = np.concatenate([[0], np.flatnonzero(flat[1:] != flat[:-1]), [mask.size]])
     return [int(count) for count in np.diff(ends)]
 
 
-def _in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
+def _pose_in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
     R_CT = camera.X_TC.rotation().matrix().T
     R_CO, p_CO = R_CT @ X_TO.rotation, R_CT @ (X_TO.p - camera.X_TC.translation())
     return {
@@ -169,10 +173,10 @@ def _in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
     }
 
 
-def _infos(image: LabelledImage) -> list[dict[str, Any]]:
+def _visibility_info(image: LabeledImage) -> list[dict[str, Any]]:
     infos = []
     for instance, (seen, alone, share) in enumerate(
-        zip(image.seen, image.alone, image.visible_share, strict=True)
+        zip(image.visible_pixels, image.unoccluded_pixels, image.visible_fractions, strict=True)
     ):
         box = [-1, -1, -1, -1]
         if seen:
@@ -193,7 +197,7 @@ def _infos(image: LabelledImage) -> list[dict[str, Any]]:
     return infos
 
 
-class ImageSet:
+class ImageDataset:
     """The images of a set, read as they are asked for."""
 
     def __init__(self, folder: Path) -> None:
@@ -216,11 +220,12 @@ class ImageSet:
     def __len__(self) -> int:
         return len(self._files)
 
-    def __getitem__(self, index: int) -> LabelledImage:
+    def __getitem__(self, index: int) -> LabeledImage:
         """The image of a number; those of one scene follow each other."""
         scene, name = self._files[index]
         eye, instances, infos = (
-            _of_scene(scene / file)[str(int(name))] for file in (CAMERA_FILE, POSES_FILE, INFO_FILE)
+            _read_scene_json(scene / file)[str(int(name))]
+            for file in (CAMERA_FILE, POSES_FILE, INFO_FILE)
         )
         depth = np.asarray(Image.open(scene / DEPTH / f"{name}.png")).astype(
             np.float32
@@ -228,23 +233,23 @@ class ImageSet:
         depth[depth == 0] = np.inf
         label = np.asarray(Image.open(scene / LABEL / f"{name}.png")).astype(np.int64)
         label[label == _NO_INSTANCE] = -1
-        return LabelledImage(
+        return LabeledImage(
             np.asarray(Image.open(scene / COLOR / f"{name}.png")),
             depth,
             label,
             tuple(self._class_names[instance["obj_id"]] for instance in instances),
-            tuple(_in_tray(instance, eye) for instance in instances),
+            tuple(_pose_in_tray(instance, eye) for instance in instances),
             np.array([info["px_count_all"] for info in infos], np.int64),
         )
 
 
 @lru_cache(maxsize=64)
-def _of_scene(path: Path) -> dict[str, Any]:
+def _read_scene_json(path: Path) -> dict[str, Any]:
     read: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return read
 
 
-def _in_tray(instance: dict[str, Any], eye: dict[str, Any]) -> Pose:
+def _pose_in_tray(instance: dict[str, Any], eye: dict[str, Any]) -> Pose:
     R_TC, p_CT = np.reshape(eye["cam_R_w2c"], (3, 3)).T, np.array(eye["cam_t_w2c"])
     R_CO, p_CO = np.reshape(instance["cam_R_m2c"], (3, 3)), np.array(instance["cam_t_m2c"])
     return Pose.of(R_TC @ R_CO, R_TC @ (p_CO - p_CT) / 1000)

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from drake_clutter.perception.second_look import (
-    LEAST,
-    doubtful,
-    halves,
-    possible,
-    surfaces,
-    unexplained,
+from drake_clutter.perception.hypothesis_refinement import (
+    MIN_SEGMENT_CELLS,
+    candidate_classes,
+    find_ambiguous_regions,
+    find_unexplained_surfaces,
+    label_surfaces,
+    split_mask,
 )
 
 SHAPE = (30, 40)
@@ -23,54 +23,54 @@ def heights(left: float, right: float) -> np.ndarray:
 
 
 def test_surfaces_end_at_steps_and_at_the_floor() -> None:
-    surface = surfaces(heights(0.05, 0.10))
+    surface = label_surfaces(heights(0.05, 0.10))
     assert surface[0, 0] == -1
     left, right = surface[10, 8], surface[10, 20]
     assert left != right
     for mask, number in ((LEFT, left), (RIGHT, right)):
         assert (surface[mask] == number).mean() > 0.95, "the median rounds corners"
         assert (surface[~mask] == number).sum() <= 4
-    level = surfaces(heights(0.10, 0.10))
+    level = label_surfaces(heights(0.10, 0.10))
     assert level[10, 8] == level[10, 20] >= 0
     hole = heights(0.10, 0.10)
     hole[8:11, 6:9] = np.nan
-    assert surfaces(hole)[9, 7] == -1, "what is not measured belongs to nothing"
+    assert label_surfaces(hole)[9, 7] == -1, "what is not measured belongs to nothing"
 
 
 def test_a_surface_is_left_alone_when_a_pose_explains_it() -> None:
-    surface = surfaces(heights(0.05, 0.10))
-    (left,) = unexplained(surface, [RIGHT])
+    surface = label_surfaces(heights(0.05, 0.10))
+    (left,) = find_unexplained_surfaces(surface, [RIGHT])
     assert np.array_equal(left, surface == surface[10, 8])
-    assert unexplained(surface, [LEFT, RIGHT]) == []
-    assert len(unexplained(surface, [])) == 2
+    assert find_unexplained_surfaces(surface, [LEFT, RIGHT]) == []
+    assert len(find_unexplained_surfaces(surface, [])) == 2
     small = np.zeros(SHAPE, np.float32)
     small[3:6, 3:6] = 0.1
-    assert small.astype(bool).sum() < LEAST
-    assert unexplained(surfaces(small), []) == []
+    assert small.astype(bool).sum() < MIN_SEGMENT_CELLS
+    assert find_unexplained_surfaces(label_surfaces(small), []) == []
 
 
 def test_a_doubtful_pose_is_widened_over_the_rest_of_its_surface() -> None:
-    surface = surfaces(heights(0.10, 0.10))
+    surface = label_surfaces(heights(0.10, 0.10))
     part = LEFT.copy()
     part[:, 12:] = False
     chances = np.zeros((2, *SHAPE), np.float32)
     chances[0], chances[1] = 0.7, 0.3
-    (wider,) = doubtful(surface, [part], [0], chances)
+    (wider,) = find_ambiguous_regions(surface, [part], [0], chances)
     assert wider[part].all()
     assert wider[10, 12]
     assert wider[10, 15]
     assert not wider[0, 0]
-    of_two = doubtful(surface, [part, RIGHT], [0, 0], chances)
+    of_two = find_ambiguous_regions(surface, [part, RIGHT], [0, 0], chances)
     assert not (of_two[0] & RIGHT).any(), "not over what another pose explains"
     chances[1] = 0.1
-    assert doubtful(surface, [part], [0], chances) == []
+    assert find_ambiguous_regions(surface, [part], [0], chances) == []
 
 
 def test_two_objects_side_by_side_are_among_the_halves() -> None:
     both = LEFT | RIGHT
     votes = np.zeros((*SHAPE, 3), np.float32)
     votes[RIGHT, 0] = 0.05
-    found = halves(both, votes)
+    found = split_mask(both, votes)
     assert len(found) == 6
     for one in (LEFT, RIGHT):
         assert max((one & half).sum() / (one | half).sum() for half in found) > 0.9
@@ -79,4 +79,4 @@ def test_two_objects_side_by_side_are_among_the_halves() -> None:
 def test_the_likely_classes_come_first() -> None:
     chances = np.zeros((4, *SHAPE), np.float32)
     chances[:, LEFT] = np.array([0.2, 0.1, 0.5, 0.16])[:, None]
-    assert possible(LEFT, chances) == [2, 0, 3]
+    assert candidate_classes(LEFT, chances) == [2, 0, 3]
