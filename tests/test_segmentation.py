@@ -9,7 +9,7 @@ from conftest import DEFAULT_CELL, TRAY, rng
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import save_checkpoint
+from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.perception.image_dataset import LabeledImage
 from drake_clutter.perception.segmentation import (
     CHECKPOINT_KIND,
@@ -30,6 +30,8 @@ from drake_clutter.perception.segmentation_training import (
 )
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose
+from drake_clutter.systems.scenario import DETECTORS
+from drake_clutter.validation import validate
 
 CAMERA = Camera.over(1.6, width=160, height=120)
 WINDOW = ImageWindow.around_support(CAMERA, TRAY)
@@ -221,3 +223,17 @@ def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path
         resumed.train_iteration()
     for name, value in whole.network.state_dict().items():
         assert torch.equal(resumed.network.state_dict()[name], value), name
+
+
+@pytest.mark.parametrize(("name", "use_color"), [("depth", False), ("depth-color", True)])
+def test_shipped_checkpoints_load_under_their_earlier_names(name: str, use_color: bool) -> None:
+    path = resource_path(DETECTORS[name])
+    stored = load_checkpoint(path)
+    assert stored.about["looks_at_color"] is use_color
+    network = SegmentationNetwork.load(path)
+    assert (network.classes, network.use_color) == (tuple(stored.about["classes"]), use_color)
+    assert torch.equal(network.stem[1][0].weight, stored.weights["into.1.0.weight"])  # type: ignore[index]
+
+
+def test_configs_take_earlier_names() -> None:
+    assert validate(SegmentationConfig, {"batch": 3}, "test") == SegmentationConfig(batch_size=3)
