@@ -17,9 +17,9 @@ from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.interfaces import CannotJudge, Verdict
+from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
@@ -84,14 +84,14 @@ def hash_of(part: Part) -> str:
 
 
 @cache
-def _scene_set(name: str) -> SceneSet:
-    return load_scene_set(resource_path(f"training/scenes/{name}.json"), load_catalog())
+def _scene_set(name: str) -> SceneDataset:
+    return load_scene_dataset(resource_path(f"training/scenes/{name}.json"), load_catalog())
 
 
 def _scene(case: Case) -> Scene:
     """The scene of a case, at rest."""
     held = _scene_set(case.scenes)
-    return held.settled(case.number, held.grammar, WORLD)
+    return held.settled_scene(case.number, held.grammar, WORLD)
 
 
 @cache
@@ -198,11 +198,11 @@ def generation(case: Case) -> list[Line]:
     return lines
 
 
-def _verdict(judge: str, verdict: Verdict | CannotJudge) -> Line:
-    if isinstance(verdict, CannotJudge):
+def _verdict(judge: str, verdict: Verdict | InconclusiveVerdict) -> Line:
+    if isinstance(verdict, InconclusiveVerdict):
         return Line(f"{judge}: cannot be judged, {verdict}")
     words = str(verdict.instability or f"stable, hidden {_named(verdict.hidden)}")
-    poses, shares = _numbers(verdict.settled.values()), [*verdict.visible_share.values()]
+    poses, shares = _numbers(verdict.settled.values()), [*verdict.visible_fractions.values()]
     return Line(f"{judge}: {words}", {"poses": poses, "shares": shares})
 
 
@@ -230,12 +230,12 @@ def _episode(
 
 def _move(step: Step) -> Line:
     outcome = step.outcome
-    texts = [outcome.result.value, outcome.detail, outcome.instability, outcome.cannot_judge]
+    texts = [outcome.result.value, outcome.detail, outcome.instability, outcome.inconclusive]
     words = f"{step.move}: {'; '.join(str(text) for text in texts if text)}"
     words += f"; found {_named(step.newly_found)}"
     parts = {"poses": _numbers(outcome.scene.poses.values())}
-    if outcome.released is not None:
-        parts["released"] = _numbers([outcome.released])
+    if outcome.X_TO_released is not None:
+        parts["released"] = _numbers([outcome.X_TO_released])
     arms = [frame.arm for frame in outcome.motion if frame.arm is not None]
     if arms:
         parts |= {"q_middle": [*arms[len(arms) // 2].q], "q_last": [*arms[-1].q]}

@@ -96,7 +96,7 @@ class DrakeVerdicts:
             groups.append(record)
         fields: dict[str, Any] = {"index": index, "groups": groups}
         if all(group["fall"] is None for group in groups):
-            shares = self._judge.look(scene.at(settled)).visible_share
+            shares = self._judge.look(scene.with_poses(settled)).visible_fractions
             fields["settled"] = {
                 name: [shares[name], *pose.translation, *pose.quaternion]
                 for name, pose in settled.items()
@@ -189,7 +189,7 @@ class DrakeMoves:
         rng = move_rng(item)
         command = resolve_placement(move, observation, ClutterConfig().exploration, rng)
         outcome = (
-            Outcome(MoveResult.NO_FREE_SPOT, scene)
+            Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
             if command is None
             else self._executor.execute(
                 scene,
@@ -245,7 +245,7 @@ def drake_moves(
 
 def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
     """The scene as it came to rest; the record is a stable one's."""
-    return scene.at(
+    return scene.with_poses(
         {name: Pose(tuple(v[1:4]), tuple(v[4:])) for name, v in record["settled"].items()}
     )
 

@@ -29,7 +29,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.station.station_simulation import TIME_STEP, StationSimulation
@@ -45,8 +45,8 @@ app = typer.Typer(no_args_is_help=True)
 
 
 def _frozen(number: int, config: ClutterConfig) -> Scene:
-    held = load_scene_set(resource_path(f"training/scenes/{EPISODES[0]}.json"), load_catalog())
-    return held.settled(number, held.grammar, config)
+    held = load_scene_dataset(resource_path(f"training/scenes/{EPISODES[0]}.json"), load_catalog())
+    return held.settled_scene(number, held.grammar, config)
 
 
 def _step_milliseconds(config: ClutterConfig) -> dict[str, float]:

@@ -36,8 +36,8 @@ from drake_clutter.files import write_json
 from drake_clutter.reports.pictures import PictureCamera
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     Move,
     MoveResult,
     Outcome,
@@ -97,7 +97,11 @@ class Disagreement:
 def said(found: Any) -> str:
     """One word for what a judge found."""
     return (
-        "cannot judge" if isinstance(found, CannotJudge) else "stable" if found is None else "falls"
+        "cannot judge"
+        if isinstance(found, InconclusiveVerdict)
+        else "stable"
+        if found is None
+        else "falls"
     )
 
 
@@ -115,17 +119,20 @@ def compare_scenes(
     for record in track(records, f"{batch.objects} {batch.nodes}", console=Console(stderr=True)):
         scene, rng = laid_out(batch, record["index"])
         verdict = judge.judge(scene, rng)
-        found = verdict if isinstance(verdict, CannotJudge) else verdict.instability
+        found = verdict if isinstance(verdict, InconclusiveVerdict) else verdict.instability
         drake = "stable" if "settled" in record else "falls"
         scenes.pairs[said(found), drake] += 1
-        if not isinstance(verdict, CannotJudge) and verdict.stable and drake == "stable":
+        if not isinstance(verdict, InconclusiveVerdict) and verdict.stable and drake == "stable":
             both_stable += 1
             same_hidden += verdict.hidden == hidden(record, config.cell.camera.visibility_threshold)
         for group in record["groups"]:
             part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
             fall = group["fall"]
             whole = judge.stability(part)
-            if isinstance(whole, CannotJudge) and whole.reason is CannotJudgeReason.FLOATING:
+            if (
+                isinstance(whole, InconclusiveVerdict)
+                and whole.reason is InconclusiveReason.FLOATING
+            ):
                 # What it misses stands in another group: asked again together with all that stands.
                 standing = tuple(
                     scene[n]
@@ -222,7 +229,7 @@ def compare_moves(
         rng = move_rng(item)
         command = resolve_placement(Move(pick, place), observation, config.exploration, rng)
         outcome = (
-            Outcome(MoveResult.NO_FREE_SPOT, scene)
+            Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
             if command is None
             else executor.execute(
                 scene,
@@ -232,7 +239,7 @@ def compare_moves(
         )
         outcomes[outcome.result.value, record["result"]] += 1
         if (
-            outcome.result is not MoveResult.CANNOT_JUDGE
+            outcome.result is not MoveResult.INCONCLUSIVE
             and outcome.result.value != record["result"]
         ):
             found = (
@@ -246,7 +253,7 @@ def compare_moves(
             where = command.X_TO_place.translation
             apart = (abs(a - b) for a, b in zip(where, record["place"][:3], strict=True))
             same_place += max(apart) < 0.001
-    judged = {pair: n for pair, n in outcomes.items() if pair[0] != MoveResult.CANNOT_JUDGE.value}
+    judged = {pair: n for pair, n in outcomes.items() if pair[0] != MoveResult.INCONCLUSIVE.value}
     equal, count = sum(n for (a, b), n in judged.items() if a == b), sum(judged.values())
     return {
         "count": sum(outcomes.values()),
@@ -296,7 +303,9 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
         axis.set_axis_off()
     for axis, item in zip(axes.flat, chosen, strict=False):
         x, y, _ = np.mean([o.X_TO.translation for o in item.objects.objects], axis=0)
-        centred = tuple(replace(o, X_TO=o.X_TO.moved((-x, -y, 0.0))) for o in item.objects.objects)
+        centred = tuple(
+            replace(o, X_TO=o.X_TO.translated((-x, -y, 0.0))) for o in item.objects.objects
+        )
         picture = camera.oblique(replace(item.objects, objects=centred, graph=None))
         axis.imshow(picture[110:510, 290:690])
         axis.set_title(f"fast: {item.fast}\nDrake: {item.drake}", fontsize=13)

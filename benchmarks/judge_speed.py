@@ -37,8 +37,8 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.files import write_json
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.interfaces import CannotJudge
-from drake_clutter.scenes.scene import Scene, jittered, tilt_between
+from drake_clutter.scenes.interfaces import InconclusiveVerdict
+from drake_clutter.scenes.scene import Scene, perturb_poses, tilt_between
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
@@ -131,7 +131,9 @@ class Case:
         """The scene with its offsets."""
         return replace(
             self.scene,
-            objects=tuple(jittered(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))),
+            objects=tuple(
+                perturb_poses(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))
+            ),
         )
 
 
@@ -266,7 +268,7 @@ def measure(
         found[name] = (
             seconds,
             [
-                (None, None) if isinstance(v, CannotJudge) else (v.stable, v.hidden)
+                (None, None) if isinstance(v, InconclusiveVerdict) else (v.stable, v.hidden)
                 for v in verdicts
             ],
         )

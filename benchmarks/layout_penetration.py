@@ -12,7 +12,7 @@ import typer
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import NodeBudget, SceneGrammar, uniform_choice
-from drake_clutter.scenes.geometry import deepest_penetration
+from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.seeding import item_rng
 from drake_clutter.workers.parallel_map import map_ordered
@@ -36,7 +36,7 @@ class _Layouts:
         scene = lay_out(derivation, grammar.classes, ClutterConfig(), rng)
         if isinstance(scene, LayoutFailure):
             return scene.reason.value, -np.inf
-        return "laid out", deepest_penetration(scene.objects)[0]
+        return "laid out", max_penetration(scene.objects)[0]
 
 
 def main(

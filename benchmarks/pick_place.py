@@ -106,12 +106,12 @@ def judged(carried: PickPlaceResult) -> str:
 
 def teleported_falls(scene: Scene, plan: PickPlacePlan) -> bool:
     """Whether the pile falls, or the object does not stay, when it is moved by teleport."""
-    after = scene.at({plan.pick: plan.X_TO_place})
+    after = scene.with_poses({plan.pick: plan.X_TO_place})
     verdict = DrakeJudge(WORLD).judge(after, np.random.default_rng(0))
     strict = replace(WORLD.settle, max_displacement=UNDISTURBED, max_tilt_deg=3.0)
     return (
         not verdict.stable
-        or worst_instability(after.objects, after.at(verdict.settled), strict) is not None
+        or worst_instability(after.objects, after.with_poses(verdict.settled), strict) is not None
     )
 
 
@@ -129,7 +129,7 @@ class Scenes:
             scene, _ = self._make.lay_out(rng)
             verdict = self._judge.judge(scene, rng)
             if verdict.stable:
-                return scene.at(verdict.settled)
+                return scene.with_poses(verdict.settled)
 
 
 class Mover:

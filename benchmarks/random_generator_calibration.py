@@ -76,7 +76,7 @@ def main(
         scenes = map_ordered(_Size(job), range(count), workers=workers)
         made = list(track(scenes, f"{size} nodes", total=count, console=Console(stderr=True)))
         row = summarise(job, [(m.scene, m.verdict) for m in made])
-        shares = [m.verdict.visible_share.values() for m in made if m.verdict.stable]
+        shares = [m.verdict.visible_fractions.values() for m in made if m.verdict.stable]
         row["hidden_by_threshold"] = {
             str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS
         }

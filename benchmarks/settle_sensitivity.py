@@ -19,9 +19,9 @@ from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
-from drake_clutter.scenes.scene import SceneObject, jittered
+from drake_clutter.scenes.scene import SceneObject, perturb_poses
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import settle
@@ -52,12 +52,12 @@ def stacks(
         )
         if isinstance(scene, LayoutFailure):
             continue
-        for group in touching_groups(scene.objects, TOUCHING_MARGIN):
+        for group in group_touching_objects(scene.objects, TOUCHING_MARGIN):
             if len(group) > 1:
                 found.append(
                     (
-                        jittered(group, config.settle.jitter, rng),
-                        jittered(group, config.settle.jitter, rng),
+                        perturb_poses(group, config.settle.jitter, rng),
+                        perturb_poses(group, config.settle.jitter, rng),
                     )
                 )
     return found[:count]
@@ -69,7 +69,7 @@ def rests_on_lying(group: list[SceneObject]) -> str:
     for o in group:
         if o.object_class.shape is not Shape.CYLINDER or o.object_class.only_rest is Rest.UPRIGHT:
             continue
-        loaded = any(abs(other.bounds_T[0][2] - o.top) < 1e-6 for other in group)
+        loaded = any(abs(other.bounds_T[0][2] - o.top_height) < 1e-6 for other in group)
         beside = any(
             other is not o
             and other.object_class is o.object_class

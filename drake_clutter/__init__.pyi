@@ -12,7 +12,10 @@ from .catalog import (
 )
 from .scenes.scene import Pose as Pose, Scene as Scene, SceneObject as SceneObject
 from .scenes.scene_file import load_scene as load_scene, save_scene as save_scene
-from .scenes.scene_set import SceneSet as SceneSet, load_scene_set as load_scene_set
+from .scenes.scene_dataset import (
+    SceneDataset as SceneDataset,
+    load_scene_dataset as load_scene_dataset,
+)
 from .export.folder import ExportFormat as ExportFormat, export_scene as export_scene
 
 # The scene grammar.

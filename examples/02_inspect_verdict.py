@@ -42,7 +42,7 @@ def main() -> None:
             elif verdict.instability is not None:
                 print(f"  {name}: unstable: {verdict.instability}")
             else:
-                visible = {k: round(v, 2) for k, v in verdict.visible_share.items()}
+                visible = {k: round(v, 2) for k, v in verdict.visible_fractions.items()}
                 print(f"  {name}: stable, visible {visible}, hidden {list(verdict.hidden)}")
 
 

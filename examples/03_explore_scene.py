@@ -8,7 +8,7 @@ from drake_clutter import (
     ClutterConfig,
     backends,
     load_catalog,
-    load_scene_set,
+    load_scene_dataset,
     make_explorers,
     run_episode,
 )
@@ -17,8 +17,8 @@ from drake_clutter.resources import resource_path
 
 def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
     config = ClutterConfig()
-    scenes = load_scene_set(resource_path("training/scenes/sg_star_10.json"), load_catalog())
-    scene = scenes.settled(index, scenes.grammar, config)
+    scenes = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), load_catalog())
+    scene = scenes.settled_scene(index, scenes.grammar, config)
 
     backend = backends(fidelity, config)(scene, np.random.default_rng(0))
     policy = make_explorers(agent, config)(backend)

@@ -12,7 +12,7 @@ from drake_clutter import (
     FeasibilityStudy,
     PlannerConfig,
     load_catalog,
-    load_scene_set,
+    load_scene_dataset,
 )
 from drake_clutter.resources import resource_path
 
@@ -28,8 +28,8 @@ def count_results(base_x: float, index: int) -> Counter[str]:
     robot = robot.model_copy(update={"base": base})
     config = replace(config, cell=config.cell.model_copy(update={"robot": robot}))
 
-    scenes = load_scene_set(resource_path("training/scenes/sg_star_10.json"), load_catalog())
-    scene = scenes.settled(index, scenes.grammar, config)
+    scenes = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), load_catalog())
+    scene = scenes.settled_scene(index, scenes.grammar, config)
     study = FeasibilityStudy(f"base {base_x}", config, PlannerConfig(optimize=False), 0)
     return Counter(row.result for row in study.moves(f"{index:04d}", index, scene))
 

@@ -65,7 +65,7 @@ def resting(
     R_TO = resting_rotation(object_class, orientation)
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
     return SceneObject(
-        name or class_name, object_class, Pose.of(R_TO, (xy[0], xy[1], floor - lowest))
+        name or class_name, object_class, Pose.from_rotation(R_TO, (xy[0], xy[1], floor - lowest))
     )
 
 
@@ -115,7 +115,7 @@ def executed(
     """What an executor makes of a move, put where the observation shows a free place."""
     command = resolve_placement(move, observation, WORLD.exploration, generator)
     if command is None:
-        return Outcome(MoveResult.NO_FREE_SPOT, scene)
+        return Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
     return executor.execute(scene, command, generator)
 
 

@@ -99,7 +99,7 @@ def test_what_comes_off_where_it_is_put_down_is_placed(
     xy: tuple[float, float], result: MoveResult, config: ClutterConfig
 ) -> None:
     """The shock of touching down may break the seal, a moment before the vacuum is switched off."""
-    after = SCENE.at({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
+    after = SCENE.with_poses({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
     outcome = evaluate_outcome(SCENE, after, "sugar_box", PLACE, True, config.settle)
     assert (outcome.result, outcome.instability) == (result, None)
 
@@ -148,7 +148,7 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(
 def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
     """The support is believed 10.5 mm too low, more than the bellows give way; and a way that was optimised hits too hard."""
     box, support = SCENE["sugar_box"], resting("cracker_box", xy=(0.2, -0.2))
-    top = support.top
+    top = support.top_height
     X_TO = Pose((0.2, -0.2, top - 0.0105 + 0.0875), box.X_TO.quaternion)
     slow = PlannerConfig(max_guarded_descent=0.08, optimize=False)
     plan = PickPlacePlanner(DEFAULT_CELL, slow).plan([box], box.name, X_TO)
@@ -253,7 +253,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         assert outcome.result is MoveResult.NOT_PLANNED
         assert outcome.detail.startswith(why)
         assert outcome.scene == scene
-        assert not outcome.result.carried_out
+        assert not outcome.result.was_executed
 
 
 def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ from drake_clutter.perception.pose_selection import evaluate_pose
 from drake_clutter.perception.segmentation import ImageWindow
 from drake_clutter.reports.detections_picture import SIDE, detections_picture
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.placement import has_clear_top, seen_through
+from drake_clutter.scenes.occlusion import occluded_boxes
+from drake_clutter.scenes.placement import has_clear_top, is_observed_free
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.unseen import unseen_blocks
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.systems.scenario import Scenario
@@ -278,7 +278,7 @@ def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
             [0.0, -2.0, 2.0],
         ]
     )
-    assert seen_through(observation, points).tolist() == [False, True, True, True, False, False]
+    assert is_observed_free(observation, points).tolist() == [False, True, True, True, False, False]
     assert has_clear_top(observation, observation["wall"])
 
 
@@ -289,31 +289,31 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
     empty = tilted.perceive(scene_of()).observation.depth
     observation = tilted.perceive(scene_of(wall, hidden)).observation
     assert [d.name for d in observation.detections] == ["wall"]
-    blocks = unseen_blocks([wall], observation, empty)
+    blocks = occluded_boxes([wall], observation, empty)
     grid = np.stack(np.meshgrid(*(np.linspace(-0.9, 0.9, 9) for _ in range(3))), axis=-1).reshape(
         -1, 3
     )
     p_T = hidden.X_TO.apply(grid * np.asarray(hidden.object_class.size) / 2)
     beside = (np.abs(p_T - wall.X_TO.p) < np.ptp(wall.corners_T, axis=0) / 2 + 0.03).all(axis=1)
-    unseen = p_T[~seen_through(observation, p_T) & ~beside & (p_T[:, 2] > 0.012)]
+    unseen = p_T[~is_observed_free(observation, p_T) & ~beside & (p_T[:, 2] > 0.012)]
     full = np.zeros(len(unseen), bool)
     for block in blocks:
         c, s = math.cos(block.yaw), math.sin(block.yaw)
-        p_B = (unseen - block.middle) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        p_B = (unseen - block.center) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         full |= (np.abs(p_B) <= np.array(block.size) / 2 + 1e-9).all(axis=1)
     assert len(unseen) > 100
     assert full.all()
-    assert all(block.middle[1] > 0.03 for block in blocks)
+    assert all(block.center[1] > 0.03 for block in blocks)
 
 
 def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
     """Something nameless of 28 mm is a block; floor and rim, at a depth that changes, are none."""
     empty = tilted.perceive(scene_of()).observation.depth
-    assert unseen_blocks([], tilted.perceive(scene_of()).observation, empty) == ()
+    assert occluded_boxes([], tilted.perceive(scene_of()).observation, empty) == ()
     stranger = resting("gelatin_box", xy=(0.1, 0.1), name="stranger")
-    (block,) = unseen_blocks([], tilted.perceive(scene_of(stranger)).observation, empty)
-    assert block.top == pytest.approx(0.028, abs=2e-3)
-    assert np.hypot(block.middle[0] - 0.1, block.middle[1] - 0.1) < 0.02
+    (block,) = occluded_boxes([], tilted.perceive(scene_of(stranger)).observation, empty)
+    assert block.top_height == pytest.approx(0.028, abs=2e-3)
+    assert np.hypot(block.center[0] - 0.1, block.center[1] - 0.1) < 0.02
 
 
 # --- Cells ---
@@ -378,14 +378,14 @@ def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(
         resting("cracker_box", Orientation.UPRIGHT_0, (0.05, 0.0)),
     )
     empty = np.where(camera.floor_depth < 5, camera.floor_depth, np.float32(np.inf))
-    blocks = unseen_blocks(
+    blocks = occluded_boxes(
         [], replace(detector.perceive(scene_of(stranger)).observation, detections=()), empty
     )
     assert blocks
     for block in blocks:
         low, high = (
-            np.array(block.middle) - np.array(block.size) / 2,
-            np.array(block.middle) + np.array(block.size) / 2,
+            np.array(block.center) - np.array(block.size) / 2,
+            np.array(block.center) + np.array(block.size) / 2,
         )
         assert np.abs([low[:2], high[:2]]).max() < 0.36 * math.sqrt(2)
         assert high[2] < 0.25

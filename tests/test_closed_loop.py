@@ -44,7 +44,7 @@ COVERED = scene_of(
     resting("cracker_box", xy=(0.05, 0.0), floor=0.028),
 )
 BEFORE = RayCaster(ClutterConfig().cell.camera).observe(COVERED)[0]
-ASIDE = COVERED.at({"cracker_box": resting("cracker_box", xy=(0.05, 0.25)).X_TO})
+ASIDE = COVERED.with_poses({"cracker_box": resting("cracker_box", xy=(0.05, 0.25)).X_TO})
 NO_SEAL = PlanningFailure(PlanningFailureReason.NO_SEAL, "it")
 AFTER = RayCaster(ClutterConfig().cell.camera).observe(ASIDE)[0]
 
@@ -316,7 +316,7 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
 
     box = resting("gelatin_box", xy=(-0.1, 0.0))
     marker, can = (
-        resting("large_marker", xy=(-0.1, 0.0), floor=box.top),
+        resting("large_marker", xy=(-0.1, 0.0), floor=box.top_height),
         resting("tomato_soup_can", xy=(0.2, 0.2)),
     )
     loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)

@@ -26,9 +26,14 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
-from drake_clutter.scenes.placement import free_places
+from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import TRAY, Pose
-from drake_clutter.scenes.scene_set import SceneSet, SetScene, load_scene_set, save_scene_set
+from drake_clutter.scenes.scene_dataset import (
+    SceneDataset,
+    SceneRecord,
+    load_scene_dataset,
+    save_scene_dataset,
+)
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import run_episode
@@ -38,22 +43,24 @@ from drake_clutter.tasks.exploration_graph import FEATURES
 ROOT = Path(__file__).parents[1]
 
 
-def entry(seed: int) -> SetScene:
+def entry(seed: int) -> SceneRecord:
     scene = random_scene(seed, 16, 20)
-    return SetScene(scene.derivation, str(seed), 1, "", tuple(scene.poses.values()))
+    return SceneRecord(scene.derivation, str(seed), 1, "", tuple(scene.poses.values()))
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scenes by RG that hide seven, three and two objects, and stand."""
     path = tmp_path_factory.mktemp("scenes") / "few.json"
-    save_scene_set(path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)], DEFAULT_CELL)
+    save_scene_dataset(
+        path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)], DEFAULT_CELL
+    )
     return path
 
 
 @pytest.fixture(scope="module")
-def scenes(file: Path) -> SceneSet:
-    return load_scene_set(file, CATALOG)
+def scenes(file: Path) -> SceneDataset:
+    return load_scene_dataset(file, CATALOG)
 
 
 def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:
@@ -89,7 +96,7 @@ def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) 
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> None:
+def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -> None:
     environment, draw = (
         ClutterExploration(scenes, privileged=privileged, max_moves=6),
         np.random.default_rng(0),
@@ -125,7 +132,7 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneSet) -> No
     assert len(ends) > 1
 
 
-def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
+def test_what_may_not_be_named_changes_nothing(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, privileged=True)
     observation, _ = environment.reset(options={"scene": 0})
     hidden = next(
@@ -141,7 +148,7 @@ def test_what_may_not_be_named_changes_nothing(scenes: SceneSet) -> None:
     assert environment.task.steps == []
 
 
-def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneSet) -> None:
+def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, max_moves=3)
     observation, _ = environment.reset(seed=0)
     for number in range(1, 4):
@@ -154,7 +161,7 @@ def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneSet) -> Non
 
 
 @pytest.mark.parametrize("fidelity", FIDELITIES)
-def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
+def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
     environment = ClutterExploration(scenes, fidelity=backends(fidelity, ClutterConfig()))
     before, _ = environment.reset(options={"scene": 2})
     height = before["feature"][:, FEATURES.index("z")]
@@ -167,7 +174,7 @@ def test_a_move_at_every_fidelity(scenes: SceneSet, fidelity: str) -> None:
     assert after["glob"].tolist() == [pytest.approx(1 / 20)]
 
 
-def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -> None:
+def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDataset) -> None:
     environment = ClutterExploration(replace(scenes, scenes=(scenes.scenes[1],)))
     starts: list[dict[str, Pose]] = []
     for options in (None, None, {"scene": 0}, {"scene": 0}):
@@ -181,7 +188,7 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneSet) -
     ]
 
 
-def test_too_many_objects_are_refused(scenes: SceneSet) -> None:
+def test_too_many_objects_are_refused(scenes: SceneDataset) -> None:
     with pytest.raises(InputError, match="none stands and hides something, with at most 2 objects"):
         ClutterExploration(scenes, most_objects=2).reset(seed=0)
     with pytest.raises(InputError, match="most_objects: 2; this scene has 11"):
@@ -202,7 +209,7 @@ def test_the_environment_needs_no_arm() -> None:
 # --- Learning ---
 
 
-def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneSet) -> None:
+def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneDataset) -> None:
     """Of four episodes, all moves of two are called good, and all of the others bad."""
     environment = ClutterExploration(scenes, privileged=True, max_moves=4)
     learner = ActorCritic(
@@ -224,7 +231,9 @@ def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneSet) -> None:
 
 
 @pytest.mark.parametrize("dagger", [False, True])
-def test_a_clone_does_more_and_more_what_its_teacher_would(dagger: bool, scenes: SceneSet) -> None:
+def test_a_clone_does_more_and_more_what_its_teacher_would(
+    dagger: bool, scenes: SceneDataset
+) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(3)
     teacher = ExplorerNetwork(len(environment.numbers), 8)
@@ -258,7 +267,7 @@ def likelihood(network: ExplorerNetwork, played: Sequence[Played]) -> float:
         return float(log_probability(found, network.places(found, moves[:, 0]), moves).mean())
 
 
-def test_episodes_are_the_same_for_the_same_seed(scenes: SceneSet) -> None:
+def test_episodes_are_the_same_for_the_same_seed(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(0)
     network = ExplorerNetwork(len(environment.numbers), 8)
@@ -290,7 +299,7 @@ def test_the_advantage_is_the_weighted_sum_of_what_comes() -> None:
     assert advantage(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneSet) -> None:
+def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneDataset) -> None:
     """The same object, by its node in either graph."""
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(1)
@@ -458,7 +467,7 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
             likelihood = sum(decision.picks.values())
             assert likelihood in (0, pytest.approx(1)), "as the network had it, with room or not"
             legal = legal_moves(observation)
-            room = {m for m in legal if free_places(observation, m, config.exploration)}
+            room = {m for m in legal if find_free_placements(observation, m, config.exploration)}
             if move is None:
                 assert not room
                 return decision
@@ -471,7 +480,7 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
     assert on_the_tray == {True, False}
 
 
-def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig) -> None:
+def test_full_knowledge_finds_everything(scenes: SceneDataset, config: ClutterConfig) -> None:
     environment = ClutterExploration(scenes, max_moves=20)
     environment.reset(options={"scene": 1})
     policy = make_explorers("full-knowledge", config)(environment.backend)
@@ -483,7 +492,7 @@ def test_full_knowledge_finds_everything(scenes: SceneSet, config: ClutterConfig
 
 def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) -> None:
     camera = "cameras.overhead.pose={translation: [0.0, 0.3, 1.5], rpy_deg: [170, 0, 0]}"
-    save_scene_set(
+    save_scene_dataset(
         tmp_path / "tilted.json",
         {"objects": "ycb7"},
         [entry(22)],

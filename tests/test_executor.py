@@ -9,7 +9,7 @@ from conftest import executed, resting, rng, scene_of, world_with
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.geometry import deepest_penetration
+from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.executor import SettleExecutor
@@ -46,7 +46,7 @@ def test_the_top_object_goes_to_the_tray(executor: SettleExecutor, detector: Lab
     assert after.names == STACKS.names
     assert after["above"].X_TO.p[2] == pytest.approx(0.019, abs=0.0005)
     assert how_far(STACKS, after, "above") > 0.15
-    assert deepest_penetration(after.objects)[0] < 0.0005
+    assert max_penetration(after.objects)[0] < 0.0005
     assert how_far(STACKS, after, "below") < 0.001
     for name in (
         "can",
@@ -69,7 +69,7 @@ def test_onto_another_object(executor: SettleExecutor, detector: LabelDetector) 
 def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecutor) -> None:
     """More than the margin within which objects are simulated together."""
     start = STACKS["on the can"].X_TO
-    raised = start.moved((0.0, 0.0, 0.005))
+    raised = start.translated((0.0, 0.0, 0.005))
     command = PickPlaceCommand(Move("on the can", "can"), start, raised)
     outcome = executor.execute(STACKS, command, rng(0))
     assert outcome.result is MoveResult.PLACED
@@ -87,10 +87,10 @@ def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
     scene = scene_of(
         neighbour,
         resting("tomato_soup_can", xy=(beside, 0.0)),
-        replace(picked, X_TO=picked.X_TO.moved((beside, 0.0, 0.0))),
+        replace(picked, X_TO=picked.X_TO.translated((beside, 0.0, 0.0))),
     )
     start = scene["picked"].X_TO
-    raised = start.moved((0.0, 0.0, 0.005))
+    raised = start.translated((0.0, 0.0, 0.005))
     command = PickPlaceCommand(Move("picked", "tomato_soup_can"), start, raised)
     outcome = executor.execute(scene, command, rng(0))
     assert outcome.result is MoveResult.PLACED
@@ -123,7 +123,7 @@ def test_a_move_without_a_free_spot_changes_nothing(
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(executor, detector, scene, Move("box"))
     assert (outcome.result, outcome.instability, outcome.motion) == (
-        MoveResult.NO_FREE_SPOT,
+        MoveResult.NO_FREE_PLACEMENT,
         None,
         (),
     )

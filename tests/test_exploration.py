@@ -58,10 +58,10 @@ class Scripted:
         generator: np.random.Generator,
     ) -> Outcome:
         result = next(self._results)
-        if not result.carried_out:
+        if not result.was_executed:
             return Outcome(result, scene)
         pick = command.move.pick
-        moved = scene.at({pick: resting("cracker_box", xy=ASIDE[pick]).X_TO})
+        moved = scene.with_poses({pick: resting("cracker_box", xy=ASIDE[pick]).X_TO})
         fallen = (
             Instability(InstabilityReason.SLID, "g1", 0.02, 0.0)
             if result is MoveResult.COLLAPSED
@@ -93,7 +93,7 @@ def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) 
 
 
 def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
-    game = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_SPOT, MoveResult.PLACED)
+    game = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_PLACEMENT, MoveResult.PLACED)
     task = game.task
     at_first = task.known
     assert at_first == ("cover 1", "cover 2", "marker")
@@ -139,7 +139,7 @@ def test_what_a_collapse_uncovers_does_not_count(detector: LabelDetector) -> Non
 
 
 def test_out_of_moves_counts_moves_that_could_not_be_carried_out(detector: LabelDetector) -> None:
-    game = episode(detector, *[MoveResult.NO_FREE_SPOT] * 2, max_moves=2)
+    game = episode(detector, *[MoveResult.NO_FREE_PLACEMENT] * 2, max_moves=2)
     task = game.task
     for _ in range(2):
         assert task.end is None
@@ -162,7 +162,9 @@ def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
     game.step(Move("cover 1"))
     known = task.known
     back = ASIDE | {"cover 1": (-0.2, 0.0)}
-    game.backend.scene = HIDING.at({"cover 2": resting("cracker_box", xy=back["cover 2"]).X_TO})
+    game.backend.scene = HIDING.with_poses(
+        {"cover 2": resting("cracker_box", xy=back["cover 2"]).X_TO}
+    )
     step = game.step(Move("cover 2"))
     assert "g1" not in {d.name for d in step.look.observation.detections}
     assert task.known == (*known, "p")
@@ -272,7 +274,7 @@ def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) 
     its = tuple(move for move in legal_moves(before) if move.pick == "cover 1")
     assert stuck.invalid_moves == (Move("marker"), *its)
     assert stuck.update(before) == stuck
-    aside = HIDING.at({"cover 1": resting("cracker_box", xy=ASIDE["cover 1"]).X_TO})
+    aside = HIDING.with_poses({"cover 1": resting("cracker_box", xy=ASIDE["cover 1"]).X_TO})
     assert placed.update(detector.perceive(aside).observation).invalid_moves == ()
     unseen = replace(before, detections=())
     assert placed.update(unseen).invalid_moves == ()

@@ -107,7 +107,7 @@ def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
         for o in SCENE.objects:
             w, x, y, z = o.X_TO.quaternion
             turned[o.name] = Pose(o.X_TO.translation, (w + tilt, x - tilt, y + tilt, z - tilt))
-        tilted.append(graph_of(SCENE.at(turned))["feature"])
+        tilted.append(graph_of(SCENE.with_poses(turned))["feature"])
     assert tilted[0] == pytest.approx(tilted[1], abs=0.01)
     assert tilted[2] == pytest.approx(tilted[1], abs=0.01)
 
@@ -136,7 +136,7 @@ def test_something_must_carry_a_box_that_floats() -> None:
 
 
 def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
-    covered = SCENE.at({"large_marker": resting("large_marker", xy=(0.0, 0.3)).X_TO})
+    covered = SCENE.with_poses({"large_marker": resting("large_marker", xy=(0.0, 0.3)).X_TO})
     belief = Belief().update(RAYS.observe(covered)[0]).update(RAYS.observe(SCENE)[0])
     known = belief.objects
     assert known[0].name == "large_marker"

@@ -57,11 +57,13 @@ def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
 def scene(mug: ObjectClass) -> Scene:
     """A box that lies on a can (its pitch is a right angle), a can of the same class, a lying marker, a turned mug."""
     can = resting("tomato_soup_can", Orientation.UPRIGHT_0, (0.1, 0.1))
-    box = resting("sugar_box", xy=(0.1, 0.1), floor=can.top)
-    tilted = Pose.of(
+    box = resting("sugar_box", xy=(0.1, 0.1), floor=can.top_height)
+    tilted = Pose.from_rotation(
         Rotation.from_euler("zyx", [0.4, np.pi / 2, 0.0]).as_matrix(), (-0.1, -0.1, 0.009)
     )
-    turned = Pose.of(Rotation.from_euler("z", 2.0).as_matrix(), (0.2, -0.15, mug.size[2] / 2))
+    turned = Pose.from_rotation(
+        Rotation.from_euler("z", 2.0).as_matrix(), (0.2, -0.15, mug.size[2] / 2)
+    )
     return scene_of(
         can,
         resting("tomato_soup_can", Orientation.UPRIGHT_0, (-0.1, 0.15), name="another can-2.1 ü"),
@@ -216,7 +218,7 @@ def check_in_trimesh(scene: Scene, main_file: Path) -> None:
         assert isinstance(mesh.visual.material.baseColorTexture, Image.Image)
         assert mesh.extents == pytest.approx(scene[name].object_class.size, abs=1e-4)
     assert picture.bounds[1] - picture.bounds[0] == pytest.approx(
-        np.array([0.666, 0.01 + scene["sugar_box"].top, 0.666]), abs=1e-4
+        np.array([0.666, 0.01 + scene["sugar_box"].top_height, 0.666]), abs=1e-4
     )
 
 

@@ -13,8 +13,8 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     Instability,
     InstabilityReason,
     Move,
@@ -69,7 +69,7 @@ def lowest(o: SceneObject) -> float:
 def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None:
     """At rest, not at the height where it is let go; within the random offset of its place; nothing else moves."""
     outcome = carried_out(STACKS, move)
-    assert (outcome.result, outcome.instability, outcome.cannot_judge, outcome.motion) == (
+    assert (outcome.result, outcome.instability, outcome.inconclusive, outcome.motion) == (
         MoveResult.PLACED,
         None,
         None,
@@ -136,7 +136,7 @@ OUTSIDE_ONLY = scene_of(
 def test_what_loses_its_support_falls(scene: Scene, move: Move, falls: str) -> None:
     """Where to is not followed: the picked object is at its place, the others are where they were."""
     outcome = carried_out(scene, move)
-    assert (outcome.result, outcome.cannot_judge) == (MoveResult.COLLAPSED, None)
+    assert (outcome.result, outcome.inconclusive) == (MoveResult.COLLAPSED, None)
     assert outcome.instability == Instability(InstabilityReason.UNSUPPORTED, falls)
     assert outcome.scene[falls].X_TO == scene[falls].X_TO
     assert outcome.scene[move.pick].X_TO != scene[move.pick].X_TO
@@ -172,8 +172,8 @@ def test_where_nothing_balances() -> None:
 def test_no_free_spot_changes_nothing() -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     outcome = carried_out(scene, Move("box"))
-    assert (outcome.result, outcome.instability, outcome.cannot_judge) == (
-        MoveResult.NO_FREE_SPOT,
+    assert (outcome.result, outcome.instability, outcome.inconclusive) == (
+        MoveResult.NO_FREE_PLACEMENT,
         None,
         None,
     )
@@ -183,7 +183,7 @@ def test_no_free_spot_changes_nothing() -> None:
 def leaning(o: SceneObject) -> SceneObject:
     R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix() @ o.X_TO.rotation
     floor = float((o.object_class.corners @ R_TO.T)[:, 2].min())
-    return replace(o, X_TO=Pose.of(R_TO, (*o.X_TO.p[:2], -floor)))
+    return replace(o, X_TO=Pose.from_rotation(R_TO, (*o.X_TO.p[:2], -floor)))
 
 
 LEANS = scene_of(*STACKS.objects, leaning(resting("gelatin_box", xy=(0.2, -0.2), name="leaning")))
@@ -198,7 +198,7 @@ JUST_RESTS = scene_of(
         resting("large_marker", xy=(-0.2, -0.2), name="marker"),
     ),
 )
-LEANING = CannotJudge(CannotJudgeReason.LEANING, "leaning")
+LEANING = InconclusiveVerdict(InconclusiveReason.LEANING, "leaning")
 
 
 @pytest.mark.parametrize(
@@ -207,19 +207,25 @@ LEANING = CannotJudge(CannotJudgeReason.LEANING, "leaning")
         (LEANS, Move("leaning"), LEANING),
         (LEANS, Move("leaning", "above"), LEANING),
         (LEANS, Move("marker", "leaning"), LEANING),
-        (JUST_RESTS, Move("on it"), CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, "over")),
+        (
+            JUST_RESTS,
+            Move("on it"),
+            InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, "over"),
+        ),
         (
             JUST_RESTS,
             Move("marker", "on it"),
-            CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, "over"),
+            InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, "over"),
         ),
     ],
 )
-def test_what_it_cannot_judge_is_a_result(scene: Scene, move: Move, answer: CannotJudge) -> None:
+def test_what_it_cannot_judge_is_a_result(
+    scene: Scene, move: Move, answer: InconclusiveVerdict
+) -> None:
     """Also that something rests, before the move, which it would let fall."""
     outcome = carried_out(scene, move)
-    assert (outcome.result, outcome.cannot_judge, outcome.instability) == (
-        MoveResult.CANNOT_JUDGE,
+    assert (outcome.result, outcome.inconclusive, outcome.instability) == (
+        MoveResult.INCONCLUSIVE,
         answer,
         None,
     )
@@ -235,7 +241,7 @@ def test_what_a_move_does_not_touch_need_not_be_judged(move: Move) -> None:
     """The same as without the box that leans, wherever the picked one goes."""
     outcome, without = carried_out(LEANS, move), carried_out(STACKS, move)
     assert (outcome.result, outcome.instability) == (without.result, without.instability)
-    assert outcome.result is not MoveResult.CANNOT_JUDGE
+    assert outcome.result is not MoveResult.INCONCLUSIVE
     assert outcome.scene["leaning"] == LEANS["leaning"]
 
 
@@ -321,7 +327,7 @@ def test_no_free_spot_is_no_question_for_an_executor() -> None:
     scene = scene_of(leaning(resting("gelatin_box", name="box")), side=0.12)
     detector = RayDetector(CONFIG.cell.camera)
     backend = SteppedBackend(Unasked(), detector, CONFIG.exploration, scene, rng())
-    assert backend.step(Move("box")) == Outcome(MoveResult.NO_FREE_SPOT, scene)
+    assert backend.step(Move("box")) == Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
     assert backend.belief.invalid_moves == backend.belief.history == (Move("box"),)
 
 

@@ -11,8 +11,8 @@ from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     Instability,
     InstabilityReason,
     Verdict,
@@ -35,13 +35,13 @@ FAST = FastJudge(ClutterConfig())
 
 def stands(*objects: SceneObject) -> bool:
     found = FAST.stability(scene_of(*objects))
-    assert not isinstance(found, CannotJudge), str(found)
+    assert not isinstance(found, InconclusiveVerdict), str(found)
     return found is None
 
 
 def reason_of(
-    found: Instability | CannotJudge | None,
-) -> InstabilityReason | CannotJudgeReason | None:
+    found: Instability | InconclusiveVerdict | None,
+) -> InstabilityReason | InconclusiveReason | None:
     """What is wrong. Which of two twins that fall alike is named is not asked."""
     return None if found is None else found.reason
 
@@ -202,7 +202,7 @@ def test_numerical_noise_is_no_matter(
         noisy.append(
             replace(
                 o,
-                X_TO=Pose.of(
+                X_TO=Pose.from_rotation(
                     turn @ o.X_TO.rotation, o.X_TO.p + 1e-9 * generator.standard_normal(3)
                 ),
             )
@@ -249,7 +249,7 @@ def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -
             is InstabilityReason.UNBALANCED
         )
     margins = FAST.margins(ARCH)  # under vertical forces
-    assert not isinstance(margins, CannotJudge)
+    assert not isinstance(margins, InconclusiveVerdict)
     assert max(margins.values()) < 0
 
 
@@ -260,79 +260,79 @@ def leaning(o: SceneObject, degrees: float) -> SceneObject:
     """Turned about the tray's y, its lowest point at the height where it was."""
     R_TO = Rotation.from_euler("y", degrees, degrees=True).as_matrix() @ o.X_TO.rotation
     lowest = float((o.object_class.corners @ R_TO.T)[:, 2].min())
-    return replace(o, X_TO=Pose.of(R_TO, (*o.X_TO.p[:2], o.bounds_T[0][2] - lowest)))
+    return replace(o, X_TO=Pose.from_rotation(R_TO, (*o.X_TO.p[:2], o.bounds_T[0][2] - lowest)))
 
 
-CANNOT: dict[str, tuple[list[SceneObject], CannotJudgeReason]] = {
-    "leans": ([leaning(resting("sugar_box", UPRIGHT, name="it"), 3.0)], CannotJudgeReason.LEANING),
+CANNOT: dict[str, tuple[list[SceneObject], InconclusiveReason]] = {
+    "leans": ([leaning(resting("sugar_box", UPRIGHT, name="it"), 3.0)], InconclusiveReason.LEANING),
     "a can that leans": (
         [leaning(resting("tomato_soup_can", name="it"), 3.0)],
-        CannotJudgeReason.LEANING,
+        InconclusiveReason.LEANING,
     ),
     "a marker that leans": (
         [leaning(resting("large_marker", name="it"), 3.0)],
-        CannotJudgeReason.LEANING,
+        InconclusiveReason.LEANING,
     ),
     "over the rim": (
         [resting("cracker_box", xy=(0.240, 0.0), name="it")],
-        CannotJudgeReason.OUTSIDE_TRAY,
+        InconclusiveReason.OUTSIDE_TRAY,
     ),
     "beside the tray": (
         [resting("large_marker", xy=(0.0, -0.5), name="it")],
-        CannotJudgeReason.OUTSIDE_TRAY,
+        InconclusiveReason.OUTSIDE_TRAY,
     ),
     "in another": (
         [resting("gelatin_box", xy=(0.1, 0.0), floor=0.040, name="it"), BELOW],
-        CannotJudgeReason.INTERPENETRATING,
+        InconclusiveReason.INTERPENETRATING,
     ),
     "beside each other, 2 mm too near": (
         [resting("gelatin_box", xy=(0.0, 0.071), name="it"), resting("gelatin_box", name="other")],
-        CannotJudgeReason.INTERPENETRATING,
+        InconclusiveReason.INTERPENETRATING,
     ),
     "in the tray": (
         [resting("cracker_box", floor=-0.003, name="it")],
-        CannotJudgeReason.INTERPENETRATING,
+        InconclusiveReason.INTERPENETRATING,
     ),
-    "floats": ([resting("cracker_box", floor=0.05, name="it")], CannotJudgeReason.FLOATING),
+    "floats": ([resting("cracker_box", floor=0.05, name="it")], InconclusiveReason.FLOATING),
     "floats 3 mm above a box": (
         [BELOW, resting("gelatin_box", floor=0.063, name="it")],
-        CannotJudgeReason.FLOATING,
+        InconclusiveReason.FLOATING,
     ),
     "floats far beside": (
         [BELOW, resting("gelatin_box", xy=(0.0, 0.25), floor=0.060, name="it")],
-        CannotJudgeReason.FLOATING,
+        InconclusiveReason.FLOATING,
     ),
     "on the side of a marker": (
         [
             resting("large_marker", name="other"),
             resting("gelatin_box", xy=(0.0, 0.044), floor=0.018, name="it"),
         ],
-        CannotJudgeReason.EDGE_CONTACT,
+        InconclusiveReason.EDGE_CONTACT,
     ),
     "in the groove of a pair": (
         [*MARKER_PAIR, resting("large_marker", floor=0.0175, name="it")],
-        CannotJudgeReason.EDGE_CONTACT,
+        InconclusiveReason.EDGE_CONTACT,
     ),
     "misses": (
         [BELOW, resting("gelatin_box", xy=(0.0, 0.13), floor=0.060, name="it")],
-        CannotJudgeReason.UNSUPPORTED,
+        InconclusiveReason.UNSUPPORTED,
     ),
 }
 
 
 @pytest.mark.parametrize(("objects", "reason"), CANNOT.values(), ids=list(CANNOT))
 def test_what_it_cannot_judge(
-    objects: list[SceneObject], reason: CannotJudgeReason, config: ClutterConfig
+    objects: list[SceneObject], reason: InconclusiveReason, config: ClutterConfig
 ) -> None:
     """Whatever is asked. What misses what should carry it falls; the rest may fall or not."""
     scene = scene_of(*objects)
-    answer = CannotJudge(reason, "it")
+    answer = InconclusiveVerdict(reason, "it")
     assert FAST.supports(scene) == FAST.margins(scene) == FAST.never_movable(scene) == answer
     losing = FAST.losing_support(scene, "it")
-    if reason is CannotJudgeReason.UNSUPPORTED:
+    if reason is InconclusiveReason.UNSUPPORTED:
         assert losing in (
             answer,
-            CannotJudge(CannotJudgeReason.FLOATING, "it"),
+            InconclusiveVerdict(InconclusiveReason.FLOATING, "it"),
         )  # of its group alone, to which the other is not
         assert FAST.stability(scene) == Instability(InstabilityReason.UNSUPPORTED, "it")
         return
@@ -382,14 +382,14 @@ def test_stable_scenes_look_as_drake_says(
     assert mine.stable
     assert drakes.stable
     assert mine.hidden == drakes.hidden
-    assert list(mine.visible_share) == list(scene.names)
-    assert mine.visible_share == pytest.approx(drakes.visible_share, abs=0.01)
+    assert list(mine.visible_fractions) == list(scene.names)
+    assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
     for name in scene.names:
         assert (
             np.linalg.norm(mine.settled[name].p - drakes.settled[name].p) < config.settle.rest_drift
         )
         assert np.hypot(*(mine.settled[name].p - scene[name].X_TO.p)[:2]) <= 0.001
-    assert fast.stability(scene.at(drakes.settled)) is None
+    assert fast.stability(scene.with_poses(drakes.settled)) is None
 
 
 @pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
@@ -397,15 +397,15 @@ def test_what_falls_in_drake(
     objects: list[SceneObject], reason: InstabilityReason, name: str, fast: FastJudge
 ) -> None:
     verdict = fast.judge(scene_of(*objects), rng())
-    if isinstance(verdict, CannotJudge):
-        assert verdict.reason in (CannotJudgeReason.FLOATING, CannotJudgeReason.OUTSIDE_TRAY)
+    if isinstance(verdict, InconclusiveVerdict):
+        assert verdict.reason in (InconclusiveReason.FLOATING, InconclusiveReason.OUTSIDE_TRAY)
         assert verdict.object == name
         return
     assert verdict.instability is not None
     assert verdict.instability.object == name
     assert (verdict.instability.displacement, verdict.instability.tilt) == (0.0, 0.0)
     assert str(verdict.instability) == f"{name} {verdict.instability.reason.value}"
-    assert (verdict.visible_share, verdict.hidden) == ({}, ())
+    assert (verdict.visible_fractions, verdict.hidden) == ({}, ())
     assert set(verdict.settled) == {o.name for o in objects}
     assert reason is not InstabilityReason.LEFT_TRAY
 
@@ -424,7 +424,7 @@ def test_the_threshold_of_hidden_is_the_configs(config: ClutterConfig) -> None:
     verdict = FastJudge(open_minded).judge(HIDING, rng())
     assert isinstance(verdict, Verdict)
     assert verdict.hidden == ()
-    assert verdict.visible_share["gelatin"] == 0.0
+    assert verdict.visible_fractions["gelatin"] == 0.0
 
 
 @pytest.mark.parametrize("name", ["a box on its shelf above nothing", "a stack beside the tray"])

@@ -18,8 +18,8 @@ from test_settle import BELOW
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     InstabilityReason,
     Verdict,
 )
@@ -50,7 +50,7 @@ def column(layers: Layers) -> list[SceneObject]:
         objects.append(
             resting(class_name, orientation, (x, y), floor, f"{class_name} {len(objects)}")
         )
-        floor = objects[-1].top
+        floor = objects[-1].top_height
     return objects
 
 
@@ -90,8 +90,10 @@ def test_a_column_stands_while_every_centre_of_mass_is_inside(layers: Layers) ->
     objects = column(layers)
     scene = scene_of(*objects)
     margins = FAST.margins(scene)
-    assume(not isinstance(margins, CannotJudge))  # out of the tray, or beside what should carry it
-    assert not isinstance(margins, CannotJudge)
+    assume(
+        not isinstance(margins, InconclusiveVerdict)
+    )  # out of the tray, or beside what should carry it
+    assert not isinstance(margins, InconclusiveVerdict)
     expected = column_margins(objects)
     assume(all(abs(e) > STEP for e in expected) and abs(min(expected) - MARGIN) > 1e-5)
     found = FAST.stability(scene)
@@ -113,7 +115,7 @@ def test_losing_support_is_what_the_rest_cannot_do_without(layers: Layers, which
     rest = [o for o in objects if o.name != taken]
     losing = FAST.losing_support(scene, taken)
     above = tuple(o.name for o in objects[objects.index(scene[taken]) + 1 :])
-    assert not isinstance(losing, CannotJudge)
+    assert not isinstance(losing, InconclusiveVerdict)
     assert set(above) <= set(losing)
     if not above:  # what lies on the rest may have been its counterweight
         assert (losing == ()) == stands(*rest)
@@ -165,8 +167,8 @@ def test_a_box_on_feet_stands_while_its_middle_is_between_them(
     found = FAST.stability(
         scene_of(*(resting("sugar_box", UPRIGHT, foot, name=f"{foot}") for foot in feet), top)
     )
-    assume(reason_of(found) is not CannotJudgeReason.FLOATING)
-    assert not isinstance(found, CannotJudge)
+    assume(reason_of(found) is not InconclusiveReason.FLOATING)
+    assert not isinstance(found, InconclusiveVerdict)
     assert (found is None) == expected
 
 
@@ -185,13 +187,13 @@ ANYTHING = st.lists(
 
 
 def shifted(scene: Scene, x: float, y: float) -> Scene:
-    return scene.at({o.name: o.X_TO.moved((x, y, 0.0)) for o in scene.objects})
+    return scene.with_poses({o.name: o.X_TO.translated((x, y, 0.0)) for o in scene.objects})
 
 
 def turned(scene: Scene, quarters: int) -> Scene:
     turn = np.rint(Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix())
-    return scene.at(
-        {o.name: Pose.of(turn @ o.X_TO.rotation, turn @ o.X_TO.p) for o in scene.objects}
+    return scene.with_poses(
+        {o.name: Pose.from_rotation(turn @ o.X_TO.rotation, turn @ o.X_TO.p) for o in scene.objects}
     )
 
 
@@ -217,7 +219,7 @@ def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) 
     """Unless two objects cannot be judged, of which the first is named."""
     scene = scene_of(*column(layers), side=2.0)
     supports = FAST.supports(scene)
-    assume(not isinstance(supports, CannotJudge))
+    assume(not isinstance(supports, InconclusiveVerdict))
     objects = list(scene.objects)
     shuffle.shuffle(objects)
     other = replace(scene, objects=tuple(objects))
@@ -226,8 +228,8 @@ def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) 
     assert FAST.margins(other) == pytest.approx(FAST.margins(scene), abs=1.01 * STEP)
     for name in scene.names:
         one, same = FAST.losing_support(scene, name), FAST.losing_support(other, name)
-        assert not isinstance(one, CannotJudge)
-        assert not isinstance(same, CannotJudge)
+        assert not isinstance(one, InconclusiveVerdict)
+        assert not isinstance(same, InconclusiveVerdict)
         assert set(one) == set(same)
 
 
@@ -258,10 +260,12 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
             )
         if step % 3 == 2:
             o = scene.objects[generator.integers(len(scene.objects))]
-            scene = scene.at({o.name: o.X_TO.moved((*generator.uniform(-0.02, 0.02, 2), 0.0))})
+            scene = scene.with_poses(
+                {o.name: o.X_TO.translated((*generator.uniform(-0.02, 0.02, 2), 0.0))}
+            )
         verdict = used.judge(scene, rng(step))
         assert FastJudge(config).judge(scene, rng(step)) == verdict
-        kinds.add(type(verdict) if isinstance(verdict, CannotJudge) else verdict.stable)
+        kinds.add(type(verdict) if isinstance(verdict, InconclusiveVerdict) else verdict.stable)
     assert kinds >= {True, False}
 
 
@@ -296,7 +300,9 @@ def test_any_number_of_orientations(config: ClutterConfig) -> None:
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         o = resting("sugar_box", name="box")
         assert (
-            used.stability(scene_of(replace(o, X_TO=Pose.of(turn @ o.X_TO.rotation, o.X_TO.p))))
+            used.stability(
+                scene_of(replace(o, X_TO=Pose.from_rotation(turn @ o.X_TO.rotation, o.X_TO.p)))
+            )
             is None
         )
 

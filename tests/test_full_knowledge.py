@@ -208,7 +208,9 @@ def test_no_more_moves_than_the_budget_are_tried() -> None:
 def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     """Because of a box that leans 3 mm beside it, the fast judge cannot tell whether the cover can go; Drake can."""
     R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix()
-    leaning = SceneObject("leaning", CLASSES["gelatin_box"], Pose.of(R_TO, (0.1335, 0.0, 0.0372)))
+    leaning = SceneObject(
+        "leaning", CLASSES["gelatin_box"], Pose.from_rotation(R_TO, (0.1335, 0.0, 0.0372))
+    )
     scene = scene_of(*covered(), leaning)
     observation = JUDGE.rays.observe(scene)[0]
     outcome = executed(SettleExecutor(CONFIG), scene, observation, Move("cover"), rng())

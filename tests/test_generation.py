@@ -23,7 +23,7 @@ from drake_clutter.grammar import Derivation, NodeBudget
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.scenes.scene_file import scene_fields
+from drake_clutter.scenes.scene_file import scene_to_dict
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
@@ -38,7 +38,7 @@ def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
     """The scenes with their verdicts, as scene files."""
     made = map_ordered(partial(SceneGenerator, which), range(count), workers=workers)
     return [
-        yaml.dump(scene_fields(generated.scene, DEFAULT_CELL, generated.verdict))
+        yaml.dump(scene_to_dict(generated.scene, DEFAULT_CELL, generated.verdict))
         for generated in made
     ]
 
@@ -72,7 +72,7 @@ def test_graphs_that_cannot_be_laid_out_are_counted_and_drawn_anew() -> None:
     assert set(failures) <= {"no room on the tray", "stack too high"}
     assert failures.total() > 0
     for m in made:
-        assert max(o.top for o in m.scene.objects) <= 0.25
+        assert max(o.top_height for o in m.scene.objects) <= 0.25
 
 
 def test_the_random_generator_is_uniform_over_feasible_rules() -> None:

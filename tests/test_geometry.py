@@ -10,7 +10,12 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.grammar import Orientation
-from drake_clutter.scenes.geometry import carried, deepest_penetration, penetration, touching_groups
+from drake_clutter.scenes.geometry import (
+    group_touching_objects,
+    max_penetration,
+    penetration_depth,
+    transport_pose,
+)
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import add_scene_plant
 
@@ -26,13 +31,13 @@ def turned(
 ) -> SceneObject:
     """An object turned about one axis of the tray."""
     rotation = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    return SceneObject(name, CLASSES[class_name], Pose.of(rotation, translation))
+    return SceneObject(name, CLASSES[class_name], Pose.from_rotation(rotation, translation))
 
 
 def both_ways(first: SceneObject, second: SceneObject) -> float:
     """The penetration, which is the same in either order."""
-    depth = penetration(first, second)
-    assert penetration(second, first) == pytest.approx(depth, abs=1e-12)
+    depth = penetration_depth(first, second)
+    assert penetration_depth(second, first) == pytest.approx(depth, abs=1e-12)
     return depth
 
 
@@ -42,7 +47,7 @@ def test_two_boxes_side_by_side(axis: int, depth: float) -> None:
     offset = np.zeros(3)
     offset[axis] = (CRACKER[axis] + SUGAR[axis]) / 2 - depth
     first, second = turned("cracker_box", "z", 0, (0, 0, 0)), turned("sugar_box", "z", 0, (0, 0, 0))
-    second = SceneObject("b", second.object_class, second.X_TO.moved(offset))
+    second = SceneObject("b", second.object_class, second.X_TO.translated(offset))
     assert both_ways(first, second) == pytest.approx(depth, abs=1e-12)
 
 
@@ -124,7 +129,7 @@ def random_pairs(
     def anyhow(name: str, class_name: str) -> SceneObject:
         rotation = Rotation.random(rng=generator).as_matrix()
         return SceneObject(
-            name, CLASSES[class_name], Pose.of(rotation, generator.uniform(0, reach, 3))
+            name, CLASSES[class_name], Pose.from_rotation(rotation, generator.uniform(0, reach, 3))
         )
 
     return [(anyhow("a", names[0]), anyhow("b", names[1])) for _ in range(count)]
@@ -150,7 +155,7 @@ def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
     overlapping = apart = 0
     for a, b in random_pairs(names, 200, 0.15):
         lifted = [
-            SceneObject(o.name, o.object_class, o.X_TO.moved((0, 0, 1.0))) for o in (a, b)
+            SceneObject(o.name, o.object_class, o.X_TO.translated((0, 0, 1.0))) for o in (a, b)
         ]  # off the tray
         scene_plant.set_poses(context, lifted)
         query = scene_plant.scene_graph.get_query_output_port().Eval(
@@ -197,7 +202,7 @@ def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
     ring = np.sqrt(1 - height**2)
     directions = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
     return any(
-        penetration(a, SceneObject("b", b.object_class, b.X_TO.moved(distance * d))) < 0
+        penetration_depth(a, SceneObject("b", b.object_class, b.X_TO.translated(distance * d))) < 0
         for d in directions
     )
 
@@ -230,11 +235,11 @@ def test_deepest_penetration_names_the_two() -> None:
         resting("sugar_box", xy=(x, 0), name=name)
         for name, x in (("a", 0.0), ("b", 0.172), ("c", 0.340))
     )
-    depth, *names = deepest_penetration([a, b, c])
+    depth, *names = max_penetration([a, b, c])
     assert depth == pytest.approx(0.007)
     assert names == ["b", "c"]
-    assert deepest_penetration([a, c])[0] == pytest.approx(-0.165)
-    assert deepest_penetration([a]) == (-np.inf, "", "")
+    assert max_penetration([a, c])[0] == pytest.approx(-0.165)
+    assert max_penetration([a]) == (-np.inf, "", "")
 
 
 def names_of(groups: list[list[SceneObject]]) -> list[list[str]]:
@@ -249,21 +254,21 @@ def test_touching_groups() -> None:
     ]
     high = resting("gelatin_box", xy=(0.0, 0.0), floor=0.0405, name="above a")
     far = resting("gelatin_box", xy=(0.0, 0.3), name="far")
-    groups = touching_groups([*chain, far, high], 0.003)
+    groups = group_touching_objects([*chain, far, high], 0.003)
     assert names_of(groups) == [["a", "c", "b", "above a"], ["far"]]
-    assert names_of(touching_groups([*chain, far, high], 0.0005)) == [
+    assert names_of(group_touching_objects([*chain, far, high], 0.0005)) == [
         ["a"],
         ["c"],
         ["b"],
         ["far"],
         ["above a"],
     ]
-    assert touching_groups([], 0.003) == []
+    assert group_touching_objects([], 0.003) == []
 
 
 def test_carried() -> None:
     quarter = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     believed, real = Pose((0.1, 0.0, 0.05)), Pose((0.11, 0.0, 0.05))
-    put = carried(believed, Pose((0.0, 0.2, 0.05), quarter), real)
+    put = transport_pose(believed, Pose((0.0, 0.2, 0.05), quarter), real)
     assert put.p == pytest.approx([0.0, 0.21, 0.05]), "the error turns with it"
     assert put.quaternion == pytest.approx(quarter)

@@ -31,7 +31,7 @@ def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Obser
     """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
     observation = LabelDetector(config.cell.camera).perceive(scene).observation
     shifted = [
-        replace(d, name=f"thing {k}", X_TO=d.X_TO.moved((shift, 0, 0)))
+        replace(d, name=f"thing {k}", X_TO=d.X_TO.translated((shift, 0, 0)))
         for k, d in enumerate(observation.detections)
     ]
     return replace(observation, detections=tuple(shifted))
@@ -52,8 +52,8 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
     (step,) = task.steps
     assert names == ["cracker_box_1"], "a name of its own"
     assert (step.move.pick, task.end) == ("cracker_box", EpisodeEnd.ALL_FOUND)
-    assert step.outcome.released is not None
-    off = task.scene["cracker_box"].X_TO.p - step.outcome.released.p
+    assert step.outcome.X_TO_released is not None
+    off = task.scene["cracker_box"].X_TO.p - step.outcome.X_TO_released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
     assert recognised(known, COVERED.objects) == ("cracker_box",), (
         "it has looked again, and was shown the same"
@@ -142,7 +142,9 @@ def test_what_the_arm_can() -> None:
     assert ceiling.never_found(COVERED) == ()
     above = replace(
         on_top,
-        X_TO=on_top.X_TO.moved((0.0, 0.0, COVERED["cracker_box"].top - on_top.bounds_T[0][2])),
+        X_TO=on_top.X_TO.translated(
+            (0.0, 0.0, COVERED["cracker_box"].top_height - on_top.bounds_T[0][2])
+        ),
     )
     assert ceiling.never_found(replace(COVERED, objects=(*COVERED.objects, above))) == (
         "gelatin_box",

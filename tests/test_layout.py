@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
 from drake_clutter.grammar.graph import DUMMY
-from drake_clutter.scenes.geometry import deepest_penetration
+from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.layout import LayoutFailure, LayoutFailureReason, lay_out
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
@@ -67,14 +67,14 @@ def check_scene(scene: Scene, config: LayoutConfig) -> None:
     objects = {o.node: o for o in scene.objects}
     assert set(objects) == {node for node, _ in scene.graph.objects()}
     assert len(objects) == len(scene.objects)
-    depth, first, second = deepest_penetration(scene.objects)
+    depth, first, second = max_penetration(scene.objects)
     assert depth <= ROUNDING, f"{first} and {second}"
     paired = twins(scene.graph)
     for o in scene.objects:
         assert o.node is not None
         below = [objects[node] for node in carriers(scene.graph, o.node)]
         lower, upper = o.bounds_T
-        assert abs(lower[2] - max((b.top for b in below), default=0.0)) < ROUNDING
+        assert abs(lower[2] - max((b.top_height for b in below), default=0.0)) < ROUNDING
         assert (
             np.abs(o.bounds_T).max(axis=0)[:2].max()
             <= scene.support.size[0] / 2 - config.stack_gap + ROUNDING
@@ -126,7 +126,7 @@ def test_random_scenes_keep_every_promise() -> None:
         scene = random_layout(index)
         if isinstance(scene, LayoutFailure):
             results[scene.reason.name] += 1
-            assert scene.amount > scene.limit or scene.reason is LayoutFailureReason.NO_ROOM
+            assert scene.required > scene.available or scene.reason is LayoutFailureReason.NO_ROOM
         else:
             results["laid out"] += 1
             check_scene(scene, LayoutConfig())
@@ -144,7 +144,7 @@ def test_a_stack_by_hand() -> None:
     )
     can, box, marker = scene.objects
     assert [o.X_TO.p[2] for o in scene.objects] == pytest.approx([0.0505, 0.131, 0.170])
-    assert marker.top == pytest.approx(0.179)
+    assert marker.top_height == pytest.approx(0.179)
     for o in (box, marker):
         assert o.X_TO.p[:2] == pytest.approx(can.X_TO.p[:2])
     assert box.bounds_T[1] - box.bounds_T[0] == pytest.approx([0.230, 0.160, 0.060])
@@ -175,7 +175,7 @@ def test_a_pair_by_hand(rule: str, gap: float, thickness: float) -> None:
     carried = scene.objects[-1]
     assert abs(one.X_TO.p - other.X_TO.p) == pytest.approx([0.0, thickness + gap, 0.0], abs=1e-4)
     assert carried.X_TO.p[:2] == pytest.approx((one.X_TO.p[:2] + other.X_TO.p[:2]) / 2)
-    assert carried.bounds_T[0][2] == pytest.approx(one.top)
+    assert carried.bounds_T[0][2] == pytest.approx(one.top_height)
 
 
 def tower(count: int) -> Derivation:
@@ -185,11 +185,11 @@ def tower(count: int) -> Derivation:
 
 
 def test_too_high() -> None:
-    assert laid_out(tower(2)).objects[-1].top == pytest.approx(0.46)
+    assert laid_out(tower(2)).objects[-1].top_height == pytest.approx(0.46)
     failure = lay_out(tower(3), CLASSES, ClutterConfig(), rng())
     assert isinstance(failure, LayoutFailure)
-    assert (failure.reason, failure.limit) == (LayoutFailureReason.TOO_HIGH, 0.50)
-    assert failure.amount == pytest.approx(0.69)
+    assert (failure.reason, failure.available) == (LayoutFailureReason.TOO_HIGH, 0.50)
+    assert failure.required == pytest.approx(0.69)
     assert str(failure) == "stack too high: 0.69 of 0.5 m"
     lower_cap = lay_out(tower(2), CLASSES, world_with("layout.max_stack_height=0.45"), rng())
     assert isinstance(lower_cap, LayoutFailure)
@@ -211,7 +211,7 @@ def test_no_room(count: int, side: float) -> None:
     failure = lay_out(derived(*BOX_ON_TRAY * count), CLASSES, config, rng())
     assert isinstance(failure, LayoutFailure)
     assert failure.reason is LayoutFailureReason.NO_ROOM
-    assert failure.amount == pytest.approx(count * 0.230 * 0.160)
+    assert failure.required == pytest.approx(count * 0.230 * 0.160)
 
 
 def test_the_smallest_tray_that_holds_a_box() -> None:

@@ -15,7 +15,7 @@ from test_settle import BELOW
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.interfaces import CannotJudge, CannotJudgeReason, Verdict
+from drake_clutter.scenes.interfaces import InconclusiveReason, InconclusiveVerdict, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.fallback import FastOrDrakeJudge
@@ -84,7 +84,9 @@ def as_made(
     """On its z, turned about it."""
     R_TO = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return SceneObject(
-        name, object_class, Pose.of(R_TO, (*xy, floor - float(object_class.corners[:, 2].min())))
+        name,
+        object_class,
+        Pose.from_rotation(R_TO, (*xy, floor - float(object_class.corners[:, 2].min()))),
     )
 
 
@@ -113,7 +115,7 @@ def test_own_meshes_near_the_edge_of_a_box(
     mine, drakes = fast.judge(scene, rng(1)), judge.judge(scene, rng(1))
     assert isinstance(mine, Verdict)
     assert mine.stable is drakes.stable is stable
-    assert mine.visible_share == pytest.approx(drakes.visible_share, abs=0.01)
+    assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
 
 
 @pytest.mark.parametrize(("x", "stable"), [(0.012, True), (0.030, False)])
@@ -138,10 +140,10 @@ def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: FastJudge) -> 
         ("wedge", 0.03),
     ):
         found = fast.margins(scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0)))
-        assert not isinstance(found, CannotJudge)
+        assert not isinstance(found, InconclusiveVerdict)
         assert found["own"] == pytest.approx(margin, abs=1.01 * STEP)
     over = fast.margins(scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060)))
-    assert not isinstance(over, CannotJudge)
+    assert not isinstance(over, InconclusiveVerdict)
     assert over["own"] == pytest.approx(0.115 - (0.123 - 0.020), abs=1.01 * STEP)
 
 
@@ -153,9 +155,11 @@ def test_a_mesh_stands_on_a_face_askew_in_its_frame(
         R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
         lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
         margins = fast.margins(
-            scene_of(SceneObject("own", own["askew"], Pose.of(R_TO, (0.0, 0.0, -lowest))))
+            scene_of(
+                SceneObject("own", own["askew"], Pose.from_rotation(R_TO, (0.0, 0.0, -lowest)))
+            )
         )
-        assert not isinstance(margins, CannotJudge)
+        assert not isinstance(margins, InconclusiveVerdict)
         assert margins["own"] >= 0.025 - 1.01 * STEP, turn
 
 
@@ -165,7 +169,7 @@ def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: FastJudge)
             as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")
         )
     )
-    assert found == CannotJudge(CannotJudgeReason.EDGE_CONTACT, "box")
+    assert found == InconclusiveVerdict(InconclusiveReason.EDGE_CONTACT, "box")
 
 
 def test_the_caster_sees_own_meshes_as_the_camera_does(
@@ -174,7 +178,7 @@ def test_the_caster_sees_own_meshes_as_the_camera_does(
     """Turned any way. Of a few hundred pixels hardly one is judged otherwise."""
     turns = Rotation.random(4, rng=rng(2)).as_matrix()
     tumbled = [
-        SceneObject(name, own[name], Pose.of(turn, (x, 0.02, 0.15)))
+        SceneObject(name, own[name], Pose.from_rotation(turn, (x, 0.02, 0.15)))
         for name, turn, x in zip(
             ("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False
         )
@@ -191,7 +195,7 @@ def test_what_is_not_convex_is_left_to_drake(
     own: dict[str, ObjectClass], config: ClutterConfig, judge: DrakeJudge
 ) -> None:
     scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
-    answer = CannotJudge(CannotJudgeReason.NOT_CONVEX, "bracket")
+    answer = InconclusiveVerdict(InconclusiveReason.NOT_CONVEX, "bracket")
     fast = FastJudge(config)
     assert fast.stability(scene) == fast.supports(scene) == fast.judge(scene, rng()) == answer
     verdict = FastOrDrakeJudge(config).judge(scene, rng(4))

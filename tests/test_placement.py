@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import (
-    CELL,
-    free_places,
+    CELL_SIZE,
+    find_free_placements,
     has_clear_top,
     resolve_placement,
     top_height,
@@ -60,7 +60,7 @@ def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = (
     """How deep the object at its new pose penetrates any other, m."""
     placed = SceneObject(name, scene[name].object_class, X_TO)
     return max(
-        (penetration(placed, o) for o in scene.objects if o.name not in (name, *besides)),
+        (penetration_depth(placed, o) for o in scene.objects if o.name not in (name, *besides)),
         default=-np.inf,
     )
 
@@ -71,7 +71,7 @@ def test_on_an_empty_tray_the_object_goes_to_the_edge(detector: LabelDetector) -
     X_TO = placement(detector, scene_of(box), "box")
     assert X_TO is not None
     furthest = 0.350 - 0.010 - 0.089 / 2  # of the centre, along y
-    assert furthest - 1.5 * CELL <= abs(X_TO.p[1]) <= furthest
+    assert furthest - 1.5 * CELL_SIZE <= abs(X_TO.p[1]) <= furthest
     assert abs(X_TO.p[0]) <= 0.350 - 0.010 - 0.175 / 2
     assert X_TO.rotation == pytest.approx(box.X_TO.rotation)
     assert X_TO.p[2] == pytest.approx(box.X_TO.p[2] + CONFIG.release_height)
@@ -89,14 +89,14 @@ def test_a_draw_takes_one_of_the_free_places(detector: LabelDetector) -> None:
     """They are searched for once; asking whether there are any draws nothing."""
     observation, move = seen(detector, scene_of(resting("sugar_box", name="box"))), Move("box")
     generator = rng(3)
-    places = free_places(observation, move, CONFIG)
+    places = find_free_placements(observation, move, CONFIG)
     assert places is not None
     assert generator.bit_generator.state == rng(3).bit_generator.state
     command = resolve_placement(move, observation, CONFIG, generator)
     assert command is not None
     assert (command.move, command.X_TO_pick) == (move, observation["box"].X_TO)
     assert list(command.X_TO_place.translation) in places.translations.tolist()
-    assert free_places(observation, move, CONFIG) is places
+    assert find_free_placements(observation, move, CONFIG) is places
 
 
 def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
@@ -166,7 +166,7 @@ def test_on_a_free_top_the_object_goes_to_its_middle(name: str, detector: LabelD
     scene = scene_of(BELOW, resting(name, xy=(-0.2, -0.2), name="picked"))
     X_TO = placement(detector, scene, "picked", "below")
     assert X_TO is not None
-    assert X_TO.p[:2] == pytest.approx([0.05, 0.05], abs=1.5 * CELL)
+    assert X_TO.p[:2] == pytest.approx([0.05, 0.05], abs=1.5 * CELL_SIZE)
     assert SceneObject("picked", CLASSES[name], X_TO).bounds_T[0][2] == pytest.approx(
         0.060 + CONFIG.release_height, abs=1e-9
     )
@@ -289,4 +289,4 @@ def test_an_object_alone_has_a_clear_top_and_its_height(
     observation = seen(detector, scene_of(*objects))
     for o in objects:
         assert has_clear_top(observation, observation[o.name])
-        assert top_height(observation[o.name]) == pytest.approx(o.top)
+        assert top_height(observation[o.name]) == pytest.approx(o.top_height)

@@ -19,7 +19,7 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
-from drake_clutter.scenes.geometry import rests_on
+from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.plant import rigid_transform
 from drake_clutter.validation import to_plain, validate
@@ -141,7 +141,7 @@ def test_what_carries_something_is_not_picked() -> None:
     assert reason(found) is PlanningFailureReason.CARRIES_OTHERS
     assert isinstance(found, PlanningFailure)
     assert found.detail == "gelatin_box"
-    assert rests_on(PILE[3], PILE) == ()
+    assert objects_resting_on(PILE[3], PILE) == ()
 
 
 def test_too_heavy() -> None:

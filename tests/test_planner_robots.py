@@ -48,7 +48,7 @@ def place_of(o: SceneObject, x: float, y: float, turn: float) -> Pose:
     """A millimeter above the tray, turned about the vertical [rad]."""
     c, s = math.cos(turn), math.sin(turn)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ o.X_TO.rotation
-    return Pose.of(R, (x, y, o.X_TO.translation[2] + 0.001))
+    return Pose.from_rotation(R, (x, y, o.X_TO.translation[2] + 0.001))
 
 
 def samples(phase: TrajectorySegment, order: int = 0) -> np.ndarray:

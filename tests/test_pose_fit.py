@@ -30,7 +30,9 @@ def placed(
 ) -> SceneObject:
     """An object on the tray in an orientation, (3, 3), over xy (m)."""
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
-    return SceneObject(object_class.name, object_class, Pose.of(R_TO, (xy[0], xy[1], -lowest)))
+    return SceneObject(
+        object_class.name, object_class, Pose.from_rotation(R_TO, (xy[0], xy[1], -lowest))
+    )
 
 
 def alone(name: str, up: int, generator: np.random.Generator) -> SceneObject:
@@ -213,18 +215,20 @@ def test_bad_arguments(fitter: PoseFitter) -> None:
 
 
 def test_pose_error_knows_the_symmetries() -> None:
-    X_TO = Pose.of(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix(), (0.1, 0.0, 0.0))
+    X_TO = Pose.from_rotation(
+        Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix(), (0.1, 0.0, 0.0)
+    )
     R = X_TO.rotation
     box, can = CLASSES["sugar_box"], CLASSES["tomato_soup_can"]
     for half_turn in ([math.pi, 0, 0], [0, math.pi, 0], [0, 0, math.pi]):
-        same = Pose.of(
+        same = Pose.from_rotation(
             R @ Rotation.from_rotvec(half_turn).as_matrix(), X_TO.p + np.array([0.0, 0.003, 0.004])
         )
         assert np.array(pose_error(box, same, X_TO)) == pytest.approx(
             np.array([0.005, 0.0]), abs=1e-6
         )
-    quarter = Pose.of(R @ Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix(), X_TO.p)
+    quarter = Pose.from_rotation(R @ Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix(), X_TO.p)
     assert pose_error(box, quarter, X_TO)[1] == pytest.approx(math.pi / 2)
     assert pose_error(can, quarter, X_TO)[1] == pytest.approx(0.0, abs=1e-6)
-    down = Pose.of(R @ Rotation.from_rotvec([math.pi - 0.02, 0, 0]).as_matrix(), X_TO.p)
+    down = Pose.from_rotation(R @ Rotation.from_rotvec([math.pi - 0.02, 0, 0]).as_matrix(), X_TO.p)
     assert pose_error(can, down, X_TO)[1] == pytest.approx(0.02)

@@ -12,7 +12,7 @@ from drake_clutter.scenes.scene import Pose, SceneObject
 
 CAMERA = DEFAULT_CELL.camera
 BOX = resting("cracker_box", Orientation.FLAT_0)
-ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top)
+ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top_height)
 BESIDE = resting("gelatin_box", xy=(0.2, 0.1))
 
 
@@ -43,22 +43,22 @@ def test_an_explanation_counts_pixels_as_the_label_image_does() -> None:
 
 
 def test_an_object_that_is_fitted_twice_is_one() -> None:
-    again = replace(BOX, X_TO=BOX.X_TO.moved((0.002, -0.001, 0.001)))
+    again = replace(BOX, X_TO=BOX.X_TO.translated((0.002, -0.001, 0.001)))
     assert found([BOX], [again, BOX], [0.7, 0.9]) == [1]
 
 
 def test_a_smaller_class_on_the_face_of_a_larger_is_none() -> None:
-    part = SceneObject("part", CLASSES["gelatin_box"], Pose((0.03, 0.0, BOX.top - 0.014)))
+    part = SceneObject("part", CLASSES["gelatin_box"], Pose((0.03, 0.0, BOX.top_height - 0.014)))
     assert found([BOX], [part, BOX]) == [1]
 
 
 def test_what_the_camera_sees_past_is_not_there() -> None:
-    aside = replace(BESIDE, X_TO=BESIDE.X_TO.moved((0.05, 0.0, 0.0)))
-    in_the_air = replace(BESIDE, X_TO=BESIDE.X_TO.moved((0.0, 0.0, 0.05)))
+    aside = replace(BESIDE, X_TO=BESIDE.X_TO.translated((0.05, 0.0, 0.0)))
+    in_the_air = replace(BESIDE, X_TO=BESIDE.X_TO.translated((0.0, 0.0, 0.05)))
     assert found([BOX, BESIDE], [aside, in_the_air]) == []
 
 
 def test_what_is_hardly_seen_is_left_out() -> None:
     covered = resting("pudding_box", floor=0.0)
-    cover = resting("cracker_box", Orientation.FLAT_0, xy=(0.01, 0.0), floor=covered.top)
+    cover = resting("cracker_box", Orientation.FLAT_0, xy=(0.01, 0.0), floor=covered.top_height)
     assert found([covered, cover], [covered, cover]) == [1]

@@ -50,7 +50,9 @@ def tumbled(seed: int, spread: float = 0.22) -> Scene:
     for index, (class_name, turn) in enumerate(zip(2 * ALL_SHAPES, turns, strict=True)):
         p_TO = (*generator.uniform(-spread, spread, 2), generator.uniform(0.16, 0.40))
         objects.append(
-            SceneObject(f"{class_name} {index}", CLASSES[class_name], Pose.of(turn, p_TO))
+            SceneObject(
+                f"{class_name} {index}", CLASSES[class_name], Pose.from_rotation(turn, p_TO)
+            )
         )
     return scene_of(*objects)
 
@@ -229,8 +231,11 @@ def test_what_was_cast_before_is_no_matter() -> None:
 def test_other_places_than_those_of_the_poses() -> None:
     scene = tumbled(1)
     offsets = rng(3).uniform(-0.05, 0.05, (len(scene.objects), 3))
-    moved = scene.at(
-        {o.name: o.X_TO.moved(offset) for o, offset in zip(scene.objects, offsets, strict=True)}
+    moved = scene.with_poses(
+        {
+            o.name: o.X_TO.translated(offset)
+            for o, offset in zip(scene.objects, offsets, strict=True)
+        }
     )
     shapes = Shapes()
     caster = RayCaster(CAMERA, shapes)

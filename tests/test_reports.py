@@ -21,9 +21,9 @@ from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
 from drake_clutter.scenes.interfaces import (
-    Frame,
     Instability,
     InstabilityReason,
+    MotionSample,
     Move,
     MoveResult,
     Outcome,
@@ -36,7 +36,7 @@ from drake_clutter.tasks.exploration import ExplorationTask, Step
 GELATIN = resting("gelatin_box", xy=(-0.15, 0.1), name="gelatin_box_1")
 SCENE = scene_of(
     GELATIN,
-    resting("cracker_box", xy=(-0.15, 0.1), floor=GELATIN.top, name="cracker_box_2"),
+    resting("cracker_box", xy=(-0.15, 0.1), floor=GELATIN.top_height, name="cracker_box_2"),
     resting("sugar_box", xy=(0.2, -0.2), name="sugar_box_3"),
 )
 UNCOVER = Move("cracker_box_2")
@@ -80,7 +80,9 @@ def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> P
     out = tmp_path_factory.mktemp("page")
     step = task.steps[0]
     onto_gelatin = Decision(Move("sugar_box_3", "gelatin_box_1"))
-    stuck = Step(onto_gelatin, Outcome(MoveResult.NO_FREE_SPOT, task.scene), step.look, (), 0.0)
+    stuck = Step(
+        onto_gelatin, Outcome(MoveResult.NO_FREE_PLACEMENT, task.scene), step.look, (), 0.0
+    )
     fallen = Instability(InstabilityReason.TOPPLED, "sugar_box_3", 0.1, 1.5)
     outcome = Outcome(MoveResult.COLLAPSED, task.scene, fallen)
     collapse = Step(Decision(Move("cracker_box_2")), outcome, step.look, (), -1.0)
@@ -163,7 +165,7 @@ def test_the_recording_is_one_file_that_moves(folder: Path, tmp_path: Path) -> N
     assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)\s*=", source)
     assert len(source) < 4_000_000
     still = tmp_path / "still.html"
-    write_recording(still, SCENE, [Frame(0.0, SCENE.poses)], DEFAULT_CELL)
+    write_recording(still, SCENE, [MotionSample(0.0, SCENE.poses)], DEFAULT_CELL)
     # The last command that the viewer is given; a still scene has none of its kind.
     assert _commands(source, "set_animation") == 1
     assert _commands(still.read_text(encoding="utf-8"), "set_animation") == 0
@@ -184,13 +186,13 @@ def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
     assert frames[0].poses == task.start.poses
     assert frames[-1].poses == task.scene.poses
     path = np.array([frame.poses["cracker_box_2"].p for frame in frames])
-    assert path[:, 2].max() > max(o.top for o in SCENE.objects)
+    assert path[:, 2].max() > max(o.top_height for o in SCENE.objects)
     # Nothing jumps: within a frame of carrying, less than 10 cm.
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.1
 
 
 def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) -> None:
-    step = replace(task.steps[0], outcome=Outcome(MoveResult.NO_FREE_SPOT, SCENE))
+    step = replace(task.steps[0], outcome=Outcome(MoveResult.NO_FREE_PLACEMENT, SCENE))
     assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {
         SCENE["cracker_box_2"].X_TO
     }

@@ -24,7 +24,7 @@ from conftest import (
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.scene_file import SceneFile, load_scene, save_scene, scene_fields
+from drake_clutter.scenes.scene_file import SceneFile, load_scene, save_scene, scene_to_dict
 
 Path_ = tuple[str | int, ...]
 GONE = object()
@@ -33,7 +33,7 @@ GONE = object()
 def stable_verdict(scene: Scene) -> Verdict:
     """Made up, with numbers that take all their digits."""
     generator = rng(1)
-    settled = {o.name: o.X_TO.moved(generator.normal(size=3) * 1e-5) for o in scene.objects}
+    settled = {o.name: o.X_TO.translated(generator.normal(size=3) * 1e-5) for o in scene.objects}
     shares = {name: float(generator.uniform()) for name in scene.names}
     return Verdict(
         None, settled, shares, tuple(name for name, share in shares.items() if share < 0.3)
@@ -80,7 +80,9 @@ def test_round_trip_is_exact(seed: int, tmp_path: Path) -> None:
         read = reloaded(tmp_path, scene, verdict)
         assert_same(read.scene, scene)
         assert read.verdict == verdict
-        assert read.settled_scene == (read.scene.at(verdict.settled) if verdict else read.scene)
+        assert read.settled_scene == (
+            read.scene.with_poses(verdict.settled) if verdict else read.scene
+        )
 
 
 def test_poses_of_every_size_survive(tmp_path: Path) -> None:
@@ -176,8 +178,8 @@ def test_a_file_from_elsewhere_is_written_alike(tmp_path: Path) -> None:
 # --- What is refused ---
 
 SCENE = random_scene(1, 12, 12, "pantry14")
-DOCUMENT = scene_fields(SCENE, DEFAULT_CELL, stable_verdict(SCENE))
-UNSTABLE = scene_fields(SCENE, DEFAULT_CELL, unstable_verdict(SCENE))
+DOCUMENT = scene_to_dict(SCENE, DEFAULT_CELL, stable_verdict(SCENE))
+UNSTABLE = scene_to_dict(SCENE, DEFAULT_CELL, unstable_verdict(SCENE))
 
 
 def changed(document: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
@@ -300,11 +302,11 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("verdict", "stable"), False, "verdict.instability: allowed"),
     (("verdict", "hidden"), ["ghost"], "ghost' is no object"),
     (("verdict", "hidden"), "none", "verdict.hidden: 'none'; allowed is a list"),
-    (("verdict", "visible_share", "ghost"), 0.5, "ghost' is no object"),
+    (("verdict", "visible_fractions", "ghost"), 0.5, "ghost' is no object"),
     (
-        ("verdict", "visible_share", SCENE.names[0]),
+        ("verdict", "visible_fractions", SCENE.names[0]),
         "all",
-        f"verdict.visible_share.{SCENE.names[0]}: 'all'",
+        f"verdict.visible_fractions.{SCENE.names[0]}: 'all'",
     ),
     (
         ("verdict", "settled", "ghost"),
@@ -460,14 +462,14 @@ def test_yaml_that_its_reader_stumbles_over_is_refused(line: str, tmp_path: Path
 @pytest.mark.parametrize(
     "verdict",
     [
-        "{stable: banana, settled: {}, visible_share: {}, hidden: []}",
-        "{stable: 1, settled: {}, visible_share: {}, hidden: []}",
-        "{stable: false, settled: {}, visible_share: {}, hidden: [], "
+        "{stable: banana, settled: {}, visible_fractions: {}, hidden: []}",
+        "{stable: 1, settled: {}, visible_fractions: {}, hidden: []}",
+        "{stable: false, settled: {}, visible_fractions: {}, hidden: [], "
         "instability: {reason: slid, object: ghost, displacement: 0.1, tilt: 0.1}}",
-        "{stable: true, settled: {}, visible_share: {}, hidden: [], "
+        "{stable: true, settled: {}, visible_fractions: {}, hidden: [], "
         "instability: {reason: slid, object: a, displacement: 0.1, tilt: 0.1}}",
-        "{stable: true, settled: {}, visible_share: {a: 7.0}, hidden: []}",
-        "{stable: true, settled: {}, visible_share: {a: 1.0}, hidden: []}",
+        "{stable: true, settled: {}, visible_fractions: {a: 7.0}, hidden: []}",
+        "{stable: true, settled: {}, visible_fractions: {a: 1.0}, hidden: []}",
     ],
 )
 def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Path) -> None:
@@ -498,3 +500,15 @@ def test_an_object_may_not_name_a_structure_node(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="node"):
         load_scene(path, CATALOG)
+
+
+def test_visible_fractions_under_their_earlier_name(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    fractions = dict.fromkeys(SCENE.names, 0.5)
+    save_scene(path, SCENE, DEFAULT_CELL, Verdict(None, SCENE.poses, fractions, ()))
+    text = path.read_text()
+    path.write_text(text.replace("visible_fractions:", "visible_share:"))
+    assert path.read_text() != text
+    verdict = load_scene(path, CATALOG).verdict
+    assert verdict is not None
+    assert verdict.visible_fractions == fractions

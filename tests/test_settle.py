@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
-from drake_clutter.scenes.scene import Pose, SceneObject, jittered, tilt_between
+from drake_clutter.scenes.scene import Pose, SceneObject, perturb_poses, tilt_between
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.simulation.settle import Settled, settle
 
@@ -84,10 +84,10 @@ def test_what_stands(objects: list[SceneObject], judge: DrakeJudge) -> None:
     scene = scene_of(*objects)
     verdict = judge.judge(scene, rng())
     assert verdict.stable, str(verdict.instability)
-    assert set(verdict.settled) == set(verdict.visible_share) == set(scene.names)
+    assert set(verdict.settled) == set(verdict.visible_fractions) == set(scene.names)
     for o in objects:
         assert np.linalg.norm(verdict.settled[o.name].p - o.X_TO.p) < 0.003
-    assert [name for name, share in verdict.visible_share.items() if share < 0.30] == list(
+    assert [name for name, share in verdict.visible_fractions.items() if share < 0.30] == list(
         verdict.hidden
     )
 
@@ -100,7 +100,7 @@ def test_what_falls(
     assert verdict.instability is not None
     assert (verdict.instability.reason, verdict.instability.object) == (reason, name)
     assert set(verdict.settled) == {o.name for o in objects}
-    assert (verdict.visible_share, verdict.hidden) == ({}, ())
+    assert (verdict.visible_fractions, verdict.hidden) == ({}, ())
     start = next(o for o in objects if o.name == name)
     moved = np.linalg.norm(verdict.settled[name].p - start.X_TO.p)
     assert verdict.instability.displacement == pytest.approx(
@@ -160,7 +160,9 @@ def test_a_single_object_beside_the_tray_has_left_it(x: float, judge: DrakeJudge
 
 
 def moved_aside(objects: Sequence[SceneObject], y: float, prefix: str) -> list[SceneObject]:
-    return [replace(o, name=prefix + o.name, X_TO=o.X_TO.moved((0.0, y, 0.0))) for o in objects]
+    return [
+        replace(o, name=prefix + o.name, X_TO=o.X_TO.translated((0.0, y, 0.0))) for o in objects
+    ]
 
 
 @pytest.mark.parametrize(
@@ -176,7 +178,7 @@ def test_apart_or_together_the_verdict_is_the_same(
 ) -> None:
     objects = [*moved_aside(first, -0.2, "first "), *moved_aside(second, 0.2, "second ")]
     apart = judge.judge(scene_of(*objects), rng(5))
-    together = settle(jittered(objects, config.settle.jitter, rng(5)), TRAY, config.settle)
+    together = settle(perturb_poses(objects, config.settle.jitter, rng(5)), TRAY, config.settle)
     assert (apart.instability is None) == (together.instability is None)
     if apart.instability is not None and together.instability is not None:
         assert (apart.instability.reason, apart.instability.object) == (
@@ -267,7 +269,7 @@ def test_motion_is_recorded_and_a_fall_followed_if_asked() -> None:
 def test_jitter_is_uniform_over_a_disc_in_the_trays_plane() -> None:
     box = resting("sugar_box", xy=(0.1, 0.2), name="box")
     generator = rng(0)
-    moved = jittered([box] * 2000, 0.001, generator)
+    moved = perturb_poses([box] * 2000, 0.001, generator)
     offsets = np.array([o.X_TO.p - box.X_TO.p for o in moved])
     assert (offsets[:, 2] == 0).all()
     assert all(o.X_TO.quaternion == box.X_TO.quaternion for o in moved)
@@ -275,7 +277,7 @@ def test_jitter_is_uniform_over_a_disc_in_the_trays_plane() -> None:
     assert distances.max() <= 0.001 + 1e-12
     assert (distances**2).mean() == pytest.approx(0.5e-6, rel=0.05)  # uniform over the area
     assert abs(offsets.mean(axis=0)).max() < 4e-5
-    assert jittered([box], 0.001, rng(0))[0] == moved[0]
+    assert perturb_poses([box], 0.001, rng(0))[0] == moved[0]
 
 
 @pytest.mark.parametrize(
@@ -293,7 +295,7 @@ def test_jitter_is_uniform_over_a_disc_in_the_trays_plane() -> None:
 def test_tilt_between(class_name: str, axis: str, degrees: float, tilt: float) -> None:
     start = resting(class_name, Orientation.FLAT_30).X_TO
     turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    end = Pose.of(start.rotation @ turn, (1.0, 2.0, 3.0))
+    end = Pose.from_rotation(start.rotation @ turn, (1.0, 2.0, 3.0))
     assert math.degrees(tilt_between(CLASSES[class_name], start, end)) == pytest.approx(
         tilt, abs=1e-5
     )

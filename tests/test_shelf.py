@@ -13,7 +13,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand, Verdict
-from drake_clutter.scenes.placement import free_places
+from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
@@ -61,11 +61,11 @@ def test_both_judges_agree_on_generated_scenes(shelf: ClutterConfig) -> None:
         assert isinstance(verdict, Verdict)
         assert isinstance(other, Verdict)
         assert (verdict.stable, verdict.hidden) == (other.stable, other.hidden)
-        for name, share in verdict.visible_share.items():
-            assert other.visible_share[name] == pytest.approx(share, abs=0.02)
+        for name, share in verdict.visible_fractions.items():
+            assert other.visible_fractions[name] == pytest.approx(share, abs=0.02)
         stable.append(verdict.stable)
         if verdict.stable:
-            assert inside(scene.at(verdict.settled), shelf)
+            assert inside(scene.with_poses(verdict.settled), shelf)
     assert True in stable
     assert False in stable
 
@@ -85,7 +85,7 @@ def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
     )
     observation = LabelDetector(shelf.cell.camera).perceive(scene).observation
     for o in scene.objects:
-        places = free_places(observation, Move(o.name), shelf.exploration)
+        places = find_free_placements(observation, Move(o.name), shelf.exploration)
         assert places is not None
         for x, y, z in places.translations.tolist():
             placed = o.object_class.corners, Pose((x, y, z), places.quaternion)
@@ -102,7 +102,7 @@ def test_the_arm_reaches_in_or_says_why_not(
     world = load_config_as(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
     picked = resting("pudding_box", xy=(-0.05, 0.1))
     scene = Scene((picked, resting("cracker_box", xy=(0.1, -0.2))), world.cell.support)
-    X_TO_place = picked.X_TO.moved((0.02, -0.12, 0.001))
+    X_TO_place = picked.X_TO.translated((0.02, -0.12, 0.001))
     command = PickPlaceCommand(Move(picked.name), picked.X_TO, X_TO_place)
     executor = ArmExecutor(world, planner_config=PlannerConfig(optimize=False))
     assert executor.execute(scene, command, rng()).result is result

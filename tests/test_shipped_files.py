@@ -11,7 +11,7 @@ from conftest import CATALOG, DEFAULT_CELL, training_script
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_head
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import load_config_as, override_config
 from drake_clutter.yaml_io import parse_yaml, to_yaml
@@ -68,7 +68,7 @@ def test_checkpoints_and_their_configs(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SETS, ids=name_of)
 def test_scene_sets(path: Path) -> None:
-    assert load_scene_set(path, CATALOG).cell == DEFAULT_CELL
+    assert load_scene_dataset(path, CATALOG).cell == DEFAULT_CELL
 
 
 def configs_in(document: Any) -> Iterator[tuple[str, Any]]:

@@ -19,7 +19,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports import recording
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.interfaces import Frame, Move, MoveResult, Outcome
+from drake_clutter.scenes.interfaces import MotionSample, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.station.messages import PlannedMove
@@ -64,7 +64,7 @@ def is_past(simulation: StationSimulation, time: float) -> bool:
 
 
 def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
-    simulation, motion, simulated = StationSimulation(CELL, SCENE), list[Frame](), []
+    simulation, motion, simulated = StationSimulation(CELL, SCENE), list[MotionSample](), []
     context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
     simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, planned()))
     for end in (0.4, 0.8, 1.2):

@@ -12,7 +12,7 @@ from test_fast_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT
 from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
 
 from drake_clutter.catalog import ObjectClass, Shape
-from drake_clutter.scenes.interfaces import CannotJudge
+from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 
 
@@ -53,7 +53,7 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 )
 def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
     found = FAST.margins(scene_of(*objects))
-    assert not isinstance(found, CannotJudge)
+    assert not isinstance(found, InconclusiveVerdict)
     assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(
         margins, abs=0.11
     )
@@ -61,7 +61,7 @@ def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, f
 
 def test_what_rolls_has_no_margin() -> None:
     margins = FAST.margins(scene_of(*TABLE["a box on a marker"][0]))
-    assert not isinstance(margins, CannotJudge)
+    assert not isinstance(margins, InconclusiveVerdict)
     assert min(margins.values()) < MARGIN
 
 
@@ -197,7 +197,9 @@ def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64
     ]
     half = float(np.abs(R_TO[2] * np.array(class_of_load.size)).sum()) / 2
     return scene_of(
-        foot, *pair, SceneObject("load", class_of_load, Pose.of(R_TO, (0.0, 0.0, 0.128 + half)))
+        foot,
+        *pair,
+        SceneObject("load", class_of_load, Pose.from_rotation(R_TO, (0.0, 0.0, 0.128 + half))),
     )
 
 
@@ -229,7 +231,7 @@ def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
 def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
     scene = random_scene(seed, 4, 17)
     fixed = FAST.never_movable(scene)
-    if isinstance(fixed, CannotJudge):
+    if isinstance(fixed, InconclusiveVerdict):
         assert FAST.supports(scene) == fixed
         return
     loose = {name for name in scene.names if FAST.losing_support(scene, name) == ()}
@@ -264,4 +266,6 @@ def test_what_holds_each_other_down_does_not_come_apart() -> None:
 
 
 def test_beyond_the_model_it_does_not_say_whether_it_comes_apart() -> None:
-    assert isinstance(FAST.comes_apart(scene_of(resting("cracker_box", floor=0.1))), CannotJudge)
+    assert isinstance(
+        FAST.comes_apart(scene_of(resting("cracker_box", floor=0.1))), InconclusiveVerdict
+    )

@@ -124,7 +124,7 @@ def test_grasps_begin_in_the_middle_of_the_top() -> None:
     found = gripper.grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
     assert not isinstance(found, NoGrasp)
     assert len(found) == SAMPLING.count
-    assert found[0].p_TG == pytest.approx([0.1, -0.2, box.top])
+    assert found[0].p_TG == pytest.approx([0.1, -0.2, box.top_height])
     distances = [float(np.linalg.norm(grasp.p_TG - found[0].p_TG)) for grasp in found]
     assert (np.diff(distances) > -1e-9).all()
     assert found[0].payload.mass == box.object_class.mass

@@ -16,7 +16,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.records import resume_jsonl
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
-from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.simulation.judge import DrakeJudge
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
@@ -74,7 +74,7 @@ def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
 def test_episodes_are_played_once(tmp_path: Path) -> None:
     """And those that are there are not taken for others."""
     script = training_script("evaluate_explorers")
-    scenes = load_scene_set(script.SCENES / "sg_star_25.json", CATALOG)
+    scenes = load_scene_dataset(script.SCENES / "sg_star_25.json", CATALOG)
     path = tmp_path / "random.jsonl"
     played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
     before = path.read_bytes()
@@ -83,7 +83,7 @@ def test_episodes_are_played_once(tmp_path: Path) -> None:
     assert script.played(scenes, "random", 2, "equilibrium", 0, 1, path)[:1] == played, (
         "others are added to it"
     )
-    assert played[0].hidden == scenes.scenes[0].hidden
+    assert played[0].hidden == scenes.scenes[0].num_hidden
     with pytest.raises(
         InputError, match=r"random\.jsonl: holds records of something else \(agent, seed\)"
     ):
@@ -168,14 +168,17 @@ def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
         "frozen": frozen,
     }
     script.main(tmp_path / "first.json", count=2, **options)
-    first = load_scene_set(tmp_path / "first.json", CATALOG)
-    assert first.about["judge"] == "drake"
-    assert len({scene.form for scene in first.scenes}) == 2
-    assert all(scene.hidden > 0 and (scene.settled is not None) == frozen for scene in first.scenes)
+    first = load_scene_dataset(tmp_path / "first.json", CATALOG)
+    assert first.metadata["judge"] == "drake"
+    assert len({scene.canonical_form for scene in first.scenes}) == 2
+    assert all(
+        scene.num_hidden > 0 and (scene.settled_poses is not None) == frozen
+        for scene in first.scenes
+    )
     again = tmp_path / "again.json"
     script.main(again, count=1, not_in=[tmp_path / "first.json"], **options)
-    (other,) = load_scene_set(again, CATALOG).scenes
-    assert other.form not in {scene.form for scene in first.scenes}
+    (other,) = load_scene_dataset(again, CATALOG).scenes
+    assert other.canonical_form not in {scene.canonical_form for scene in first.scenes}
 
 
 def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(

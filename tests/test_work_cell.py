@@ -104,14 +104,14 @@ def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
     path.write_text(support_sdf(tray(0.3)))
     cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
     objects = (resting("sugar_box"), resting("pudding_box", xy=(0.2, 0.0)))
-    X_TO_place = objects[0].X_TO.moved((0.0, -0.2, 0.001))
+    X_TO_place = objects[0].X_TO.translated((0.0, -0.2, 0.001))
     plan = PickPlacePlanner(cell, PlannerConfig(optimize=False)).plan(
         objects, "sugar_box", X_TO_place
     )
     assert isinstance(plan, PickPlacePlan)
     done = StationSimulation(cell, scene_of(*objects)).execute(plan)
     assert done.poses["sugar_box"].p == pytest.approx(
-        objects[0].X_TO.moved((0.0, -0.2, 0.0)).p, abs=2e-3
+        objects[0].X_TO.translated((0.0, -0.2, 0.0)).p, abs=2e-3
     )
 
 

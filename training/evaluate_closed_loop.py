@@ -34,7 +34,7 @@ from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import mean_interval, wilson_interval
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
@@ -106,7 +106,7 @@ class Player:
     def __init__(self) -> None:
         self._catalog = load_catalog()
         self._set = cache(
-            lambda name: load_scene_set(HERE / "scenes" / f"{name}.json", self._catalog)
+            lambda name: load_scene_dataset(HERE / "scenes" / f"{name}.json", self._catalog)
         )
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
         self._ceiling = ArmCeiling(Scenario().world)
@@ -114,11 +114,14 @@ class Player:
     def __call__(self, asked: Asked) -> dict[str, Any]:
         """Plays one, and tells how it went."""
         row, number = asked.row, asked.number
-        held: SceneSet = self._set(row.scenes)
+        held: SceneDataset = self._set(row.scenes)
         scenario = Scenario(
-            agent=row.agent, perception=row.perception, objects=held.about["objects"], seed=number
+            agent=row.agent,
+            perception=row.perception,
+            objects=held.metadata["objects"],
+            seed=number,
         )
-        scene = held.settled(number, held.grammar, scenario.world)
+        scene = held.settled_scene(number, held.grammar, scenario.world)
         begun = time.perf_counter()
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
         told["arm_can"] = not self._ceiling.never_found(scene)
@@ -158,12 +161,12 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     Raises:
         InputError: the file holds episodes of other networks, scenes or settings.
     """
-    scenes = load_scene_set(HERE / "scenes" / f"{row.scenes}.json", load_catalog())
+    scenes = load_scene_dataset(HERE / "scenes" / f"{row.scenes}.json", load_catalog())
     networks = [checkpoint_path(row.agent, TRAINED)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))
     scenario = to_plain(
-        Scenario(agent=row.agent, perception=row.perception, objects=scenes.about["objects"])
+        Scenario(agent=row.agent, perception=row.perception, objects=scenes.metadata["objects"])
     )
     scenario.pop("seed")  # each episode's own: the scene's number
     asked = {"row": row.name, "first": row.first, "sha256": scenes.sha256, "scenario": scenario}

@@ -28,7 +28,7 @@ from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.statistics import wilson_interval
@@ -143,10 +143,10 @@ def main(
     )
 
     def shown(path: Path) -> tuple[list[str], list[LabeledImage]]:
-        held = load_scene_set(path, catalog)
+        held = load_scene_dataset(path, catalog)
         found = []
         for k in track(range(min(count, len(held.scenes))), path.stem, console=console):
-            scene = held.settled(k, held.grammar, config)
+            scene = held.settled_scene(k, held.grammar, config)
             image = camera.render(scene)
             share = camera.visible_shares(scene, image.label)
             seen = np.bincount(image.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]

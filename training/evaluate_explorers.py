@@ -32,7 +32,7 @@ from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import resume_jsonl
 from drake_clutter.reports.in_words import in_words
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.scene_set import SceneSet, load_scene_set
+from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import bootstrap_ratio_interval
 from drake_clutter.tasks.exploration import EpisodeEnd
 from drake_clutter.validation import to_plain
@@ -67,7 +67,7 @@ TABLES = dict.fromkeys(SETS_OF_SEVEN, ("table2", SEVEN)) | {"sg_14": ("table3", 
 
 
 def played(
-    scenes: SceneSet, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path
+    scenes: SceneDataset, agent: str, count: int, fidelity: str, seed: int, workers: int, path: Path
 ) -> list[EpisodeResult]:
     """The episodes of an agent on a set's first scenes; those that the file has not got are played, and written as they end."""
     config = ClutterConfig()
@@ -231,7 +231,7 @@ def main(
     if not names:
         raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
     held = {"seed": seed, "fidelity": fidelity, "config": to_plain(ClutterConfig())}
-    sets = {name: load_scene_set(SCENES / f"{name}.json", catalog) for name in names}
+    sets = {name: load_scene_dataset(SCENES / f"{name}.json", catalog) for name in names}
     for name, scenes in sets.items():  # says what is wrong before anything is played
         rows_there(out or RESULTS / f"{TABLES[name][0]}.json", held)
         for agent in agents or TABLES[name][1]:

@@ -28,7 +28,7 @@ from drake_clutter.commands.generate import SCENES, generate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.resources import git_commit, resource_path
-from drake_clutter.scenes.interfaces import CannotJudge
+from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
 
@@ -90,13 +90,13 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
         found = judge.stability(file.scene)
         fast = (
             "cannot judge"
-            if isinstance(found, CannotJudge)
+            if isinstance(found, InconclusiveVerdict)
             else "stable"
             if found is None
             else "falls"
         )
         confusion[f"fast {fast}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
-        top = {o.node: o.top for o in file.scene.objects}
+        top = {o.node: o.top_height for o in file.scene.objects}
         for nodes in file.scene.graph.stack_objects():
             heights[int(max(top[node] for node in nodes) // 0.05)] += 1
     called = confusion["fast stable, drake stable"] + confusion["fast stable, drake falls"]

@@ -29,9 +29,9 @@ from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.grammar import canonical_form
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
-from drake_clutter.scenes.interfaces import CannotJudge
+from drake_clutter.scenes.interfaces import InconclusiveVerdict
+from drake_clutter.scenes.scene_dataset import SceneRecord, load_scene_dataset, save_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.scenes.scene_set import SetScene, load_scene_set, save_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
@@ -46,7 +46,7 @@ JUDGED = "judged.jsonl"
 """In the --work folder: what was said of each scene."""
 
 
-def judged_by_drake(folder: Path) -> Iterator[SetScene]:
+def judged_by_drake(folder: Path) -> Iterator[SceneRecord]:
     """The stable scenes of a folder that hide something."""
     catalog = load_catalog()
     solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
@@ -57,7 +57,9 @@ def judged_by_drake(folder: Path) -> Iterator[SetScene]:
         if file.verdict.stable and file.verdict.hidden:
             settled = tuple(file.verdict.settled[name] for name in file.scene.names)
             form = canonical_form(file.scene.graph, catalog.classes)
-            yield SetScene(file.scene.derivation, form, len(file.verdict.hidden), answer, settled)
+            yield SceneRecord(
+                file.scene.derivation, form, len(file.verdict.hidden), answer, settled
+            )
 
 
 class GraphJudge:
@@ -78,7 +80,7 @@ class GraphJudge:
         scene, _ = self._generator.lay_out(rng)
         verdict = self._fast.judge(scene, rng)
         if (
-            isinstance(verdict, CannotJudge)
+            isinstance(verdict, InconclusiveVerdict)
             or not verdict.hidden
             or self._fast.comes_apart(scene) is not True
         ):
@@ -97,21 +99,21 @@ class GraphJudge:
         }
 
 
-def graphs_of(records: Iterable[dict[str, Any]], fell: Counter[str]) -> Iterator[SetScene]:
+def graphs_of(records: Iterable[dict[str, Any]], fell: Counter[str]) -> Iterator[SceneRecord]:
     """The graphs of what `GraphJudge` said that are stable and hide something; counts in `fell` how others fell in Drake."""
     for record in records:
         if record.get("fell"):
             fell[record["fell"]] += 1
         if record.get("hidden"):
-            yield SetScene(tuple(record["rules"]), record["form"], record["hidden"])
+            yield SceneRecord(tuple(record["rules"]), record["form"], record["hidden"])
 
 
-def without_repeats(scenes: Iterable[SetScene], taken: set[str]) -> Iterator[SetScene]:
+def without_repeats(scenes: Iterable[SceneRecord], taken: set[str]) -> Iterator[SceneRecord]:
     """Those whose form is not taken, each form once."""
     taken = set(taken)
     for scene in scenes:
-        if scene.form not in taken:
-            taken.add(scene.form)
+        if scene.canonical_form not in taken:
+            taken.add(scene.canonical_form)
             yield scene
 
 
@@ -135,7 +137,9 @@ def main(
     """Makes a set."""
     console = Console(stderr=True)
     taken = {
-        scene.form for path in not_in or [] for scene in load_scene_set(path, load_catalog()).scenes
+        scene.canonical_form
+        for path in not_in or []
+        for scene in load_scene_dataset(path, load_catalog()).scenes
     }
     job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
     about: dict[str, Any] = {
@@ -150,7 +154,7 @@ def main(
         "without": [path.name for path in not_in or []],
         "commit": git_commit(),
     }
-    found, drawn = list[SetScene](), 0
+    found, drawn = list[SceneRecord](), 0
     if not frozen:
         judged = resume_jsonl(
             work / JUDGED,
@@ -179,7 +183,7 @@ def main(
         told = f"only {len(found)} of {MOST_DRAWS * count} scenes are stable, hide something, and are no repeats"
         raise InputError(f"--count {count}: {told}; allowed is what agent and nodes can make")
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_scene_set(out, about, found[:count], job.config.cell)
+    save_scene_dataset(out, about, found[:count], job.config.cell)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,9 @@ def pick_free(scene: Scene, rng: np.random.Generator) -> SceneObject:
     free = [
         o
         for o in scene.objects
-        if not any(over.top > o.top and _overlap(o, over, 0.0) for over in scene.objects)
+        if not any(
+            over.top_height > o.top_height and _overlap(o, over, 0.0) for over in scene.objects
+        )
     ]
     return free[rng.integers(len(free))]
 
@@ -180,13 +182,13 @@ def put_elsewhere(taken: SceneObject, rest: Scene, rng: np.random.Generator) -> 
     """The object on the tray's floor, turned about the vertical, clear of the rest; None if no place was found."""
     for _ in range(_PLACEMENT_TRIES):
         R_TO = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix() @ taken.X_TO.rotation
-        turned = replace(taken, X_TO=Pose.of(R_TO, (0.0, 0.0, 0.0)))
+        turned = replace(taken, X_TO=Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)))
         lower, upper = turned.bounds_T
         half_size = rest.support.half_size
         least, most = -half_size - lower[:2], half_size - upper[:2]
         if (least < most).all():
             x, y = rng.uniform(least, most)
-            placed = replace(taken, X_TO=Pose.of(R_TO, (x, y, -lower[2])))
+            placed = replace(taken, X_TO=Pose.from_rotation(R_TO, (x, y, -lower[2])))
             if not any(_overlap(placed, other, _GAP) for other in rest.objects):
                 return placed
     return None

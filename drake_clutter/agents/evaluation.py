@@ -13,8 +13,8 @@ from drake_clutter.agents.exploration import PolicyMaker, make_explorers
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.seeding import item_rng
 from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
 from drake_clutter.tasks.episode import run_episode
@@ -82,7 +82,7 @@ class EpisodePlayer:
         self._config, self._max_moves, self._seed = config, max_moves, seed
         # In this process: an object class is known by its identity.
         self._catalog = load_catalog(catalog_folder)
-        self._set = cache(partial(load_scene_set, catalog=self._catalog))
+        self._set = cache(partial(load_scene_dataset, catalog=self._catalog))
         self._start_backend = backends(fidelity, config)
         self._explorers: dict[str, PolicyMaker] = {}
 
@@ -90,7 +90,7 @@ class EpisodePlayer:
         if episode.number is None:
             return load_scene(episode.file, self._catalog).settled_scene
         held = self._set(episode.file)
-        return held.settled(episode.number, held.grammar, self._config)
+        return held.settled_scene(episode.number, held.grammar, self._config)
 
     def __call__(self, episode: Episode) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
@@ -108,7 +108,7 @@ class EpisodePlayer:
             found=len(task.found),
             moves=len(task.steps),
             found_after=tuple(int(n) for n in found_after),
-            not_carried_out=sum(not step.outcome.result.carried_out for step in task.steps),
+            not_carried_out=sum(not step.outcome.result.was_executed for step in task.steps),
         )
 
 

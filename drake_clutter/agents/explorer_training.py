@@ -9,7 +9,7 @@ from drake_clutter.agents.exploration_episodes import acting, figures, play_epis
 from drake_clutter.agents.explorer_network import ExplorerNetwork
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.scene_set import load_scene_set
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.validation import InRange, config_class, renamed_fields
 
@@ -41,7 +41,7 @@ class ExplorerTraining:
     def environment(self, *, privileged: bool = False) -> ClutterExploration:
         """Where it learns; `privileged`: it sees everything, or K_t."""
         return ClutterExploration(
-            load_scene_set(
+            load_scene_dataset(
                 Path(self.scenes), load_catalog(Path(self.catalog) if self.catalog else None)
             ),
             privileged=privileged,

@@ -196,7 +196,7 @@ class SceneGenerator:
         solvable = None
         if verdict.stable:
             solvable = self._search.solve(
-                scene.at(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False
+                scene.with_poses(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False
             ).answer
         return GeneratedScene(scene, verdict, failures, solvable)
 

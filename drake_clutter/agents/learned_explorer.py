@@ -15,7 +15,7 @@ from drake_clutter.config import ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
 from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import free_places
+from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import Backend
@@ -130,7 +130,10 @@ class LearnedExplorer:
             x, y = moves[0].tolist()
             for place in (0, y):
                 move = Move(names[x - 1], names[place - 1] if place else TRAY)
-                if allowed[x, place] and free_places(observation, move, self._config) is not None:
+                if (
+                    allowed[x, place]
+                    and find_free_placements(observation, move, self._config) is not None
+                ):
                     return Decision(move, chances, names)
                 allowed[x, place] = 0
         return Decision(None)

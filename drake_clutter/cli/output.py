@@ -23,7 +23,7 @@ from drake_clutter.files import InputError
 
 if TYPE_CHECKING:
     from drake_clutter.cell.work_cell import WorkCell
-    from drake_clutter.scenes.interfaces import Frame
+    from drake_clutter.scenes.interfaces import MotionSample
     from drake_clutter.scenes.scene import Scene
     from drake_clutter.tasks.exploration import Step
 
@@ -92,7 +92,11 @@ def progress_bar(what: str, items: Iterable[Any], done: int, total: int) -> Iter
 
 
 def watch(
-    name: Path, scene: "Scene", frames: Sequence["Frame"], cell: "WorkCell", html: Path | None
+    name: Path,
+    scene: "Scene",
+    frames: Sequence["MotionSample"],
+    cell: "WorkCell",
+    html: Path | None,
 ) -> None:
     """Show frames in the browser until it is interrupted, or write them to one HTML file."""
     from drake_clutter.reports.recording import serve, write_recording

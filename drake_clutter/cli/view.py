@@ -12,9 +12,9 @@ def view(
 ) -> None:
     """Show a scene in the browser (Meshcat), or write it to one HTML file."""
     from drake_clutter.catalog import load_catalog
-    from drake_clutter.scenes.interfaces import Frame
+    from drake_clutter.scenes.interfaces import MotionSample
     from drake_clutter.scenes.scene_file import load_scene
 
     file = load_scene(scene, load_catalog(catalog))
     shown = file.scene if laid_out else file.settled_scene
-    watch(scene, shown, [Frame(0.0, shown.poses)], file.cell, html)
+    watch(scene, shown, [MotionSample(0.0, shown.poses)], file.cell, html)

@@ -18,8 +18,8 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, file_sha256, write_json
 from drake_clutter.resources import git_commit, resource_path
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.scenes.scene_set import load_scene_set
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
@@ -72,7 +72,7 @@ def playable(named: str, catalog_folder: Path | None) -> list[PlayableScene]:
             )
         scenes = sets[named]
     if scenes.is_file():
-        held = load_scene_set(scenes, catalog)
+        held = load_scene_dataset(scenes, catalog)
         classes = frozenset(c.name for c in held.classes)
         return [
             PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))

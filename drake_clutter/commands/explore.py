@@ -45,7 +45,7 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
         raise InputError(
             f"the scene is not stable: {verdict.instability}; allowed is one that stays as it is when it settles"
         )
-    return scene.at(verdict.settled)
+    return scene.with_poses(verdict.settled)
 
 
 def explore(

@@ -281,7 +281,7 @@ def scene_at_rest(path: Path, job: FeasibilityJob) -> Scene | None:
     """The scene as it settles; None if it does not stay."""
     file = load_scene(path, load_catalog(job.catalog_folder))
     verdict = file.verdict or DrakeJudge(job.world).judge(file.scene, item_rng(job.seed))
-    return file.scene.at(verdict.settled) if verdict.stable else None
+    return file.scene.with_poses(verdict.settled) if verdict.stable else None
 
 
 def feasibility(

@@ -144,7 +144,7 @@ def _thumbnail(index: int, scene: Scene, verdict: Verdict) -> tuple[NDArray[np.u
     _camera = _camera or PictureCamera()
     if verdict.instability is None:
         return (
-            _camera.overhead(scene.at(verdict.settled)),
+            _camera.overhead(scene.with_poses(verdict.settled)),
             f"{index:04d}  hidden {len(verdict.hidden)}",
             True,
         )

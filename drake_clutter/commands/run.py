@@ -50,7 +50,7 @@ def scene_of(
     generate = SceneGenerator(job)
     for index in range(first, first + SCENE_TRIES):
         made = generate(index)
-        if made.verdict.hidden and suits(scene := made.scene.at(made.verdict.settled)):
+        if made.verdict.hidden and suits(scene := made.scene.with_poses(made.verdict.settled)):
             return scene, index
     raise InputError(
         f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable, hides something and suits"

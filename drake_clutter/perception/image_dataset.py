@@ -252,4 +252,4 @@ def _read_scene_json(path: Path) -> dict[str, Any]:
 def _pose_in_tray(instance: dict[str, Any], eye: dict[str, Any]) -> Pose:
     R_TC, p_CT = np.reshape(eye["cam_R_w2c"], (3, 3)).T, np.array(eye["cam_t_w2c"])
     R_CO, p_CO = np.reshape(instance["cam_R_m2c"], (3, 3)), np.array(instance["cam_t_m2c"])
-    return Pose.of(R_TC @ R_CO, R_TC @ (p_CO - p_CT) / 1000)
+    return Pose.from_rotation(R_TC @ R_CO, R_TC @ (p_CO - p_CT) / 1000)

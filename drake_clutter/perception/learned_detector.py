@@ -40,7 +40,7 @@ from drake_clutter.perception.segmentation import (
     make_network_input,
     upsample,
 )
-from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 
@@ -91,7 +91,7 @@ def _select_candidates(
 
     @cache
     def clash(a: int, b: int) -> bool:
-        return penetration(objects[a], objects[b]) > MAX_PENETRATION
+        return penetration_depth(objects[a], objects[b]) > MAX_PENETRATION
 
     numbers = select_consistent_poses(
         [c.evidence for c in candidates],

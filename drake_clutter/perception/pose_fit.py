@@ -159,7 +159,7 @@ class PoseFitter:
         score = float(
             pose_consistency(cylinder, half, R_TO, p_TO, view, FINE_RAYS, DEPTH_TOLERANCE)
         )
-        return FittedPose(Pose.of(R_TO, p_TO), score) if score > 0 else None
+        return FittedPose(Pose.from_rotation(R_TO, p_TO), score) if score > 0 else None
 
     def _mask_bounds(
         self, object_class: ObjectClass, mask: NDArray[np.bool_], p_TO_guess: Floats

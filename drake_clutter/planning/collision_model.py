@@ -21,8 +21,8 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.tool_kinematics import invert_pose
 from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.cell_plant import Arm, add_work_cell, fixture_name, joint_numbers
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform, support_body
 
@@ -54,7 +54,7 @@ class CollisionModel:
         self,
         cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
-        occluded: Sequence[UnseenBlock] = (),
+        occluded: Sequence[OccludedBox] = (),
     ) -> None:
         """Makes a plant of the arm, named objects, and space that must be taken for full."""
         builder = DiagramBuilder()
@@ -64,7 +64,7 @@ class CollisionModel:
             made.plant, made.scene_graph, cell, compliant=False, visuals=False
         )
         for k, block in enumerate(occluded):
-            X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.middle)
+            X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.center)
             made.plant.RegisterCollisionGeometry(
                 made.plant.world_body(),
                 X_TB,

@@ -19,9 +19,9 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.pick_place_search import PickPlaceSearch
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
-from drake_clutter.scenes.geometry import rests_on
+from drake_clutter.scenes.geometry import objects_resting_on
+from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.unseen import UnseenBlock
 from drake_clutter.simulation.plant import rigid_transform
 
 
@@ -42,7 +42,7 @@ class PickPlacePlanner:
         self._grasps = lru_cache(maxsize=256)(self._find_grasps)
 
     def collision_model(
-        self, objects: Sequence[SceneObject], occluded: Sequence[UnseenBlock] = ()
+        self, objects: Sequence[SceneObject], occluded: Sequence[OccludedBox] = ()
     ) -> CollisionModel:
         """The objects and the arm; the latest of each set of objects is kept."""
         named = tuple((o.name, o.object_class) for o in objects)
@@ -59,7 +59,7 @@ class PickPlacePlanner:
         objects: Sequence[SceneObject],
         pick: str,
         X_TO_place: Pose,
-        occluded: Sequence[UnseenBlock] = (),
+        occluded: Sequence[OccludedBox] = (),
     ) -> PickPlacePlan | PlanningFailure:
         """Plans to carry an object to a pose that differs by a shift and a turn about the vertical.
 
@@ -74,7 +74,7 @@ class PickPlacePlanner:
         for above in dict.fromkeys(
             (self.config.descent_start_offset, 0.0)
         ):  # once if they are the same
-            found = self._plan(objects, picked, X_TO_place.moved((0.0, 0.0, above)), occluded)
+            found = self._plan(objects, picked, X_TO_place.translated((0.0, 0.0, above)), occluded)
             if isinstance(found, PlanningFailure) or found.max_descent >= above:
                 break
         return replace(found, planning_time=time.perf_counter() - begun)
@@ -84,10 +84,10 @@ class PickPlacePlanner:
         objects: Sequence[SceneObject],
         picked: SceneObject,
         X_TO_place: Pose,
-        occluded: Sequence[UnseenBlock],
+        occluded: Sequence[OccludedBox],
     ) -> PickPlacePlan | PlanningFailure:
         begun = time.perf_counter()
-        if carried := rests_on(picked, objects):
+        if carried := objects_resting_on(picked, objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
         grasps = self._grasps(picked)
         if isinstance(grasps, PlanningFailure):
@@ -102,7 +102,7 @@ class PickPlacePlanner:
                 f"at home: {' and '.join(nearest.pair)}",
                 nearest.distance,
             )
-        tops = [*scene.fixture_tops, *(block.top for block in occluded)]
+        tops = [*scene.fixture_tops, *(block.top_height for block in occluded)]
         attempt = PickPlaceSearch(self.cell, self.config, scene, objects, picked, X_TO_place, tops)
         for grasp in grasps:
             for q_pick, q_place, yaw in attempt.ik_candidates(grasp):
@@ -125,7 +125,7 @@ class PickPlacePlanner:
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
         """Whether the cup can hold an object, and none of the others rests on it: without that, no plan is worth asking for."""
-        return not rests_on(scene_object, objects) and self.can_grasp(scene_object)
+        return not objects_resting_on(scene_object, objects) and self.can_grasp(scene_object)
 
     def _find_grasps(self, picked: SceneObject) -> tuple[Grasp, ...] | PlanningFailure:
         """Where the gripper takes an object and can hold it, the nearest to its middle first."""
@@ -148,7 +148,7 @@ class PickPlacePlanner:
         """Whether any grasp that holds reaches both ends of a move without collision: what no plan can do without."""
         picked = next(o for o in objects if o.name == pick)
         grasps = self._grasps(picked)
-        if rests_on(picked, objects) or isinstance(grasps, PlanningFailure):
+        if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
             return False
         scene = self.collision_model(objects)
         attempts = PickPlaceSearch(self.cell, self.config, scene, objects, picked, X_TO_place)

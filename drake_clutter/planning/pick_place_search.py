@@ -115,7 +115,11 @@ class PickPlaceSearch:
         others = [o for o in objects if o is not picked]
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
         obstacle_tops = sorted(
-            {round(top, 3) for top in (*obstacle_tops, *(o.top for o in others)) if top > bottom}
+            {
+                round(top, 3)
+                for top in (*obstacle_tops, *(o.top_height for o in others))
+                if top > bottom
+            }
         )
         rise = self._config.lift_height
         self._transfer_heights = [bottom + rise] + [
@@ -312,7 +316,7 @@ class PickPlaceSearch:
         heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
         self._set_up_segment("retreat", X_OG)
         self._collision_model.set_object_pose(
-            self._picked.name, self._X_TO_goal.moved((0.0, 0.0, -10.0))
+            self._picked.name, self._X_TO_goal.translated((0.0, 0.0, -10.0))
         )
         for before, height in pairwise(heights):
             X = np.array([raise_pose(X_place, -before), raise_pose(X_place, -height)])

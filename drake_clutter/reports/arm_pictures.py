@@ -17,7 +17,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.reports.pictures import ENGINE, look_at
-from drake_clutter.scenes.interfaces import Frame
+from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
@@ -29,7 +29,7 @@ _EYE, _TARGET, _FOV_Y_DEG = (1.10, -1.90, 1.30), (-0.22, 0.0, 0.46), 36.0
 _RENDERER = "arm_pictures"
 
 
-def arm_moments(frames: Sequence[Frame], pick: str) -> list[Frame]:
+def arm_moments(frames: Sequence[MotionSample], pick: str) -> list[MotionSample]:
     """The frames of a recorded move that tell it: before, the object's rise, its way, and when it stands."""
     height = np.array([frame.poses[pick].p[2] for frame in frames])
     aside = np.array(
@@ -55,7 +55,7 @@ def quarter_turn_to_base(cell: WorkCell) -> NDArray[np.float64]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def strip(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> NDArray[np.uint8]:
+def strip(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> NDArray[np.uint8]:
     """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
     builder, cell = DiagramBuilder(), cell.with_support(scene.support)
     made = add_scene_plant(

@@ -145,7 +145,7 @@ def _move(
         f"The tray from above before move {number}: {words}. Hidden: {_listed(unknown) or 'nothing'}.",
         "Before, with the move.",
     )
-    if outcome.result.carried_out:
+    if outcome.result.was_executed:
         still_unknown = tuple(name for name in unknown if name not in step.newly_found)
         after = Marks(
             hidden=still_unknown,
@@ -202,8 +202,8 @@ def _move(
 
 def _place(scene: Scene, step: Step) -> Pose | None:
     """Where the picked object was let go; of a move that was not carried out, above the object it was meant for."""
-    if step.outcome.result.carried_out:
-        return step.outcome.released or step.outcome.scene[step.move.pick].X_TO
+    if step.outcome.result.was_executed:
+        return step.outcome.X_TO_released or step.outcome.scene[step.move.pick].X_TO
     return (
         None
         if step.move.place == TRAY

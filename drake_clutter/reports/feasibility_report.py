@@ -27,7 +27,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.reports.arm_pictures import strip
 from drake_clutter.reports.pictures import Marks, PictureCamera
-from drake_clutter.scenes.interfaces import ArmState, Frame
+from drake_clutter.scenes.interfaces import ArmState, MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.statistics import wilson_interval
@@ -412,7 +412,7 @@ def _worst(
     return parts
 
 
-def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[Frame]:
+def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSample]:
     """At the grasp, in the middle of the way, and at the place."""
     carry, frames = plan.segments[1].trajectory, []
     tool = ToolKinematics(cell)
@@ -420,7 +420,7 @@ def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[Frame]:
         q = carry.value(time).ravel()
         X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
         poses = {**scene.poses, plan.pick: pose_of(X_TO)}
-        frames.append(Frame(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
+        frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
     return frames
 
 

@@ -119,7 +119,7 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Pose:
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
-    return Pose.of(np.column_stack([x, np.cross(z, x), z]), eye)
+    return Pose.from_rotation(np.column_stack([x, np.cross(z, x), z]), eye)
 
 
 class PictureCamera:

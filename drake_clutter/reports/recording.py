@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import write_text
-from drake_clutter.scenes.interfaces import Frame
+from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
@@ -56,40 +56,40 @@ _LAMPS: dict[str, dict[str, Any]] = {
 _SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 
 
-def episode_frames(start: Scene, steps: Sequence[Step]) -> list[Frame]:
+def episode_frames(start: Scene, steps: Sequence[Step]) -> list[MotionSample]:
     """An episode's moves as one motion: each object is lifted, carried over and set down, then everything settles.
 
     Where a move was made by teleport, in one instant, lifting and carrying are an illustration, and no robot's motion. Moves that
     could not be carried out are left out.
     """
     poses, time = dict(start.poses), _LONG_PAUSE
-    frames = [Frame(0.0, dict(poses))]
+    frames = [MotionSample(0.0, dict(poses))]
     scene = start
     for step in steps:
-        if not step.outcome.result.carried_out:
+        if not step.outcome.result.was_executed:
             continue
         pick, motion = step.move.pick, step.outcome.motion
         if not (motion and motion[0].arm):
             for X_TO in _carried(
-                scene, pick, step.outcome.released or step.outcome.scene[pick].X_TO
+                scene, pick, step.outcome.X_TO_released or step.outcome.scene[pick].X_TO
             ):
                 poses[pick] = X_TO
-                frames.append(Frame(time, dict(poses)))
+                frames.append(MotionSample(time, dict(poses)))
                 time += 1 / FRAMES_PER_SECOND
         for frame in motion:
             poses |= frame.poses
-            frames.append(Frame(time + frame.time, dict(poses), frame.arm))
+            frames.append(MotionSample(time + frame.time, dict(poses), frame.arm))
         scene = step.outcome.scene
         poses = dict(scene.poses)
         time = frames[-1].time + _PAUSE
-        frames.append(Frame(time, dict(poses)))
-    frames.append(Frame(frames[-1].time + _LONG_PAUSE, dict(poses)))
+        frames.append(MotionSample(time, dict(poses)))
+    frames.append(MotionSample(frames[-1].time + _LONG_PAUSE, dict(poses)))
     return frames
 
 
-def joined(motions: Sequence[Sequence[Frame]]) -> list[Frame]:
+def joined(motions: Sequence[Sequence[MotionSample]]) -> list[MotionSample]:
     """Motions one after the other, with pauses."""
-    frames, time = list[Frame](), 0.0
+    frames, time = list[MotionSample](), 0.0
     for motion in motions:
         frames += [replace(frame, time=time + frame.time) for frame in motion]
         time = frames[-1].time + _PAUSE
@@ -101,7 +101,7 @@ def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     picked = scene[pick]
     # Its lowest point may lie below its origin by as much as its farthest corner.
     reach = float(np.linalg.norm(picked.object_class.corners, axis=1).max())
-    tops = [o.top for o in scene.objects if o.name != pick]
+    tops = [o.top_height for o in scene.objects if o.name != pick]
     height = max([picked.X_TO.p[2], X_T_placed.p[2], *(top + reach for top in tops)]) + _CLEARANCE
     start, end = picked.X_TO.p, X_T_placed.p
     corners = np.array([start, [start[0], start[1], height], [end[0], end[1], height], end])
@@ -114,14 +114,16 @@ def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
         for s in smooth:
             turned = (0.0, s, 1.0)[leg]
             poses.append(
-                Pose.of(
+                Pose.from_rotation(
                     turn(turned).as_matrix(), corners[leg] + s * (corners[leg + 1] - corners[leg])
                 )
             )
     return poses
 
 
-def write_recording(path: Path, scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> None:
+def write_recording(
+    path: Path, scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
+) -> None:
     """Writes one HTML file that shows the frames again and again, without a network.
 
     Args:
@@ -134,7 +136,7 @@ def write_recording(path: Path, scene: Scene, frames: Sequence[Frame], cell: Wor
     write_text(path, _SOURCE_COMMENT.sub("", _animated(scene, frames, cell).StaticHtml()))
 
 
-def _animated(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> Meshcat:
+def _animated(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
     known = [frame.arm.q for frame in frames if frame.arm]
     # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
     with drake_silent_below(logging.WARNING):
@@ -156,7 +158,7 @@ def _animated(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> Meshcat:
     return meshcat
 
 
-def serve(scene: Scene, frames: Sequence[Frame], cell: WorkCell) -> Meshcat:
+def serve(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
     """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
     return _animated(scene, frames, cell)
 

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.scenes.scene import Pose, SceneObject
 
-PENETRATION_ALLOWED = 0.001
+MAX_PENETRATION = 0.001
 """m; a scene whose objects penetrate deeper is refused. Settled objects rest within about 0.01 mm of each other."""
 
 _PARALLEL = 1e-9
@@ -70,7 +70,7 @@ def _piece_penetration(
     return float(overlap.min())
 
 
-def penetration(first: SceneObject, second: SceneObject) -> float:
+def penetration_depth(first: SceneObject, second: SceneObject) -> float:
     """How deep two objects penetrate, m: the least translation that parts them; negative or zero when they do not.
 
     A cylinder is judged as the 32-sided prism inscribed in it, so the depth of a curved contact reads up to 0.5 % of the
@@ -78,9 +78,9 @@ def penetration(first: SceneObject, second: SceneObject) -> float:
     """
     lower_a, upper_a = first.bounds_T
     lower_b, upper_b = second.bounds_T
-    apart = float(np.maximum(lower_a - upper_b, lower_b - upper_a).max())
-    if apart >= 0:
-        return -apart
+    gap = float(np.maximum(lower_a - upper_b, lower_b - upper_a).max())
+    if gap >= 0:
+        return -gap
     return max(
         _piece_penetration(a, b, first, second)
         for a in _pieces(first.object_class)
@@ -88,43 +88,47 @@ def penetration(first: SceneObject, second: SceneObject) -> float:
     )
 
 
-def deepest_penetration(objects: Sequence[SceneObject]) -> tuple[float, str, str]:
+def max_penetration(objects: Sequence[SceneObject]) -> tuple[float, str, str]:
     """The deepest penetration of any two objects, m, and their names; (-inf, "", "") for fewer than two objects."""
-    found = (-np.inf, "", "")
+    deepest = (-np.inf, "", "")
     for first, second in combinations(objects, 2):
-        found = max(
-            found, (penetration(first, second), first.name, second.name), key=lambda item: item[0]
+        deepest = max(
+            deepest,
+            (penetration_depth(first, second), first.name, second.name),
+            key=lambda item: item[0],
         )
-    return found
+    return deepest
 
 
-def touching_groups(objects: Sequence[SceneObject], margin: float) -> list[list[SceneObject]]:
+def group_touching_objects(
+    objects: Sequence[SceneObject], margin: float
+) -> list[list[SceneObject]]:
     """The objects in groups that cannot touch each other: their axis-aligned boxes are more than `margin` (m) apart."""
-    neighbours = nx.Graph()
-    neighbours.add_nodes_from(range(len(objects)))
+    adjacency = nx.Graph()
+    adjacency.add_nodes_from(range(len(objects)))
     for i, j in combinations(range(len(objects)), 2):
         (lower_a, upper_a), (lower_b, upper_b) = objects[i].bounds_T, objects[j].bounds_T
         if np.maximum(lower_a - upper_b, lower_b - upper_a).max() <= margin:
-            neighbours.add_edge(i, j)
-    return [[objects[i] for i in sorted(group)] for group in nx.connected_components(neighbours)]
+            adjacency.add_edge(i, j)
+    return [[objects[i] for i in sorted(group)] for group in nx.connected_components(adjacency)]
 
 
-def carried(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
+def transport_pose(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
     """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
     R = X_TA_new.rotation @ X_TA.rotation.T
-    return Pose.of(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
+    return Pose.from_rotation(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
 
 
-def rests_on(
+def objects_resting_on(
     picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004
 ) -> tuple[str, ...]:
     """The names of the objects that stand or lean on the picked one: they touch it and reach over it."""
-    found = []
+    names = []
     for other in objects:
         if other is picked:
             continue
         (lower, upper), (other_lower, other_upper) = picked.bounds_T, other.bounds_T
         overlap = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
         if overlap.min() > margin and abs(other_lower[2] - upper[2]) < margin:
-            found.append(other.name)
-    return tuple(found)
+            names.append(other.name)
+    return tuple(names)

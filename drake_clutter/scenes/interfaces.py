@@ -58,13 +58,13 @@ class Verdict:
     Attributes:
         instability: None for a stable scene.
         settled: X_TO of every object after settling, by name. Of an unstable scene: as far as it was followed.
-        visible_share: of its unoccluded pixels, what the camera sees of each object, 0 to 1, by name; empty if unstable.
+        visible_fractions: of its unoccluded pixels, what the camera sees of each object, 0 to 1, by name; empty if unstable.
         hidden: the objects whose visible share is below the config's threshold, in the scene's order; empty if unstable.
     """
 
     instability: Instability | None
     settled: Mapping[str, Pose]
-    visible_share: Mapping[str, float]
+    visible_fractions: Mapping[str, float]
     hidden: tuple[str, ...]
 
     @property
@@ -73,7 +73,7 @@ class Verdict:
         return self.instability is None
 
 
-class CannotJudgeReason(Enum):
+class InconclusiveReason(Enum):
     """What is beyond a judge's model of a scene."""
 
     LEANING = "leans"
@@ -87,7 +87,7 @@ class CannotJudgeReason(Enum):
 
 
 @dataclass(frozen=True)
-class CannotJudge:
+class InconclusiveVerdict:
     """A judge's answer to a scene that its model does not cover; `DrakeJudge` judges all.
 
     Attributes:
@@ -95,7 +95,7 @@ class CannotJudge:
         object: the name of the first object of which it is true.
     """
 
-    reason: CannotJudgeReason
+    reason: InconclusiveReason
     object: str
 
     def __str__(self) -> str:
@@ -105,7 +105,7 @@ class CannotJudge:
 class SceneJudge(Protocol):
     """Says whether a scene is stable and what it hides."""
 
-    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | InconclusiveVerdict:
         """The verdict; `rng` draws the random offsets that no exact balance survives."""
 
 
@@ -145,13 +145,13 @@ class MoveResult(Enum):
 
     PLACED = "placed"
     COLLAPSED = "collapsed"
-    NO_FREE_SPOT = "no free spot"
-    CANNOT_JUDGE = "cannot be judged"
+    NO_FREE_PLACEMENT = "no free spot"
+    INCONCLUSIVE = "cannot be judged"
     NOT_PLANNED = "not planned"
     DROPPED = "dropped"
 
     @property
-    def carried_out(self) -> bool:
+    def was_executed(self) -> bool:
         """Whether anything was moved."""
         return self in (MoveResult.PLACED, MoveResult.COLLAPSED, MoveResult.DROPPED)
 
@@ -172,7 +172,7 @@ class ArmState:
 
 
 @dataclass(frozen=True)
-class Frame:
+class MotionSample:
     """Where the objects were at a time.
 
     Attributes:
@@ -195,18 +195,18 @@ class Outcome:
         scene: the scene afterwards; the scene before, if the move could not be carried out.
         instability: what did not stay, when it collapsed.
         motion: for pictures: from when the picked object was let go, or of a robot's whole move.
-        released: X_TO where the picked object was let go.
-        cannot_judge: what is beyond the executor's model, when that is the result.
+        X_TO_released: X_TO where the picked object was let go.
+        inconclusive: what is beyond the executor's model, when that is the result.
         detail: in words, why no plan was found, or how well it was carried out.
     """
 
     result: MoveResult
     scene: Scene
     instability: Instability | None = None
-    motion: tuple[Frame, ...] = ()
-    cannot_judge: CannotJudge | None = None
+    motion: tuple[MotionSample, ...] = ()
+    inconclusive: InconclusiveVerdict | None = None
     detail: str = ""
-    released: Pose | None = None
+    X_TO_released: Pose | None = None
 
 
 @dataclass(frozen=True)

@@ -30,20 +30,20 @@ class LayoutFailure:
 
     Attributes:
         reason: why.
-        amount: m^2, area of the stacks' footprints, or m, height of the highest stack.
-        limit: m^2, area of the tray, or m, the height allowed.
+        required: m^2, area of the stacks' footprints, or m, height of the highest stack.
+        available: m^2, area of the tray, or m, the height allowed.
     """
 
     reason: LayoutFailureReason
-    amount: float
-    limit: float
+    required: float
+    available: float
 
     def __str__(self) -> str:
         unit = "m" if self.reason is LayoutFailureReason.TOO_HIGH else "m^2"
-        return f"{self.reason.value}: {self.amount:.3g} of {self.limit:.3g} {unit}"
+        return f"{self.reason.value}: {self.required:.3g} of {self.available:.3g} {unit}"
 
 
-class _Resting(NamedTuple):
+class _RestingPose(NamedTuple):
     """An object class at rest; lengths in m, axes those of T, origin the object's.
 
     Attributes:
@@ -57,10 +57,10 @@ class _Resting(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def _at_rest(object_class: ObjectClass, orientation: Orientation) -> _Resting:
-    X_TO = Pose.of(resting_rotation(object_class, orientation), (0.0, 0.0, 0.0))
+def _resting_pose(object_class: ObjectClass, orientation: Orientation) -> _RestingPose:
+    X_TO = Pose.from_rotation(resting_rotation(object_class, orientation), (0.0, 0.0, 0.0))
     corners = X_TO.apply(object_class.corners)
-    return _Resting(X_TO.quaternion, corners.min(axis=0), corners.max(axis=0))
+    return _RestingPose(X_TO.quaternion, corners.min(axis=0), corners.max(axis=0))
 
 
 class Stack:
@@ -81,24 +81,24 @@ class Stack:
     ) -> None:
         """Lays out a stack whose attributes are all terminal; `bottom`: the single or the pair that stands on the tray."""
         self.nodes: list[int] = []
-        self._graph, self._classes, self._resting = graph, classes, list[_Resting]()
+        self._graph, self._classes, self._resting = graph, classes, list[_RestingPose]()
         origins: list[list[float]] = []
         floor, level, parent = 0.0, list(bottom), ClutterGraph.TRAY_NODE
         while level:
             orientation = graph.edge_kind(parent, level[0])  # a pair's two are alike
             assert isinstance(orientation, Orientation), "layout needs a terminal graph"
-            resting = _at_rest(classes[graph.kind(level[0])], orientation)
-            aside = 0.0
+            resting = _resting_pose(classes[graph.kind(level[0])], orientation)
+            offset = 0.0
             if len(level) == 2:
                 gap = config.lying_gap if orientation.rest is Rest.FLAT else config.standing_gap
-                aside = (resting.upper[1] - resting.lower[1] + gap) / 2
+                offset = (resting.upper[1] - resting.lower[1] + gap) / 2
             self.nodes += level
             self._resting += [resting] * len(level)
             height = floor - resting.lower[2]
             origins += (
                 [[0.0, 0.0, height]]
                 if len(level) == 1
-                else [[0.0, -aside, height], [0.0, aside, height]]
+                else [[0.0, -offset, height], [0.0, offset, height]]
             )
             floor = height + resting.upper[2]
             parent = level[0]
@@ -117,12 +117,12 @@ class Stack:
 
     def objects(self, x: float = 0.0, y: float = 0.0) -> list[SceneObject]:
         """The stack's objects, the stack moved by x and y (m)."""
-        made = []
+        objects = []
         for node, resting, (px, py, pz) in zip(
             self.nodes, self._resting, (self.p_T + np.array([x, y, 0.0])).tolist(), strict=True
         ):
             object_class = self._classes[self._graph.kind(node)]
-            made.append(
+            objects.append(
                 SceneObject(
                     f"{object_class.name}_{node}",
                     object_class,
@@ -130,10 +130,10 @@ class Stack:
                     node,
                 )
             )
-        return made
+        return objects
 
 
-def _place(
+def _sample_positions(
     half_sizes: NDArray[np.float64],
     support: Support,
     config: LayoutConfig,
@@ -145,19 +145,19 @@ def _place(
         return None
     order = np.argsort(-half_sizes.prod(axis=1), kind="stable")
     for _ in range(config.placement_tries):
-        centres = np.full_like(half_sizes, np.nan)
-        for drawn, stack in enumerate(order):
-            draws = rng.uniform(-1, 1, (config.placement_tries, 2)) * reach[stack]
-            others = order[:drawn]
-            apart = (
-                np.abs(draws[:, None] - centres[others]) - half_sizes[others] - half_sizes[stack]
+        centers = np.full_like(half_sizes, np.nan)
+        for num_placed, stack in enumerate(order):
+            samples = rng.uniform(-1, 1, (config.placement_tries, 2)) * reach[stack]
+            placed = order[:num_placed]
+            gap = (
+                np.abs(samples[:, None] - centers[placed]) - half_sizes[placed] - half_sizes[stack]
             )
-            free = (apart.max(axis=2) >= config.stack_gap).all(axis=1)
+            free = (gap.max(axis=2) >= config.stack_gap).all(axis=1)
             if not free.any():
                 break
-            centres[stack] = draws[np.argmax(free)]
+            centers[stack] = samples[np.argmax(free)]
         else:
-            return centres
+            return centers
     return None
 
 
@@ -190,8 +190,8 @@ def lay_out(
         np.array([stack.lower[:2] for stack in stacks]),
         np.array([stack.upper[:2] for stack in stacks]),
     )
-    centres = _place((upper - lower) / 2, config.cell.support, config.layout, rng)
-    if centres is None:
+    centers = _sample_positions((upper - lower) / 2, config.cell.support, config.layout, rng)
+    if centers is None:
         return LayoutFailure(
             LayoutFailureReason.NO_ROOM,
             float((upper - lower).prod(axis=1).sum()),
@@ -199,7 +199,7 @@ def lay_out(
         )
     objects = [
         o
-        for stack, (x, y) in zip(stacks, centres - (lower + upper) / 2, strict=True)
+        for stack, (x, y) in zip(stacks, centers - (lower + upper) / 2, strict=True)
         for o in stack.objects(float(x), float(y))
     ]
     return Scene(tuple(objects), config.cell.support, graph, derivation.rules, seed)

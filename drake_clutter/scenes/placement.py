@@ -19,13 +19,13 @@ from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Pose
 
-CELL = 0.005
+CELL_SIZE = 0.005
 """m, of the grid of places on the tray that are considered."""
 _DEPTH_TOLERANCE = 0.004
 """m, within which a measured height is taken to be a known one."""
-_LEVEL_STEP = 0.020
+_HEIGHT_STEP = 0.020
 """m between the heights at which the air over a place is looked through."""
-_SUPPORT_MARGIN = 0.005
+_EDGE_MARGIN = 0.005
 """m from the edge of the support within which no centre of mass is put."""
 _YAWS = (0.0, np.pi / 2)
 """rad by which the picked object may be turned, the first that fits is taken."""
@@ -47,11 +47,13 @@ class _Grid:
     @lru_cache(maxsize=16)
     def over(support: Support) -> "_Grid":
         """Return the grid of a support."""
-        counts = [int(side / CELL) for side in support.size]
-        x, y = (np.asarray((np.arange(count) - (count - 1) / 2) * CELL, float) for count in counts)
+        counts = [int(side / CELL_SIZE) for side in support.size]
+        x, y = (
+            np.asarray((np.arange(count) - (count - 1) / 2) * CELL_SIZE, float) for count in counts
+        )
         return _Grid(x, y)
 
-    def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    def centers(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centers of cells (k, 2) [m]. Shape (k, 2)."""
         return np.column_stack([self.x[cells[:, 0]], self.y[cells[:, 1]]])
 
@@ -61,7 +63,7 @@ class _Grid:
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
 
 
-def _pixels(
+def _project_to_pixels(
     camera: Camera, p_T: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Row and column of the pixel on which each of points (N, 3) m falls, and how deep it is, m.
@@ -80,13 +82,13 @@ def _pixels(
     return rows * within, columns * within, np.where(within, depth, np.nan)
 
 
-def seen_through(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_observed_free(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(N,) whether the camera sees past each point (N, 3) m in the tray frame, so that it is known to be free."""
-    rows, columns, depth = _pixels(observation.camera, p_T)
+    rows, columns, depth = _project_to_pixels(observation.camera, p_T)
     return np.asarray(observation.depth[rows, columns] >= depth)
 
 
-class _Turned(NamedTuple):
+class _OrientedObject(NamedTuple):
     """A picked object as it would be put down.
 
     Attributes:
@@ -102,43 +104,45 @@ class _Turned(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def _turned(
+def _orient_object(
     object_class: ObjectClass,
     quaternion: tuple[float, float, float, float],
     yaw: float,
     clearance: float,
-) -> _Turned:
+) -> _OrientedObject:
     cosine, sine = np.cos(yaw), np.sin(yaw)
     R_TO = (
         np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         @ Pose((0.0, 0.0, 0.0), quaternion).rotation
     )
     corners = object_class.corners @ R_TO.T
-    reach = int(np.ceil((np.abs(corners[:, :2]).max() + clearance) / CELL))
+    reach = int(np.ceil((np.abs(corners[:, :2]).max() + clearance) / CELL_SIZE))
     offsets = np.arange(-reach, reach + 1)
     x, y = np.meshgrid(offsets, offsets, indexing="ij")
     lines = ConvexHull(corners[:, :2]).equations
-    outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) * CELL + lines[:, 2:]).max(axis=0)
+    outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) * CELL_SIZE + lines[:, 2:]).max(
+        axis=0
+    )
     # Half a cell more: no part of the footprint lies in a cell that is not looked at.
-    covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL / 2]
+    covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL_SIZE / 2]
     outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
-    turned = quaternion if yaw == 0 else Pose.of(R_TO, (0.0, 0.0, 0.0)).quaternion
-    return _Turned(
-        turned, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first]
+    oriented = quaternion if yaw == 0 else Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)).quaternion
+    return _OrientedObject(
+        oriented, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first]
     )
 
 
 @lru_cache(maxsize=16)
-def _tray_places(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _tray_candidates(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(n, 2) cells of the tray, those furthest from its centre first, and (n,) minus how far, m."""
     grid = _Grid.over(support)
     cells = np.argwhere(np.ones((len(grid.x), len(grid.y)), bool))
-    cost = -np.abs(grid.at(cells)).max(axis=1)
+    cost = -np.abs(grid.centers(cells)).max(axis=1)
     order = np.argsort(cost, kind="stable")
     return cells[order], cost[order]
 
 
-def _top_places(
+def _top_candidates(
     observation: Observation, target: Detection
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(n, 2) cells well inside what is seen of an object's top, those nearest to its middle first, and (n,) how near, m."""
@@ -153,26 +157,26 @@ def _top_places(
     x1, y1 = (int(np.searchsorted(axis, high)) + 1 for axis, high in zip(axes, upper, strict=True))
     x, y = np.meshgrid(grid.x[x0:x1], grid.y[y0:y1], indexing="ij")
     p_T = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, floor)])
-    rows, columns, depth = _pixels(observation.camera, p_T)
+    rows, columns, depth = _project_to_pixels(observation.camera, p_T)
     at_top = np.abs(observation.depth[rows, columns] - depth) < _DEPTH_TOLERANCE
-    top = (at_top & target.mask[rows, columns]).reshape(x.shape)
-    if not top.any():
+    is_top = (at_top & target.mask[rows, columns]).reshape(x.shape)
+    if not is_top.any():
         return np.empty((0, 2), np.int64), np.empty(0)
     first = np.array([x0, y0])
-    middle = grid.at(np.argwhere(top) + first).mean(axis=0)
-    inside = distance_transform_edt(np.pad(top, 1))[1:-1, 1:-1] * CELL > _SUPPORT_MARGIN
+    center = grid.centers(np.argwhere(is_top) + first).mean(axis=0)
+    inside = distance_transform_edt(np.pad(is_top, 1))[1:-1, 1:-1] * CELL_SIZE > _EDGE_MARGIN
     cells = np.argwhere(inside) + first
-    cost = np.linalg.norm(grid.at(cells) - middle, axis=1)
+    cost = np.linalg.norm(grid.centers(cells) - center, axis=1)
     order = np.argsort(cost, kind="stable")
     return cells[order], cost[order]
 
 
 @njit(cache=True)
-def _first_fits(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
+def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
     """The first of the cells over which the footprint is free at all levels (m), and those of the same cost: their positions."""
     height, width = depth.shape
     n, m = len(x), len(y)
-    known = np.zeros((n, m), np.int8)  # 1: free, 2: not
+    state = np.zeros((n, m), np.int8)  # 1: free, 2: not
     found = np.empty(len(cells), np.int64)
     count = 0
     for position in range(len(cells)):
@@ -184,21 +188,23 @@ def _first_fits(depth, camera, x, y, levels, footprint, cells, cost):  # type: i
             if i < 0 or j < 0 or i >= n or j >= m:
                 fits = False
                 break
-            if known[i, j] == 0:
-                known[i, j] = 1
+            if state[i, j] == 0:
+                state[i, j] = 1
                 for level in levels:
-                    p_x, p_y, away = in_camera(camera, x[i], y[j], level)
-                    seen = False
-                    if away > NEAREST:
-                        u, v = project(camera, p_x, p_y, away)
+                    p_x, p_y, point_depth = in_camera(camera, x[i], y[j], level)
+                    is_free = False
+                    if point_depth > NEAREST:
+                        u, v = project(camera, p_x, p_y, point_depth)
                         column, row = int(np.rint(u)), int(np.rint(v))
-                        seen = (
-                            0 <= row < height and 0 <= column < width and depth[row, column] >= away
+                        is_free = (
+                            0 <= row < height
+                            and 0 <= column < width
+                            and depth[row, column] >= point_depth
                         )
-                    if not seen:
-                        known[i, j] = 2
+                    if not is_free:
+                        state[i, j] = 2
                         break
-            if known[i, j] == 2:
+            if state[i, j] == 2:
                 fits = False
                 break
         if fits:
@@ -220,10 +226,10 @@ def has_clear_top(observation: Observation, detection: Detection) -> bool:
     points = grid.points(top + _DEPTH_TOLERANCE)
     lines = ConvexHull(corners[:, :2]).equations
     over = (lines[:, :2] @ points[:, :2].T + lines[:, 2:]).max(axis=0) < 0
-    return bool(seen_through(observation, points[over]).mean() > 0.98) if over.any() else True
+    return bool(is_observed_free(observation, points[over]).mean() > 0.98) if over.any() else True
 
 
-class FreePlaces(NamedTuple):
+class FreePlacements(NamedTuple):
     """Equally good poses at which a picked object can be released.
 
     Attributes:
@@ -235,16 +241,16 @@ class FreePlaces(NamedTuple):
     quaternion: tuple[float, float, float, float]
 
 
-_Found = dict[tuple[Move, ExplorationConfig], FreePlaces | None]
-_FREE_PLACES: WeakKeyDictionary[Observation, _Found] = WeakKeyDictionary()
+_PlacementCache = dict[tuple[Move, ExplorationConfig], FreePlacements | None]
+_FREE_PLACEMENTS: WeakKeyDictionary[Observation, _PlacementCache] = WeakKeyDictionary()
 """Places that have been searched for, by observation: action filters and commands ask alike."""
 
 
-def free_places(
+def find_free_placements(
     observation: Observation,
     move: Move,
     config: ExplorationConfig,
-) -> FreePlaces | None:
+) -> FreePlacements | None:
     """Return the equally good places for a move, or None if no place is known to be free.
 
     The object keeps its orientation, or is turned by a quarter about the vertical if only that
@@ -262,43 +268,47 @@ def free_places(
     Raises:
         KeyError: The move names an object that is not in view.
     """
-    known = _FREE_PLACES.setdefault(observation, {})
-    if (move, config) not in known:
-        known[move, config] = _search_places(observation, move, config)
-    return known[move, config]
+    cached = _FREE_PLACEMENTS.setdefault(observation, {})
+    if (move, config) not in cached:
+        cached[move, config] = _search_placements(observation, move, config)
+    return cached[move, config]
 
 
-def _search_places(
+def _search_placements(
     observation: Observation,
     move: Move,
     config: ExplorationConfig,
-) -> FreePlaces | None:
+) -> FreePlacements | None:
     picked = observation[move.pick]
     if move.place == TRAY:
-        floor, (cells, cost) = 0.0, _tray_places(observation.support)
+        floor, (cells, cost) = 0.0, _tray_candidates(observation.support)
     else:
         target = observation[move.place]
-        floor, (cells, cost) = top_height(target), _top_places(observation, target)
+        floor, (cells, cost) = top_height(target), _top_candidates(observation, target)
     grid = _Grid.over(observation.support)
     camera = observation.camera.pinhole
     for yaw in _YAWS:
-        turned = _turned(picked.object_class, picked.X_TO.quaternion, yaw, config.clearance)
+        oriented = _orient_object(
+            picked.object_class, picked.X_TO.quaternion, yaw, config.clearance
+        )
         levels = (
             floor
             + _DEPTH_TOLERANCE
-            + np.arange(0, turned.height + config.release_height, _LEVEL_STEP)
+            + np.arange(0, oriented.height + config.release_height, _HEIGHT_STEP)
         )
         if (
             not observation.camera.vertical
         ):  # nothing that is seen through below speaks for what is above
-            levels = np.append(levels, floor + turned.height + config.release_height)
-        arguments = (grid.x, grid.y, levels, turned.footprint, cells, cost)
-        best = _first_fits(observation.depth, camera, *arguments)
+            levels = np.append(levels, floor + oriented.height + config.release_height)
+        arguments = (grid.x, grid.y, levels, oriented.footprint, cells, cost)
+        best = _first_free_cells(observation.depth, camera, *arguments)
         if len(best):
             # In the order of the cells, so that a draw does not depend on how they were sorted.
             best = best[np.lexsort(cells[best].T[::-1])]
-            height = np.full(len(best), floor + config.release_height - turned.lowest)
-            return FreePlaces(np.column_stack([grid.at(cells[best]), height]), turned.quaternion)
+            height = np.full(len(best), floor + config.release_height - oriented.lowest)
+            return FreePlacements(
+                np.column_stack([grid.centers(cells[best]), height]), oriented.quaternion
+            )
     return None
 
 
@@ -319,9 +329,9 @@ def resolve_placement(
     """
     if move.place == move.pick:
         raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
-    places = free_places(observation, move, config)
-    if places is None:
+    placements = find_free_placements(observation, move, config)
+    if placements is None:
         return None
-    x, y, z = places.translations[rng.integers(len(places.translations))].tolist()
-    X_TO_place = Pose((x, y, z), places.quaternion)
+    x, y, z = placements.translations[rng.integers(len(placements.translations))].tolist()
+    X_TO_place = Pose((x, y, z), placements.quaternion)
     return PickPlaceCommand(move, observation[move.pick].X_TO, X_TO_place)

@@ -33,7 +33,7 @@ class Pose:
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     @staticmethod
-    def of(rotation: NDArray[np.float64], translation: Iterable[float]) -> "Pose":
+    def from_rotation(rotation: NDArray[np.float64], translation: Iterable[float]) -> "Pose":
         """The pose with R_AB (3, 3) and p_AB (3,) m; w is not negative."""
         w, x, y, z = (
             float(v)
@@ -56,7 +56,7 @@ class Pose:
         """Points (N, 3) m given in B, in A."""
         return np.asarray(p_B @ self.rotation.T + self.p)
 
-    def moved(self, offset: Iterable[float]) -> "Pose":
+    def translated(self, offset: Iterable[float]) -> "Pose":
         """The pose with p_AB + offset, offset (3,) m."""
         x, y, z = (float(v) for v in self.p + np.asarray(list(offset)))
         return replace(self, translation=(x, y, z))
@@ -89,7 +89,7 @@ class SceneObject:
         return self.corners_T.min(axis=0), self.corners_T.max(axis=0)
 
     @property
-    def top(self) -> float:
+    def top_height(self) -> float:
         """Height of its highest point above the tray's floor, m."""
         return float(self.bounds_T[1][2])
 
@@ -133,7 +133,7 @@ class Scene:
         """X_TO by name."""
         return {scene_object.name: scene_object.X_TO for scene_object in self.objects}
 
-    def at(self, poses: Mapping[str, Pose]) -> "Scene":
+    def with_poses(self, poses: Mapping[str, Pose]) -> "Scene":
         """The scene with the poses of the objects that are named replaced."""
         return replace(
             self,
@@ -143,20 +143,21 @@ class Scene:
         )
 
 
-def random_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def sample_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """(count, 3) m: for each object an offset in the tray's plane, drawn uniformly from a disc of the radius (m)."""
-    draws = rng.random((count, 2))
-    distance, angle = radius * np.sqrt(draws[:, 0]), 2 * math.pi * draws[:, 1]
+    samples = rng.random((count, 2))
+    distance, angle = radius * np.sqrt(samples[:, 0]), 2 * math.pi * samples[:, 1]
     return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)])
 
 
-def jittered(
+def perturb_poses(
     objects: Sequence[SceneObject], radius: float, rng: np.random.Generator
 ) -> list[SceneObject]:
     """The objects, each moved by a random offset of its own."""
-    offsets = random_offsets(len(objects), radius, rng)
+    offsets = sample_offsets(len(objects), radius, rng)
     return [
-        replace(o, X_TO=o.X_TO.moved(offset)) for o, offset in zip(objects, offsets, strict=True)
+        replace(o, X_TO=o.X_TO.translated(offset))
+        for o, offset in zip(objects, offsets, strict=True)
     ]
 
 

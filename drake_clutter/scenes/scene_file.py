@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AliasChoices, Field, field_validator, model_validator
 
 from drake_clutter.catalog import Catalog
 from drake_clutter.cell.support import Side
@@ -14,7 +14,7 @@ from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.files import InputError, format_value, input_error, write_text
 from drake_clutter.grammar import ClutterGraph, Orientation
 from drake_clutter.grammar.graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
-from drake_clutter.scenes.geometry import PENETRATION_ALLOWED, deepest_penetration
+from drake_clutter.scenes.geometry import MAX_PENETRATION, max_penetration
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.validation import (
@@ -56,7 +56,7 @@ class SceneFile:
     @property
     def settled_scene(self) -> Scene:
         """The scene as it settled, or as laid out if it was never judged."""
-        return self.scene.at(self.verdict.settled) if self.verdict else self.scene
+        return self.scene.with_poses(self.verdict.settled) if self.verdict else self.scene
 
 
 class _PoseEntry(StrictModel):
@@ -118,7 +118,10 @@ class _InstabilityEntry(StrictModel):
 class _VerdictEntry(StrictModel):
     stable: Flag
     settled: dict[str, _PoseEntry]
-    visible_share: dict[str, Fraction]
+    visible_fractions: Annotated[
+        dict[str, Fraction],
+        Field(validation_alias=AliasChoices("visible_fractions", "visible_share")),
+    ]
     hidden: tuple[NonEmptyText, ...]
     instability: _InstabilityEntry | None = None
 
@@ -169,27 +172,27 @@ def load_scene(path: Path, catalog: Catalog) -> SceneFile:
     return _scene_file(read_yaml(path, "a scene file"), str(path), catalog)
 
 
-def scene_from_text(text: str, path: str, catalog: Catalog) -> SceneFile:
+def scene_from_yaml(text: str, source: str, catalog: Catalog) -> SceneFile:
     """Read what a scene file holds.
 
     Args:
         text: The content.
-        path: How errors name the file.
+        source: How errors name the file.
         catalog: Of the objects' classes.
 
     Raises:
         InputError: See `load_scene`.
     """
-    return _scene_file(parse_yaml(text, path, "a scene file"), path, catalog)
+    return _scene_file(parse_yaml(text, source, "a scene file"), source, catalog)
 
 
 def _scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
     document = validate(_Document, given, path)
     objects = tuple(_objects(document.objects, path, catalog))
-    depth, first, second = deepest_penetration(objects)
-    if depth > PENETRATION_ALLOWED:
+    depth, first, second = max_penetration(objects)
+    if depth > MAX_PENETRATION:
         found = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
-        raise input_error(path, f"{found}; allowed is {1000 * PENETRATION_ALLOWED:g} mm")
+        raise input_error(path, f"{found}; allowed is {1000 * MAX_PENETRATION:g} mm")
     graph = None if document.graph is None else _graph(document.graph, objects, path)
     cell = document.work_cell
     scene = Scene(objects, cell.support, graph, document.derivation, document.seed)
@@ -250,13 +253,13 @@ def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     if entry.stable == (why is not None):
         what = "allowed is one for an unstable scene, and none for a stable one"
         raise input_error(path, f"verdict.instability: {what}")
-    named = {"settled": set(entry.settled), "visible_share": set(entry.visible_share)}
+    named = {"settled": set(entry.settled), "visible_fractions": set(entry.visible_fractions)}
     named |= {"hidden": set(entry.hidden), "instability.object": {why.object} if why else set()}
     for field, names in named.items():
         if strangers := sorted(names - set(scene.names)):
             found = f"verdict.{field}: {format_value(strangers[0])} is no object"
             raise input_error(path, f"{found}; allowed are {', '.join(scene.names)}")
-    for field in ("settled", "visible_share") if entry.stable else ("settled",):
+    for field in ("settled", "visible_fractions") if entry.stable else ("settled",):
         if missing := sorted(set(scene.names) - named[field]):
             found = f"verdict.{field}: {missing[0]} is missing"
             raise input_error(path, f"{found}; allowed is an entry for every object")
@@ -264,14 +267,14 @@ def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     if why is not None:
         instability = Instability(why.reason, why.object, why.displacement, why.tilt)
     settled = {name: pose.pose for name, pose in entry.settled.items()}
-    return Verdict(instability, settled, entry.visible_share, entry.hidden)
+    return Verdict(instability, settled, entry.visible_fractions, entry.hidden)
 
 
 def _pose_fields(pose: Pose) -> dict[str, list[float]]:
     return {"translation": list(pose.translation), "quaternion": list(pose.quaternion)}
 
 
-def scene_fields(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> dict[str, Any]:
+def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> dict[str, Any]:
     """Return the document of a scene file, as plain lists and mappings; see `save_scene`."""
     plain = to_plain(cell.with_support(scene.support))
     document: dict[str, Any] = {
@@ -326,7 +329,7 @@ def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
     }
     return fields | {
         "hidden": list(verdict.hidden),
-        "visible_share": dict(verdict.visible_share),
+        "visible_fractions": dict(verdict.visible_fractions),
         "settled": settled,
     }
 
@@ -340,9 +343,9 @@ def save_scene(path: Path, scene: Scene, cell: WorkCell, verdict: Verdict | None
         cell: The work cell that it was made with.
         verdict: What a judge said of it, or None.
     """
-    write_text(path, scene_text(scene, cell, verdict))
+    write_text(path, scene_to_yaml(scene, cell, verdict))
 
 
-def scene_text(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> str:
+def scene_to_yaml(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> str:
     """Return what a scene file holds, see `save_scene`."""
-    return to_yaml(scene_fields(scene, cell, verdict))
+    return to_yaml(scene_to_dict(scene, cell, verdict))

@@ -25,7 +25,7 @@ def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.
         R_TO = Rotation.random(rng=rng).as_matrix()
         x, y = rng.uniform(-_WITHIN, _WITHIN, 2) * support.size
         loose = SceneObject(
-            f"{object_class.name}_{number}", object_class, Pose.of(R_TO, (x, y, 0.0))
+            f"{object_class.name}_{number}", object_class, Pose.from_rotation(R_TO, (x, y, 0.0))
         )
         lower, upper = loose.bounds_T
         below = [
@@ -34,7 +34,7 @@ def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.
             if (np.minimum(upper, top)[:2] > np.maximum(lower, bottom)[:2]).all()
         ]
         z = max(below, default=0.0) + rng.uniform(_LEAST_GAP, _MOST_GAP) - lower[2]
-        objects.append(SceneObject(loose.name, object_class, Pose.of(R_TO, (x, y, z))))
+        objects.append(SceneObject(loose.name, object_class, Pose.from_rotation(R_TO, (x, y, z))))
     return Scene(tuple(objects), support)
 
 
@@ -57,7 +57,7 @@ def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Sc
     scenes = []
     for moment in moments:
         simulator.AdvanceTo(moment)
-        fallen = scene.at(scene_plant.poses(context))
+        fallen = scene.with_poses(scene_plant.poses(context))
         scenes.append(
             Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.support)), scene.support)
         )

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.geometry import touching_groups
-from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome, PickPlaceCommand
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
+from drake_clutter.scenes.geometry import group_touching_objects
+from drake_clutter.scenes.interfaces import MotionSample, MoveResult, Outcome, PickPlaceCommand
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, perturb_poses
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import Settled, settle
 
@@ -41,10 +41,10 @@ class SettleExecutor:
         # What is let go sinks by the height of release; else it would never count as calm.
         sinks = self._config.settle.calm_displacement + self._config.exploration.release_height
         settle_config = replace(self._config.settle, calm_displacement=sinks)
-        (released,) = jittered([replace(scene[pick], X_TO=X_TO)], settle_config.jitter, rng)
-        moved = scene.at({pick: released.X_TO})
+        (released,) = perturb_poses([replace(scene[pick], X_TO=X_TO)], settle_config.jitter, rng)
+        moved = scene.with_poses({pick: released.X_TO})
 
-        groups = touching_groups(scene.objects, TOUCHING_MARGIN)
+        groups = group_touching_objects(scene.objects, TOUCHING_MARGIN)
         touched = next(names for group in groups if pick in (names := {o.name for o in group}))
         settled = []
         for group in _groups(moved, released):
@@ -53,28 +53,32 @@ class SettleExecutor:
             settled.append(settle(group, scene.support, settle_config, record=True))
             if settled[-1].instability is not None:
                 if not self._follow_falls:
-                    after = moved.at(settled[-1].poses)
+                    after = moved.with_poses(settled[-1].poses)
                     motion = _together(moved.poses, settled)
                     return Outcome(
                         MoveResult.COLLAPSED,
                         after,
                         settled[-1].instability,
                         motion,
-                        released=released.X_TO,
+                        X_TO_released=released.X_TO,
                     )
                 coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
                 whole = settle(moved.objects, scene.support, coarse, record=True, follow_falls=True)
                 fall = settled[-1].instability
                 return Outcome(
                     MoveResult.COLLAPSED,
-                    moved.at(whole.poses),
+                    moved.with_poses(whole.poses),
                     fall,
                     whole.motion,
-                    released=released.X_TO,
+                    X_TO_released=released.X_TO,
                 )
         motion = _together(moved.poses, settled)
         return Outcome(
-            MoveResult.PLACED, moved.at(_poses(settled)), None, motion, released=released.X_TO
+            MoveResult.PLACED,
+            moved.with_poses(_poses(settled)),
+            None,
+            motion,
+            X_TO_released=released.X_TO,
         )
 
 
@@ -82,7 +86,7 @@ def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
     """Objects that may touch each other; what is let go may fall onto all that is below it, however far."""
     lower, upper = (bound[:2] for bound in released.bounds_T)
     with_released, others = list[SceneObject](), []
-    for group in touching_groups(scene.objects, TOUCHING_MARGIN):
+    for group in group_touching_objects(scene.objects, TOUCHING_MARGIN):
         if any(
             (lower <= o.bounds_T[1][:2]).all() and (o.bounds_T[0][:2] <= upper).all() for o in group
         ):
@@ -96,12 +100,12 @@ def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:
     return {name: pose for result in settled for name, pose in result.poses.items()}
 
 
-def _together(start: dict[str, Pose], settled: Sequence[Settled]) -> tuple[Frame, ...]:
+def _together(start: dict[str, Pose], settled: Sequence[Settled]) -> tuple[MotionSample, ...]:
     """The motions of groups that settled apart, as one motion of the whole scene; a group that has ended stays."""
     longest = max((result.motion for result in settled), key=len)
     poses, frames = dict(start), []
     for index, frame in enumerate(longest):
         for result in settled:
             poses |= result.motion[min(index, len(result.motion) - 1)].poses
-        frames.append(Frame(frame.time, dict(poses)))
+        frames.append(MotionSample(frame.time, dict(poses)))
     return tuple(frames)

@@ -4,7 +4,7 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
+    InconclusiveVerdict,
     MoveResult,
     Outcome,
     PickPlaceCommand,
@@ -26,7 +26,9 @@ class FastOrDrakeJudge:
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
         """See `SceneJudge.judge`."""
         verdict = self._fast.judge(scene, rng)
-        return self._drake.judge(scene, rng) if isinstance(verdict, CannotJudge) else verdict
+        return (
+            self._drake.judge(scene, rng) if isinstance(verdict, InconclusiveVerdict) else verdict
+        )
 
 
 class FastOrDrakeExecutor:
@@ -43,7 +45,7 @@ class FastOrDrakeExecutor:
         """See `MoveExecutor.execute`."""
         state = rng.bit_generator.state
         outcome = self._fast.execute(scene, command, rng)
-        if outcome.result is MoveResult.CANNOT_JUDGE:
+        if outcome.result is MoveResult.INCONCLUSIVE:
             rng.bit_generator.state = state  # the same offsets as if Drake had been asked first
             return self._settle.execute(scene, command, rng)
         return outcome

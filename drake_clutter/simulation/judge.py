@@ -8,9 +8,9 @@ import numpy as np
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.interfaces import Verdict
-from drake_clutter.scenes.scene import Pose, Scene, SceneObject, jittered
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, perturb_poses
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.settle import Settled, settle
 from drake_clutter.stability.judge import FastJudge
@@ -40,14 +40,16 @@ class DrakeJudge:
             settled |= result.poses
             if result.instability is not None:
                 return Verdict(result.instability, settled, {}, ())
-        return self.look(scene.at(settled))
+        return self.look(scene.with_poses(settled))
 
     def settle_groups(
         self, scene: Scene, rng: np.random.Generator
     ) -> Iterator[tuple[tuple[SceneObject, ...], Settled]]:
         """Settles group after group of objects that may touch, random offsets added; each with how it settled."""
         config = self._config.settle
-        groups = touching_groups(jittered(scene.objects, config.jitter, rng), TOUCHING_MARGIN)
+        groups = group_touching_objects(
+            perturb_poses(scene.objects, config.jitter, rng), TOUCHING_MARGIN
+        )
         for group in sorted(
             groups,
             key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None,
@@ -65,14 +67,14 @@ class DrakeJudge:
         x, y, z = single.X_TO.translation
         key = (single.object_class, support, z, single.X_TO.quaternion)
         if key not in self._singles:
-            centred = replace(single, X_TO=single.X_TO.moved((-x, -y, 0.0)))
+            centred = replace(single, X_TO=single.X_TO.translated((-x, -y, 0.0)))
             self._singles[key] = settle([centred], support, self._config.settle)
         settled = self._singles[key]
         (pose,) = settled.poses.values()
         instability = (
             replace(settled.instability, object=single.name) if settled.instability else None
         )
-        return Settled(instability, {single.name: pose.moved((x, y, 0.0))}, ())
+        return Settled(instability, {single.name: pose.translated((x, y, 0.0))}, ())
 
     def look(self, scene: Scene) -> Verdict:
         """The verdict on a scene that is known to be at rest: what it hides."""

@@ -29,7 +29,7 @@ def rigid_transform(pose: Pose) -> RigidTransform:
 
 def pose_of(X_AB: RigidTransform) -> Pose:
     """Drake's type as a pose."""
-    return Pose.of(X_AB.rotation().matrix(), X_AB.translation())
+    return Pose.from_rotation(X_AB.rotation().matrix(), X_AB.translation())
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_clutter.catalog import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import SettleConfig
-from drake_clutter.scenes.interfaces import Frame, Instability, InstabilityReason
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, MotionSample
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
 from drake_clutter.simulation.plant import add_scene_plant
 
@@ -33,7 +33,7 @@ class Settled:
 
     instability: Instability | None
     poses: dict[str, Pose]
-    motion: tuple[Frame, ...]
+    motion: tuple[MotionSample, ...]
 
 
 def fallen(
@@ -89,7 +89,7 @@ def settle(
     simulator.Initialize()
 
     history = [{o.name: o.X_TO for o in objects}]
-    motion = [Frame(0.0, history[0])] if record else []
+    motion = [MotionSample(0.0, history[0])] if record else []
     may_creep = _may_creep(objects)
     still_samples = REST_SAMPLES * (2 if may_creep else 1)
     calm_samples, instability = 0, None
@@ -97,13 +97,15 @@ def settle(
     for sample in range(1, last + 1):
         if record:
             simulator.AdvanceTo((sample - 0.5) * SAMPLE_PERIOD)
-            motion.append(Frame(simulator.get_context().get_time(), scene_plant.poses(context)))
+            motion.append(
+                MotionSample(simulator.get_context().get_time(), scene_plant.poses(context))
+            )
         # Half a step is added so that rounding never leaves a step out.
         simulator.AdvanceTo(sample * SAMPLE_PERIOD + config.time_step / 2)
         poses, speeds = scene_plant.poses(context), scene_plant.speeds(context, scene_plant.bodies)
         history.append(poses)
         if record:
-            motion.append(Frame(sample * SAMPLE_PERIOD, poses))
+            motion.append(MotionSample(sample * SAMPLE_PERIOD, poses))
         # Every second time: by then what topples has turned so far that it is not taken for something that slides.
         if instability is None and (sample % 2 == 0 or sample == last):
             gone = [

@@ -4,8 +4,8 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     Instability,
     InstabilityReason,
     Move,
@@ -13,7 +13,7 @@ from drake_clutter.scenes.interfaces import (
     Outcome,
     PickPlaceCommand,
 )
-from drake_clutter.scenes.scene import TRAY, Scene, random_offsets
+from drake_clutter.scenes.scene import TRAY, Scene, sample_offsets
 from drake_clutter.stability.judge import FastJudge
 
 
@@ -33,15 +33,17 @@ class FastExecutor:
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
-        (x, y, _) = random_offsets(1, self._config.settle.jitter, rng)[0]
-        resting = command.X_TO_place.moved((x, y, -self._config.exploration.release_height))
-        moved = scene.at({command.move.pick: resting})
+        (x, y, _) = sample_offsets(1, self._config.settle.jitter, rng)[0]
+        resting = command.X_TO_place.translated((x, y, -self._config.exploration.release_height))
+        moved = scene.with_poses({command.move.pick: resting})
         found = self._judged(scene, moved, command.move)
-        if isinstance(found, CannotJudge):
-            return Outcome(MoveResult.CANNOT_JUDGE, scene, cannot_judge=found)
+        if isinstance(found, InconclusiveVerdict):
+            return Outcome(MoveResult.INCONCLUSIVE, scene, inconclusive=found)
         return Outcome(MoveResult.PLACED if found is None else MoveResult.COLLAPSED, moved, found)
 
-    def _judged(self, before: Scene, after: Scene, move: Move) -> Instability | CannotJudge | None:
+    def _judged(
+        self, before: Scene, after: Scene, move: Move
+    ) -> Instability | InconclusiveVerdict | None:
         """What does not stand when the picked object goes from one place to the other; None if everything does.
 
         As under Drake, what the move does not touch stays at rest. What rests before the move although the judge would let it
@@ -50,11 +52,11 @@ class FastExecutor:
         for name in (move.pick,) if move.place == TRAY else (move.pick, move.place):
             found = self._judge.stability(self._judge.group(before, name))
             if isinstance(found, Instability):
-                return CannotJudge(CannotJudgeReason.RESTS_NEVERTHELESS, found.object)
+                return InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, found.object)
             if found is not None:
                 return found
         losing = self._judge.losing_support(before, move.pick)
-        if isinstance(losing, CannotJudge):
+        if isinstance(losing, InconclusiveVerdict):
             return losing
         if losing:
             return Instability(InstabilityReason.UNSUPPORTED, losing[0])

@@ -9,13 +9,13 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.interfaces import (
-    CannotJudge,
-    CannotJudgeReason,
+    InconclusiveReason,
+    InconclusiveVerdict,
     Instability,
     InstabilityReason,
     Verdict,
 )
-from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, random_offsets
+from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject, sample_offsets
 from drake_clutter.stability import contacts, equilibrium
 from drake_clutter.stability.shapes import Floats, Ints, Shapes
 from drake_clutter.stability.visibility import RayCaster
@@ -35,13 +35,13 @@ _KEPT = 100_000
 _ROW = 32
 """Bytes of a row of `equilibrium.canonical_order`."""
 _CANNOT = {
-    contacts.LEANING: CannotJudgeReason.LEANING,
-    contacts.NOT_CONVEX: CannotJudgeReason.NOT_CONVEX,
-    contacts.OUTSIDE: CannotJudgeReason.OUTSIDE_TRAY,
-    contacts.OVERLAPPING: CannotJudgeReason.INTERPENETRATING,
-    contacts.FLOATING: CannotJudgeReason.FLOATING,
-    contacts.EDGE: CannotJudgeReason.EDGE_CONTACT,
-    contacts.UNSUPPORTED: CannotJudgeReason.UNSUPPORTED,
+    contacts.LEANING: InconclusiveReason.LEANING,
+    contacts.NOT_CONVEX: InconclusiveReason.NOT_CONVEX,
+    contacts.OUTSIDE: InconclusiveReason.OUTSIDE_TRAY,
+    contacts.OVERLAPPING: InconclusiveReason.INTERPENETRATING,
+    contacts.FLOATING: InconclusiveReason.FLOATING,
+    contacts.EDGE: InconclusiveReason.EDGE_CONTACT,
+    contacts.UNSUPPORTED: InconclusiveReason.UNSUPPORTED,
 }
 
 
@@ -82,13 +82,13 @@ class FastJudge:
         self._known: dict[bytes, tuple[int, int]] = {}  # see `_weakest`
         self._generation = 0
 
-    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | CannotJudge:
+    def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | InconclusiveVerdict:
         """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
         shapes, p_T = self._arrays(scene.objects)
         found = self._stability(scene, shapes, p_T)
-        if isinstance(found, CannotJudge):
+        if isinstance(found, InconclusiveVerdict):
             return found
-        moved = p_T + random_offsets(len(p_T), self._config.settle.jitter, rng)
+        moved = p_T + sample_offsets(len(p_T), self._config.settle.jitter, rng)
         settled = {
             o.name: Pose((x, y, z), o.X_TO.quaternion)
             for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)
@@ -101,16 +101,16 @@ class FastJudge:
             None, settled, shares, tuple(name for name, share in shares.items() if share < below)
         )
 
-    def stability(self, scene: Scene) -> Instability | CannotJudge | None:
+    def stability(self, scene: Scene) -> Instability | InconclusiveVerdict | None:
         """What does not stand, or None if everything does."""
         return self._stability(scene, *self._arrays(scene.objects))
 
     def _stability(
         self, scene: Scene, shapes: Ints, p_T: Floats
-    ) -> Instability | CannotJudge | None:
+    ) -> Instability | InconclusiveVerdict | None:
         standing = self._standing(scene, shapes, p_T)
-        if isinstance(standing, CannotJudge):
-            if standing.reason is CannotJudgeReason.UNSUPPORTED:
+        if isinstance(standing, InconclusiveVerdict):
+            if standing.reason is InconclusiveReason.UNSUPPORTED:
                 return Instability(InstabilityReason.UNSUPPORTED, standing.object)
             return standing
         for weakest, rolls in self._weakest(standing, standing.stack):
@@ -119,10 +119,10 @@ class FastJudge:
                 return Instability(reason, scene.objects[weakest].name)
         return None
 
-    def supports(self, scene: Scene) -> dict[str, frozenset[str]] | CannotJudge:
+    def supports(self, scene: Scene) -> dict[str, frozenset[str]] | InconclusiveVerdict:
         """What each object stands on, by name; `TRAY` for the tray."""
         standing = self._standing(scene, *self._arrays(scene.objects))
-        if isinstance(standing, CannotJudge):
+        if isinstance(standing, InconclusiveVerdict):
             return standing
         found: dict[str, set[str]] = {name: set() for name in scene.names}
         for lower, upper in standing.pairs.tolist():
@@ -142,7 +142,7 @@ class FastJudge:
         )
         return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
 
-    def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | CannotJudge:
+    def losing_support(self, scene: Scene, name: str) -> tuple[str, ...] | InconclusiveVerdict:
         """The objects, in the scene's order, that would not stay if the named one were taken away; its group alone is looked at.
 
         Of a stack that loses its balance these are what is furthest from equilibrium, without it the next, and so on.
@@ -152,7 +152,7 @@ class FastJudge:
         """
         scene = self.group(scene, name)
         standing = self._standing(scene, *self._arrays(scene.objects))
-        if isinstance(standing, CannotJudge):
+        if isinstance(standing, InconclusiveVerdict):
             return standing
         shapes, _, pairs, stack = standing
         taken = scene.names.index(name)
@@ -174,14 +174,14 @@ class FastJudge:
             left = [row for row in left if row not in unsupported]
         return tuple(scene.objects[row].name for row in sorted(fallen))
 
-    def margins(self, scene: Scene) -> dict[str, float] | CannotJudge:
+    def margins(self, scene: Scene) -> dict[str, float] | InconclusiveVerdict:
         """How much narrower the contacts under each object may become before its stack loses balance, m, by name.
 
         Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm. What rolls
         has none.
         """
         standing = self._standing(scene, *self._arrays(scene.objects))
-        if isinstance(standing, CannotJudge):
+        if isinstance(standing, InconclusiveVerdict):
             return standing
         shapes, p_T, pairs, stack = standing
         found = {}
@@ -210,10 +210,10 @@ class FastJudge:
                 found[scene_object.name] = 0.0
         return found
 
-    def comes_apart(self, scene: Scene) -> bool | CannotJudge:
+    def comes_apart(self, scene: Scene) -> bool | InconclusiveVerdict:
         """Whether all objects can be taken away one by one, each with nothing on it, while what is left always stands."""
         standing = self._standing(scene, *self._arrays(scene.objects))
-        if isinstance(standing, CannotJudge):
+        if isinstance(standing, InconclusiveVerdict):
             return standing
         pairs, hopeless = standing.pairs.tolist(), set[frozenset[int]]()
 
@@ -235,7 +235,7 @@ class FastJudge:
             for stack in set(standing.stack.tolist())
         )
 
-    def never_movable(self, scene: Scene) -> frozenset[str] | CannotJudge:
+    def never_movable(self, scene: Scene) -> frozenset[str] | InconclusiveVerdict:
         """Objects that no sequence of moves can pick without a collapse, whatever is put down on the others before.
 
         The largest set of objects of which none can be taken away while the rest of the set stands: not even if the others,
@@ -243,7 +243,7 @@ class FastJudge:
         is not thought of.) What is not in the set may still be impossible to move.
         """
         standing = self._standing(scene, *self._arrays(scene.objects))
-        if isinstance(standing, CannotJudge):
+        if isinstance(standing, InconclusiveVerdict):
             return standing
         shapes, p_T, pairs, _ = standing
         fixed = set(range(len(shapes)))
@@ -301,13 +301,15 @@ class FastJudge:
         )
         return bool(residuals.max() == 0)
 
-    def _standing(self, scene: Scene, shapes: Ints, p_T: Floats) -> "_Standing | CannotJudge":
+    def _standing(
+        self, scene: Scene, shapes: Ints, p_T: Floats
+    ) -> "_Standing | InconclusiveVerdict":
         """Who stands on whom, if all objects are within the model."""
         fault, culprit, pairs, stack = contacts.find_contacts(
             self._shapes.table.posed, shapes, p_T, scene.support.half_size
         )
         if fault != contacts.SOUND:
-            return CannotJudge(_CANNOT[fault], scene.objects[culprit].name)
+            return InconclusiveVerdict(_CANNOT[fault], scene.objects[culprit].name)
         return _Standing(shapes, p_T, pairs, stack)
 
     def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:

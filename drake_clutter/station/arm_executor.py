@@ -10,7 +10,7 @@ from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.scenes.geometry import touching_groups
+from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.interfaces import Instability, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
@@ -55,8 +55,8 @@ class ArmExecutor:
         if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
         simulated = StationSimulation(self._config.cell, scene).execute(plan, record=True)
-        X_TO_place = plan.X_TO_place.moved((0.0, 0.0, -simulated.lowered_distance))
-        after, pick = scene.at(simulated.poses), command.move.pick
+        X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -simulated.lowered_distance))
+        after, pick = scene.with_poses(simulated.poses), command.move.pick
         outcome = evaluate_outcome(
             scene, after, pick, X_TO_place, simulated.lost_object, self._config.settle
         )
@@ -78,7 +78,7 @@ def evaluate_outcome(
         pick: what was picked; X_TO_place: where it was to be let go; lost_object: whether it came off the cup on the way.
         config: the limits.
     """
-    put = before.at({pick: X_TO_place})
+    put = before.with_poses({pick: X_TO_place})
     # What comes off the cup only as it touches down, and stays there, has been put down.
     dropped = lost_object and worst_instability([put[pick]], after, config) is not None
     others = [o for o in put.objects if o.name != pick or not dropped]
@@ -89,14 +89,14 @@ def evaluate_outcome(
             for o in before.objects
             if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > MIN_DISPLACEMENT
         } | {pick}
-        for group in touching_groups(after.objects, TOUCHING_MARGIN):
+        for group in group_touching_objects(after.objects, TOUCHING_MARGIN):
             if not moved.isdisjoint(o.name for o in group):
-                after = after.at(settle(group, before.support, config).poses)
+                after = after.with_poses(settle(group, before.support, config).poses)
         instability = worst_instability(others, after, config)
     result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
         result = MoveResult.COLLAPSED
-    return Outcome(result, after, instability, released=X_TO_place)
+    return Outcome(result, after, instability, X_TO_released=X_TO_place)
 
 
 def worst_instability(

@@ -11,7 +11,7 @@ from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.systems.framework import Context
 
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.scenes.geometry import carried, touching_groups
+from drake_clutter.scenes.geometry import group_touching_objects, transport_pose
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.judge import TOUCHING_MARGIN
 from drake_clutter.simulation.plant import support_body
@@ -43,16 +43,17 @@ def affected_bodies(
     both.
     """
     picked = nearest_object(objects, plan.X_TO_pick)
-    X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
+    X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
     lowered = np.linspace(0.0, plan.max_descent, math.ceil(plan.max_descent / _DESCENT_STEP) + 1)
     placed = [
-        replace(picked, X_TO=X_TO_place.moved((0.0, 0.0, -height))) for height in lowered.tolist()
+        replace(picked, X_TO=X_TO_place.translated((0.0, 0.0, -height)))
+        for height in lowered.tolist()
     ]
-    groups = touching_groups(objects, TOUCHING_MARGIN)
+    groups = group_touching_objects(objects, TOUCHING_MARGIN)
 
     def near(ends: Sequence[SceneObject]) -> set[str]:
         def close(o: SceneObject) -> bool:
-            together = (touching_groups([end, o], TOUCHING_MARGIN) for end in ends)
+            together = (group_touching_objects([end, o], TOUCHING_MARGIN) for end in ends)
             return o is not picked and any(len(groups) == 1 for groups in together)
 
         touched = (o.name for group in groups if any(close(o) for o in group) for o in group)

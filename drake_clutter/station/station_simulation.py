@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.scenes.interfaces import Frame
+from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
@@ -69,7 +69,7 @@ class PickPlaceResult:
     lowered_distance: float
     max_tracking_error: float
     simulated_time: float
-    motion: tuple[Frame, ...] = field(repr=False, default=())
+    motion: tuple[MotionSample, ...] = field(repr=False, default=())
 
     @property
     def lost_object(self) -> bool:
@@ -173,7 +173,7 @@ class StationSimulation:
     @property
     def scene(self) -> Scene:
         """The objects where they are now."""
-        return self._scene.at(self.station.scene_plant.poses(self.plant_context))
+        return self._scene.with_poses(self.station.scene_plant.poses(self.plant_context))
 
     @property
     def executor_state(self) -> ExecutorState:
@@ -211,12 +211,12 @@ class StationSimulation:
         while not condition():
             self.step()
 
-    def sample(self) -> Frame:
+    def sample(self) -> MotionSample:
         """Return where arm and objects are; the time is that since the latest plan began."""
         context = self.plant_context
         arm = self.station.arm_state(context, self._is_suction_on(self.root))
         time = self.root.get_time() - self.executor_state.start_time
-        return Frame(time, self.station.scene_plant.poses(context), arm)
+        return MotionSample(time, self.station.scene_plant.poses(context), arm)
 
     def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
         """Carry a plan out, until the arm is home and all has come to rest.
@@ -228,7 +228,7 @@ class StationSimulation:
         before, number = self.scene, self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
         self.executor.GetInputPort("plan").FixValue(context, PlannedMove(number, plan))
-        motion, tracking = list[Frame](), 0.0
+        motion, tracking = list[MotionSample](), 0.0
 
         def at_rest() -> bool:
             if self.finished_plan != number:
@@ -246,7 +246,7 @@ class StationSimulation:
         return self._result(plan, before, tracking, tuple(motion))
 
     def _result(
-        self, plan: PickPlacePlan, before: Scene, tracking: float, motion: tuple[Frame, ...]
+        self, plan: PickPlacePlan, before: Scene, tracking: float, motion: tuple[MotionSample, ...]
     ) -> PickPlaceResult:
         poses, status = self.station.scene_plant.poses(self.plant_context), self.gripper.status
         place, wanted = poses[plan.pick], plan.X_TO_place

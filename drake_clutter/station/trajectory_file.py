@@ -25,9 +25,9 @@ from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
 from drake_clutter.files import InputError, atomic_write, input_error
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.scenes.interfaces import ArmState, Frame, Move, Outcome
+from drake_clutter.scenes.interfaces import ArmState, MotionSample, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.scenes.scene_file import scene_from_text, scene_text
+from drake_clutter.scenes.scene_file import scene_from_yaml, scene_to_yaml
 from drake_clutter.validation import config_yaml, override_config
 from drake_clutter.yaml_io import parse_yaml
 
@@ -51,7 +51,7 @@ def write_trajectories(
         file.attrs.update(
             {
                 "version": FORMAT_VERSION,
-                "scene": scene_text(initial_scene, cell),
+                "scene": scene_to_yaml(initial_scene, cell),
                 "cell": config_yaml(cell.with_support(initial_scene.support)),
             }
         )
@@ -87,7 +87,7 @@ def write_trajectories(
 
 def read_trajectories(
     path: Path, catalog: Catalog
-) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[Frame, ...]]]]:
+) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[MotionSample, ...]]]]:
     """Return the scene at first, the cell, and the motion of each move.
 
     Raises:
@@ -104,7 +104,7 @@ def read_trajectories(
             raise InputError(
                 f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {FORMAT_VERSION}"
             )
-        scene = scene_from_text(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
+        scene = scene_from_yaml(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _read_cell(path, file.attrs).with_support(scene.support)
         joints = load_robot(cell.robot).num_joints
         return (
@@ -125,7 +125,7 @@ def _read_cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
 
 def _read_move(
     path: Path, name: str, group: h5py.Group, scene: Scene, joints: int
-) -> tuple[Move, tuple[Frame, ...]]:
+) -> tuple[Move, tuple[MotionSample, ...]]:
     arrays: dict[str, NDArray[np.float64]] = {}
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM_DATASETS, (joints,))
     shapes |= {"time": (), "suction": (), "X_TO": (len(scene.objects), 7)}
@@ -148,5 +148,5 @@ def _read_move(
             o.name: Pose(tuple(row[4:]), tuple(row[:4]))
             for o, row in zip(scene.objects, rows, strict=True)
         }
-        frames.append(Frame(time, poses, arm))
+        frames.append(MotionSample(time, poses, arm))
     return Move(str(group.attrs["pick"]), str(group.attrs["place"])), tuple(frames)

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Move, Observation
-from drake_clutter.scenes.placement import free_places
+from drake_clutter.scenes.occlusion import objects_below_unidentified_points
+from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.unseen import under_nameless
 from drake_clutter.tasks.belief import Belief, legal_moves
 
 Pickable = Callable[[Sequence[SceneObject]], Collection[str]]
@@ -39,8 +39,9 @@ class InfeasibleMoves:
         free = [
             move
             for move in moves
-            if move.pick in pickable and free_places(observation, move, self.config) is not None
+            if move.pick in pickable
+            and find_free_placements(observation, move, self.config) is not None
         ]
-        risky = under_nameless(belief.objects, observation, self.empty_depth)
+        risky = objects_below_unidentified_points(belief.objects, observation, self.empty_depth)
         worth_trying = {move for move in free if move.pick not in risky} or set(free)
         return [move for move in moves if move not in worth_trying]

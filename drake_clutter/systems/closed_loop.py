@@ -19,8 +19,8 @@ from drake_clutter.planning.pick_place_plan import (
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.scenes.geometry import carried
-from drake_clutter.scenes.interfaces import Frame, MoveResult, Outcome
+from drake_clutter.scenes.geometry import transport_pose
+from drake_clutter.scenes.interfaces import MotionSample, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.station.arm_executor import evaluate_outcome
 from drake_clutter.station.body_sleep import nearest_object
@@ -170,7 +170,7 @@ class ClosedLoop:
         """See `Backend.rollout`."""
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
-        motion, state = list[Frame](), self._state
+        motion, state = list[MotionSample](), self._state
         while state.phase is not Phase.DONE:
             is_moving = self.simulation.is_executing
             self.simulation.step()
@@ -182,7 +182,7 @@ class ClosedLoop:
                 yield self._attempt(before, tuple(motion))
                 motion.clear()
 
-    def _attempt(self, state: PolicyState, motion: tuple[Frame, ...]) -> Attempt:
+    def _attempt(self, state: PolicyState, motion: tuple[MotionSample, ...]) -> Attempt:
         """Return how a move went, once the policy has looked again.
 
         Args:
@@ -200,7 +200,7 @@ class ClosedLoop:
             decision = in_true_names(decision, known, observation, before.objects)
         if isinstance(plan, PlanningFailure):
             no_spot = plan.reason is PlanningFailureReason.NO_FREE_SPOT
-            result = MoveResult.NO_FREE_SPOT if no_spot else MoveResult.NOT_PLANNED
+            result = MoveResult.NO_FREE_PLACEMENT if no_spot else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if no_spot else str(plan))
             return Attempt(decision, outcome, self.look)
         picked, outcome = self._outcome(plan)
@@ -218,8 +218,8 @@ class ClosedLoop:
         picked = grasp.last_held or nearest_object(before.objects, plan.X_TO_pick).name
         # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
         lowered = self.simulation.executor_state.lowered_distance
-        X_TO_place = carried(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
-        X_TO_place = X_TO_place.moved((0.0, 0.0, -lowered))
+        X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
+        X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered))
         came_off = not grasp.has_held or grasp.lost_object
         outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))

@@ -7,7 +7,7 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.geometry import carried, rests_on
+from drake_clutter.scenes.geometry import objects_resting_on, transport_pose
 from drake_clutter.scenes.interfaces import (
     MoveResult,
     Observation,
@@ -81,10 +81,10 @@ class ImageBackend(SteppedBackend):
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `SteppedBackend.execute`."""
         picked = nearest_object(self.scene.objects, command.X_TO_pick)
-        X_TO_place = carried(command.X_TO_pick, command.X_TO_place, picked.X_TO)
+        X_TO_place = transport_pose(command.X_TO_pick, command.X_TO_place, picked.X_TO)
         move = replace(command.move, pick=picked.name)
         outcome = super().execute(PickPlaceCommand(move, picked.X_TO, X_TO_place), rng)
-        return replace(outcome, released=command.X_TO_place)
+        return replace(outcome, X_TO_released=command.X_TO_place)
 
     def known_result(self, outcome: Outcome) -> MoveResult:
         """Return that the object was placed: what became of it shows when it is seen again."""
@@ -97,4 +97,4 @@ class ImageBackend(SteppedBackend):
 
 def _bare(known: Sequence[SceneObject]) -> set[str]:
     """Return the names of objects on which nothing rests."""
-    return {o.name for o in known if not rests_on(o, known)}
+    return {o.name for o in known if not objects_resting_on(o, known)}

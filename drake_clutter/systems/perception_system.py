@@ -137,7 +137,7 @@ class LabelPerception:
     ) -> Observation:
         """See `Perceive`."""
         poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
-        told = self._detector.perceive(self._scene.at(poses)).observation
+        told = self._detector.perceive(self._scene.with_poses(poses)).observation
         unobstructed = depth > told.depth - 0.01  # the arm may be in the way
         in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
         return Observation(

@@ -11,7 +11,7 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.scenes.unseen import unseen_blocks
+from drake_clutter.scenes.occlusion import occluded_boxes
 from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 
 PERIOD = 0.05
@@ -86,7 +86,7 @@ class PlannerSystem(LeafSystem):
         assert request.observation is not None
         if request.command is None:
             return PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, request.move.place)
-        unseen = unseen_blocks(request.objects, request.observation, self._empty_depth)
+        unseen = occluded_boxes(request.objects, request.observation, self._empty_depth)
         pick, X_TO_place = request.move.pick, request.command.X_TO_place
         return self._planner.plan(request.objects, pick, X_TO_place, unseen)
 

@@ -153,7 +153,7 @@ class PolicySystem(LeafSystem):
         finished, lowered = self._finished.Eval(context)
         if finished != now.request.number:
             return now
-        X_TO = response.plan.X_TO_place.moved((0.0, 0.0, -lowered))
+        X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered))
         belief = now.belief.record(move, MoveResult.PLACED, X_TO)
         return replace(now, phase=Phase.LOOKING, look_at=time + self._rest, belief=belief)
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.perception.pose_selection import evaluate_pose
-from drake_clutter.scenes.geometry import penetration
+from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.station.body_sleep import nearest_object
@@ -79,7 +79,9 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
     there = [SceneObject(d.name, d.object_class, d.X_TO) for d in detections]
     unseen = (o for o in known if o.name not in named and o.name not in lost)
     lost += [
-        o.name for o in unseen if any(penetration(o, other) > IN_EACH_OTHER for other in there)
+        o.name
+        for o in unseen
+        if any(penetration_depth(o, other) > IN_EACH_OTHER for other in there)
     ]
     return Tracked(replace(observation, detections=detections), tuple(lost))
 

@@ -3,7 +3,7 @@
 from drake_clutter.config import ClutterConfig
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.scenes.interfaces import CannotJudge
+from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
@@ -22,7 +22,7 @@ class ArmCeiling:
         planner = PickPlacePlanner(self._world.cell.with_support(scene.support), PlannerConfig())
         fixed = {o.name for o in scene.objects if not planner.can_grasp(o)}
         supports = self._judge.supports(scene)
-        if not isinstance(supports, CannotJudge):
+        if not isinstance(supports, InconclusiveVerdict):
             while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
                 fixed |= below
         in_view = self._judge.rays.observe(scene)[0].detections

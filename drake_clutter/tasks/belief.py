@@ -83,7 +83,7 @@ class Belief:
             X_TO_place: Where the object was released, if it was placed.
         """
         history = (*self.history, move)
-        if not result.carried_out:
+        if not result.was_executed:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
         if result is not MoveResult.PLACED or X_TO_place is None:
             return replace(self, history=history, invalid_moves=())

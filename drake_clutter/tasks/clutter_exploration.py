@@ -12,7 +12,7 @@ from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
-from drake_clutter.scenes.scene_set import SceneSet, lay_anew, load_scene_set
+from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset, relayout
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import BackendFactory, teleport_backends
@@ -50,7 +50,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
 
     def __init__(
         self,
-        scenes: SceneSet | Path | str | None = None,
+        scenes: SceneDataset | Path | str | None = None,
         *,
         privileged: bool = False,
         fidelity: str | BackendFactory = "fast",
@@ -68,8 +68,8 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             most_objects: that a scene may have.
             config: the world; None: the default one, in the cell that the scenes were made with.
         """
-        if not isinstance(scenes, SceneSet):
-            scenes = load_scene_set(
+        if not isinstance(scenes, SceneDataset):
+            scenes = load_scene_dataset(
                 resource_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalog()
             )
         self._config = config or ClutterConfig(cell=scenes.cell)
@@ -106,13 +106,13 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             raise InputError(
                 f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them"
             )
-        return self.begin(self.scenes.settled(number, self.grammar, self._config)), {}
+        return self.begin(self.scenes.settled_scene(number, self.grammar, self._config)), {}
 
     def _begin_anew(self) -> GraphObservation:
         """With a scene that stands and hides something where its stacks are put now."""
         for _ in range(_TRIES):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
-            scene = lay_anew(
+            scene = relayout(
                 self.scenes.derivation(index, self.grammar),
                 self.grammar,
                 self._config,

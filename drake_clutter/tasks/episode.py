@@ -151,7 +151,7 @@ class SteppedBackend:
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """Carry out a command."""
         outcome = self._executor.execute(self.scene, command, rng)
-        if outcome.result.carried_out:
+        if outcome.result.was_executed:
             self.scene, self.look = outcome.scene, self._detector.perceive(outcome.scene)
         return outcome
 
@@ -177,7 +177,7 @@ class SteppedBackend:
         rng = self.world_rng
         command = resolve_placement(move, self.observation, self.config, rng)
         if command is None:
-            outcome = Outcome(MoveResult.NO_FREE_SPOT, self.scene)
+            outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene)
             self.belief = self.belief.record(move, outcome.result)
         else:
             outcome = self.execute(command, rng)

@@ -157,7 +157,7 @@ class FeasibilityStudy:
             rest_of(picked),
             round(float(x), 6),
             round(float(y), 6),
-            round(picked.top, 6),
+            round(picked.top_height, 6),
             len(below(picked, scene.objects)),
         )
         if command is None:

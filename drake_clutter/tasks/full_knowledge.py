@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.scenes.interfaces import CannotJudge, Move, MoveResult, Observation
+from drake_clutter.scenes.interfaces import InconclusiveVerdict, Move, MoveResult, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.seeding import item_rng
@@ -203,7 +203,7 @@ class FullKnowledgeSearch:
     def _carried(self, scene: Scene) -> dict[str, frozenset[str]]:
         """What must be moved before each object can be, itself included: everything that stands on nothing else, by name."""
         supports = self._judge.supports(scene)
-        if isinstance(supports, CannotJudge):
+        if isinstance(supports, InconclusiveVerdict):
             return {name: frozenset({name}) for name in scene.names}
         found = {}
         for name in scene.names:
@@ -288,7 +288,7 @@ class FullKnowledgeSearch:
         """Legal moves that lose no support, in batches, the most promising first."""
         in_view = [detection.name for detection in state.observation.detections]
         losing = {name: self._judge.losing_support(state.scene, name) for name in in_view}
-        self._doubts += sum(isinstance(lost, CannotJudge) for lost in losing.values())
+        self._doubts += sum(isinstance(lost, InconclusiveVerdict) for lost in losing.values())
         free = [name for name, lost in losing.items() if lost == ()]
         for useful in (True, False):
             if useful or not only_blockers:
@@ -308,7 +308,7 @@ class FullKnowledgeSearch:
         if command is None:
             return None
         outcome = self._executor.execute(state.scene, command, rng)
-        self._doubts += outcome.result is MoveResult.CANNOT_JUDGE
+        self._doubts += outcome.result is MoveResult.INCONCLUSIVE
         if outcome.result is not MoveResult.PLACED:
             return None
         return self._state(outcome.scene, state.known, rng.bit_generator.state)

@@ -21,7 +21,7 @@ from drake_clutter.grammar.graph import (
     PRIMITIVE,
     TRAY,
 )
-from drake_clutter.scenes.interfaces import CannotJudge, Verdict
+from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.judge import FastJudge
@@ -157,7 +157,7 @@ class PartialScene:
         scene = Scene(tuple(stack.objects()), self._config.cell.support)
         if stack.upper[2] > self._config.layout.max_stack_height:
             self.fault = StackFault.TOO_HIGH
-        elif isinstance(found := self._judge.stability(scene), CannotJudge):
+        elif isinstance(found := self._judge.stability(scene), InconclusiveVerdict):
             self.fault = StackFault.CANNOT_BE_JUDGED
         elif found is not None:
             self.fault = StackFault.UNSTABLE
@@ -181,7 +181,11 @@ class PartialScene:
         if isinstance(scene, LayoutFailure):
             return None
         verdict = self._judge.judge(scene, rng)
-        return None if isinstance(verdict, CannotJudge) or not verdict.stable else (scene, verdict)
+        return (
+            None
+            if isinstance(verdict, InconclusiveVerdict) or not verdict.stable
+            else (scene, verdict)
+        )
 
     def observe(self) -> GraphObservation:
         """The graph as arrays, see `ClutterGeneration`."""

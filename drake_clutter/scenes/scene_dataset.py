@@ -27,32 +27,32 @@ _LAYOUT_TRIES = 100
 
 
 @dataclass(frozen=True)
-class SetScene:
+class SceneRecord:
     """One stable scene of a set.
 
     Attributes:
         rules: by name, that derive its graph.
-        form: its canonical form, see `canonical_form`.
-        hidden: objects that were hidden.
+        canonical_form: its canonical form, see `canonical_form`.
+        num_hidden: objects that were hidden.
         solvable: what the full-knowledge search said of it; "" if it was not asked.
-        settled: X_TO of every object where it came to rest, in the order of the laid-out scene; None: only the graph counts.
+        settled_poses: X_TO of every object at rest, in the order of the laid-out scene, or None.
     """
 
     rules: tuple[str, ...]
-    form: str
-    hidden: int
+    canonical_form: str
+    num_hidden: int
     solvable: str = ""
-    settled: tuple[Pose, ...] | None = None
+    settled_poses: tuple[Pose, ...] | None = None
 
 
 @dataclass(frozen=True)
-class SceneSet:
+class SceneDataset:
     """A set of scenes.
 
     Attributes:
         name: the file's.
         classes: of the objects, in the grammar's order.
-        about: agent, nodes, seed, object set, commit and whatever else says how it was made.
+        metadata: agent, nodes, seed, object set, commit and whatever else says how it was made.
         scenes: the scenes.
         sha256: of all that.
         cell: the work cell that it was made with.
@@ -60,8 +60,8 @@ class SceneSet:
 
     name: str
     classes: tuple[ObjectClass, ...]
-    about: Mapping[str, Any]
-    scenes: tuple[SetScene, ...]
+    metadata: Mapping[str, Any]
+    scenes: tuple[SceneRecord, ...]
     sha256: str
     cell: WorkCell
 
@@ -75,25 +75,25 @@ class SceneSet:
         rules = self.scenes[index].rules
         return Derivation(grammar.replay(rules), rules)
 
-    def settled(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
+    def settled_scene(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
         """A scene of a frozen set, as it came to rest, on the set's support.
 
         Raises:
             InputError: the set has no poses.
         """
-        poses = self.scenes[index].settled
+        poses = self.scenes[index].settled_poses
         if poses is None:
             raise InputError(
                 f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
             )
         world = replace(config, cell=config.cell.with_support(self.cell.support))
-        scene = lay_anew(
+        scene = relayout(
             self.derivation(index, grammar), grammar, world, np.random.default_rng(index)
         )
-        return scene.at(dict(zip(scene.names, poses, strict=True)))
+        return scene.with_poses(dict(zip(scene.names, poses, strict=True)))
 
 
-def lay_anew(
+def relayout(
     derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator
 ) -> Scene:
     """A graph that has been laid out before, with its stacks in new places."""
@@ -110,14 +110,14 @@ def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> st
     return hashlib.sha256(json.dumps([head, entries], sort_keys=True).encode()).hexdigest()
 
 
-def save_scene_set(
-    path: Path, about: Mapping[str, Any], scenes: Sequence[SetScene], cell: WorkCell
+def save_scene_dataset(
+    path: Path, metadata: Mapping[str, Any], scenes: Sequence[SceneRecord], cell: WorkCell
 ) -> None:
     """Write a set, one scene a line.
 
     Args:
         path: The file.
-        about: Names the object set (`objects`) and what else is to be known.
+        metadata: Names the object set (`objects`) and what else is to be known.
         scenes: The scenes.
         cell: The work cell that it was made with.
     """
@@ -126,24 +126,24 @@ def save_scene_set(
     entries: list[dict[str, Any]] = []
     for scene in scenes:
         entry: dict[str, Any] = {
-            "form": scene.form,
-            "hidden": scene.hidden,
+            "canonical_form": scene.canonical_form,
+            "hidden": scene.num_hidden,
             "solvable": scene.solvable,
         }
         entry["rules"] = [number[rule] for rule in scene.rules]
-        if scene.settled is not None:
+        if scene.settled_poses is not None:
             entry["settled"] = [
                 [round(v, 6) for v in (*pose.translation, *pose.quaternion)]
-                for pose in scene.settled
+                for pose in scene.settled_poses
             ]
         entries.append(entry)
-    head = {"version": VERSION, **about, "cell": to_plain(cell), "rules": names}
+    head = {"version": VERSION, **metadata, "cell": to_plain(cell), "rules": names}
     head["sha256"] = _digest(head, entries)
     lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
     write_text(path, f'{json.dumps(head)[:-1]}, "scenes": [\n{lines}\n]}}\n')
 
 
-def load_scene_set(path: Path, catalog: Catalog) -> SceneSet:
+def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
     """Reads a set.
 
     Raises:
@@ -152,7 +152,7 @@ def load_scene_set(path: Path, catalog: Catalog) -> SceneSet:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         entries, digest = document.pop("scenes"), document.pop("sha256")
-        changed = _digest(document, entries) != digest
+        was_changed = _digest(document, entries) != digest
         version, names, objects = (
             document.pop("version"),
             document.pop("rules"),
@@ -166,7 +166,7 @@ def load_scene_set(path: Path, catalog: Catalog) -> SceneSet:
         ) from error
     if version != VERSION:
         raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
-    if changed:
+    if was_changed:
         raise InputError(
             f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made"
         )
@@ -179,8 +179,12 @@ def load_scene_set(path: Path, catalog: Catalog) -> SceneSet:
             tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
         )
         rules = tuple(names[k] for k in entry["rules"])
-        scenes.append(SetScene(rules, entry["form"], entry["hidden"], entry["solvable"], poses))
-    return SceneSet(path.name, catalog.object_set(objects), document, tuple(scenes), digest, cell)
+        # Version 0.1 calls it a form.
+        form = entry["canonical_form"] if "canonical_form" in entry else entry["form"]
+        scenes.append(SceneRecord(rules, form, entry["hidden"], entry["solvable"], poses))
+    return SceneDataset(
+        path.name, catalog.object_set(objects), document, tuple(scenes), digest, cell
+    )
 
 
 def _pose(numbers: Sequence[float]) -> Pose:

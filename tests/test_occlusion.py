@@ -19,13 +19,17 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.interfaces import Observation
+from drake_clutter.scenes.occlusion import (
+    OccludedBox,
+    objects_below_unidentified_points,
+    occluded_boxes,
+)
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.scenes.unseen import UnseenBlock, under_nameless, unseen_blocks
 
 CAMERA = DEFAULT_CELL.camera
 EMPTY = LabelDetector(CAMERA).perceive(scene_of()).observation.depth
 LOWER = resting("sugar_box", Orientation.FLAT_0)
-UPPER = resting("cracker_box", Orientation.FLAT_0, floor=LOWER.top)
+UPPER = resting("cracker_box", Orientation.FLAT_0, floor=LOWER.top_height)
 
 
 def seen(objects: Sequence[SceneObject]) -> Observation:
@@ -36,22 +40,22 @@ def test_a_block_is_the_least_upright_one() -> None:
     turn = 0.3
     R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     corners = np.array([[0.1, 0.02], [-0.1, 0.02], [-0.1, -0.02], [0.1, -0.02]]) @ R.T + [0.2, -0.1]
-    block = UnseenBlock.under(corners, 0.06)
-    assert block.middle == pytest.approx((0.2, -0.1, 0.03))
+    block = OccludedBox.below_points(corners, 0.06)
+    assert block.center == pytest.approx((0.2, -0.1, 0.03))
     assert sorted(block.size[:2]) == pytest.approx([0.04, 0.2])
-    assert (block.size[2], block.top) == (0.06, 0.06)
+    assert (block.size[2], block.top_height) == (0.06, 0.06)
     long_axis = block.yaw if block.size[0] > block.size[1] else block.yaw + math.pi / 2
     assert math.sin(long_axis - turn) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_nothing_is_unseen_where_all_is_known() -> None:
-    assert unseen_blocks([], seen([]), EMPTY) == (), "the rim belongs to the empty cell"
-    assert unseen_blocks([LOWER], seen([LOWER]), EMPTY) == ()
+    assert occluded_boxes([], seen([]), EMPTY) == (), "the rim belongs to the empty cell"
+    assert occluded_boxes([LOWER], seen([LOWER]), EMPTY) == ()
 
 
 def test_what_is_known_has_a_shadow_down_to_the_floor() -> None:
-    (shadow,) = unseen_blocks([UPPER], seen([LOWER, UPPER]), EMPTY)
-    assert LOWER.top - 0.005 < shadow.top < LOWER.top
+    (shadow,) = occluded_boxes([UPPER], seen([LOWER, UPPER]), EMPTY)
+    assert LOWER.top_height - 0.005 < shadow.top_height < LOWER.top_height
     assert sorted(shadow.size[:2]) == pytest.approx(
         sorted(np.ptp(UPPER.corners_T, axis=0)[:2]), abs=1e-6
     )
@@ -59,9 +63,9 @@ def test_what_is_known_has_a_shadow_down_to_the_floor() -> None:
 
 def test_what_is_seen_but_not_known_is_taken_for_full() -> None:
     stranger = replace(resting("tomato_soup_can", xy=(0.2, 0.1)), name="stranger")
-    (block,) = unseen_blocks([LOWER], seen([LOWER, stranger]), EMPTY)
-    assert block.top == pytest.approx(stranger.top, abs=2e-3)
-    assert block.middle[:2] == pytest.approx((0.2, 0.1), abs=5e-3)
+    (block,) = occluded_boxes([LOWER], seen([LOWER, stranger]), EMPTY)
+    assert block.top_height == pytest.approx(stranger.top_height, abs=2e-3)
+    assert block.center[:2] == pytest.approx((0.2, 0.1), abs=5e-3)
 
 
 def test_noise_is_nothing() -> None:
@@ -71,13 +75,15 @@ def test_noise_is_nothing() -> None:
     )
     noisy[100, 100] = 1.0  # a single wrong pixel
     noisy[200:210, 150:160] = 0.0  # not measured
-    assert unseen_blocks([LOWER], replace(observation, depth=noisy), EMPTY) == ()
+    assert occluded_boxes([LOWER], replace(observation, depth=noisy), EMPTY) == ()
 
 
 def test_what_something_unknown_may_lie_on() -> None:
     beside = resting("sugar_box", Orientation.FLAT_0, xy=(0.2, 0.2))
-    assert under_nameless([LOWER, beside], seen([LOWER, beside, UPPER]), EMPTY) == {LOWER.name}
-    assert not under_nameless([LOWER, UPPER], seen([LOWER, UPPER]), EMPTY)
+    assert objects_below_unidentified_points(
+        [LOWER, beside], seen([LOWER, beside, UPPER]), EMPTY
+    ) == {LOWER.name}
+    assert not objects_below_unidentified_points([LOWER, UPPER], seen([LOWER, UPPER]), EMPTY)
 
 
 def highest(plan: PickPlacePlan) -> float:
@@ -90,12 +96,12 @@ def highest(plan: PickPlacePlan) -> float:
 def test_plans_keep_clear_of_what_is_unseen() -> None:
     planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
     place = Pose((0.2, -0.2, LOWER.X_TO.translation[2] + 0.001), LOWER.X_TO.quaternion)
-    between = UnseenBlock((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)
+    between = OccludedBox((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)
     low, high = (planner.plan([LOWER], LOWER.name, place, unseen) for unseen in ((), (between,)))
     assert isinstance(low, PickPlacePlan)
     assert isinstance(high, PickPlacePlan)
     assert highest(high) > highest(low) + 0.05, "it is carried over the block"
-    there = UnseenBlock((0.2, -0.2, 0.1), (0.2, 0.2, 0.2), 0.0)
+    there = OccludedBox((0.2, -0.2, 0.1), (0.2, 0.2, 0.2), 0.0)
     blocked = planner.plan([LOWER], LOWER.name, place, (there,))
     assert isinstance(blocked, PlanningFailure)
     assert blocked.reason is PlanningFailureReason.IN_COLLISION
