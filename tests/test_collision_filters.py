@@ -12,7 +12,7 @@ from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.robots.robot_plant import links_in_place
+from drake_clutter.robots.robot_plant import stationary_links
 from drake_clutter.validation import override_config, to_plain
 
 _LINK = """
@@ -57,8 +57,8 @@ def among_posts(spec: RobotSpec, p_TF: tuple[float, float, float]) -> WorkCell:
 
 @pytest.mark.parametrize("name", CELLS)
 def test_the_first_link_of_an_articulated_arm_stays_in_place(name: str) -> None:
-    links = robot(name).links
-    assert set(links_in_place(robot(name))) == {
+    links = robot(name).link_depths
+    assert set(stationary_links(robot(name))) == {
         link for link, moved_by in links.items() if moved_by <= 1
     }
 
@@ -74,7 +74,7 @@ def test_a_first_link_that_reaches_out_or_slides_may_hit_a_fixture(
     kind: str, axis: str, q: float, p_TF: tuple[float, float, float], tmp_path: Path
 ) -> None:
     spec = arm(tmp_path, kind, axis, 0.7)
-    assert links_in_place(load_robot(spec)) == ("foot",)
+    assert stationary_links(load_robot(spec)) == ("foot",)
     scene = CollisionModel(among_posts(spec, p_TF), [])
 
     def close_to_boom(first: float) -> set[str]:

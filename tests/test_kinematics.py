@@ -64,7 +64,7 @@ def test_out_of_reach(p_B6: list[float]) -> None:
 
 def test_where_wrist_2_is_straight_the_last_joint_is_given() -> None:
     q = np.array([0.4, -1.0, 1.2, -0.7, 0.0, 0.9])
-    found = inverse_kinematics(forward_kinematics(q), wrist_3=0.25)
+    found = inverse_kinematics(forward_kinematics(q), singular_wrist_3=0.25)
     straight = found[np.abs(found[:, 4]) < 1e-6]
     assert len(straight) > 0
     assert straight[:, 5] == pytest.approx(0.25)

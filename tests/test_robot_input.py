@@ -108,7 +108,7 @@ def test_an_inverse_that_does_not_fit(tmp_path: Path) -> None:
     text = message(skew)
     assert text.startswith("robot.ik: 'ur' (ur5e.urdf is no arm of the UR family: off by 0.0")
     assert text.endswith("; allowed is 'numerical'")
-    assert load_robot(changed(skew, ik="numerical")).ur is None
+    assert load_robot(changed(skew, ik="numerical")).ur_fit is None
 
 
 @pytest.mark.parametrize("kind", ["visual", "collision"])

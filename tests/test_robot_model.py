@@ -19,7 +19,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.robots import ur_kinematics as kinematics
 from drake_clutter.robots.numerical_ik import NumericalInverseKinematics
 from drake_clutter.robots.robot_model import RobotModel, load_robot
-from drake_clutter.robots.robot_plant import add_robot, unmeeting_links
+from drake_clutter.robots.robot_plant import add_robot, allowed_collision_pairs
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def test_the_closed_form_finds_every_configuration(name: str) -> None:
 @pytest.mark.parametrize("name", CELLS)
 def test_the_numerical_solver_reaches_nearly_all_poses(name: str) -> None:
     arm = robot(name)
-    ik = NumericalInverseKinematics(arm.chain, arm.joints, arm.home)
+    ik = NumericalInverseKinematics(arm.chain, arm.joint_range, arm.home)
     X_BF = arm.forward_kinematics(drawn(arm, 200, seed=2))
     found = ik.solve(X_BF)
     np.testing.assert_array_equal(found, ik.solve(X_BF))
@@ -94,13 +94,13 @@ def test_the_numerical_solver_reaches_nearly_all_poses(name: str) -> None:
 
 
 def test_the_ur10_is_what_it_was_to_the_bit() -> None:
-    arm, parameters = robot("ur10"), kinematics.UR10
-    assert arm.ur is not None
-    assert (arm.ur.parameters, arm.ur.X_B0, arm.ur.X_6F) == (parameters, None, None)
+    arm, parameters = robot("ur10"), kinematics.UR10_PARAMETERS
+    assert arm.ur_fit is not None
+    assert (arm.ur_fit.parameters, arm.ur_fit.X_B0, arm.ur_fit.X_6F) == (parameters, None, None)
     q = drawn(arm, 500, seed=3)
     X_BF = kinematics.forward_kinematics(q)
     np.testing.assert_array_equal(arm.forward_kinematics(q), X_BF)
-    np.testing.assert_array_equal(arm.ik.solve(X_BF), kinematics.branches(X_BF))
+    np.testing.assert_array_equal(arm.ik.solve(X_BF), kinematics.ik_branches(X_BF))
     np.testing.assert_array_equal(arm.manipulability(q), kinematics.manipulability(q))
     reference = rng(4).uniform(-6.2, 6.2, q.shape)
     turned = q + 2 * np.pi * np.round((reference - q) / (2 * np.pi))
@@ -129,7 +129,7 @@ def test_a_path_is_tracked_on_its_branch(name: str) -> None:
     assert np.abs(np.diff(path, axis=0)).max() < 0.3
     end = arm.ik.follow(X_BF[-1], path[-2])
     assert end is not None
-    if arm.ur is not None:
+    if arm.ur_fit is not None:
         np.testing.assert_array_equal(end, path[-1])
     assert arm.ik.track(column(arm, start, np.linspace(0.0, 3.0, 100)), start) is None
 
@@ -211,13 +211,13 @@ def test_the_tool_stays_vertical_along_the_rows() -> None:
 
 def test_links_know_which_joints_move_them() -> None:
     expected = ["base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"]
-    assert dict(robot("ur10").links) == {name: k for k, name in enumerate(expected)}
-    assert list(robot("iiwa14").links.values()) == list(range(8))
+    assert dict(robot("ur10").link_depths) == {name: k for k, name in enumerate(expected)}
+    assert list(robot("iiwa14").link_depths.values()) == list(range(8))
 
 
 def test_links_of_the_ur10_that_are_not_checked() -> None:
-    pairs = set(unmeeting_links(robot("ur10")))
-    links = list(robot("ur10").links)
+    pairs = set(allowed_collision_pairs(robot("ur10")))
+    links = list(robot("ur10").link_depths)
     assert pairs - set(pairwise(links)) == {("base", "upper_arm"), ("wrist_1", "wrist_3")}
 
 
@@ -245,8 +245,10 @@ def test_a_urdf_is_a_robot() -> None:
     X_LF = RigidTransform([0.0, 0.0, 0.045]).GetAsMatrix4()
     theirs = arm.forward_kinematics(q) @ X_LF
     np.testing.assert_allclose(theirs, own.forward_kinematics(q), atol=1e-9)
-    neighbors = list(pairwise(arm.links))
-    assert set(neighbors) <= set(unmeeting_links(arm)), "its STL meshes are converted for Drake"
+    neighbors = list(pairwise(arm.link_depths))
+    assert set(neighbors) <= set(allowed_collision_pairs(arm)), (
+        "its STL meshes are converted for Drake"
+    )
 
 
 def ros_urdf(offset: float = 0.0) -> str:
@@ -291,11 +293,11 @@ def ros_spec(folder: Path, text: str) -> RobotSpec:
 
 def test_the_closed_form_serves_a_ur_with_other_base_and_tool_frames(tmp_path: Path) -> None:
     arm = load_robot(ros_spec(tmp_path, ros_urdf()))
-    assert arm.ur is not None
-    own = robot("ur5e").ur
+    assert arm.ur_fit is not None
+    own = robot("ur5e").ur_fit
     assert own is not None
-    assert arm.ur.parameters.a == pytest.approx(own.parameters.a)
-    assert arm.ur.parameters.d == pytest.approx(own.parameters.d)
+    assert arm.ur_fit.parameters.a == pytest.approx(own.parameters.a)
+    assert arm.ur_fit.parameters.d == pytest.approx(own.parameters.d)
     q = drawn(arm, 100)
     X_BF = arm.forward_kinematics(q)
     np.testing.assert_allclose(X_BF, arm.chain.forward_kinematics(q), atol=1e-9)

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from drake_clutter.cell.primitives import Rod
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.ur_kinematics import (
-    JOINTS,
+    UR_JOINT_NAMES,
     forward_kinematics,
     inverse_kinematics,
     jacobian,
@@ -40,7 +40,10 @@ def test_the_file_is_what_is_written() -> None:
 def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:
     """Of the flange, its Jacobian, and the joints' order; and the inverse leads back."""
     context, draw = plant.CreateDefaultContext(), rng(0)
-    assert tuple(plant.get_joint(index).name() for index in plant.GetJointIndices())[:6] == JOINTS
+    assert (
+        tuple(plant.get_joint(index).name() for index in plant.GetJointIndices())[:6]
+        == UR_JOINT_NAMES
+    )
     flange, world = plant.GetFrameByName("flange"), plant.world_frame()
     for _ in range(200):
         q = draw.uniform(-2 * np.pi, 2 * np.pi, 6)

@@ -83,7 +83,7 @@ class CollisionModel:
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
         self._q_indices, self._v_indices = joint_numbers(self.plant, self._arm)
-        self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).links)
+        self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).link_depths)
         self._fixed = (*self._arm.fixed, support_body(self.plant))
         self._names = self._name_geometries()
         self._geometry_owners = {

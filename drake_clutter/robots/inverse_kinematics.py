@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.robots.joint_range import JointRange
-from drake_clutter.robots.ur_kinematics import DenavitHartenberg, branch_of, branches
+from drake_clutter.robots.ur_kinematics import DenavitHartenberg, branch_index, ik_branches
 
 Floats = NDArray[np.float64]
 
-JUMP = 0.5
+MAX_JOINT_JUMP = 0.5
 """From one pose of a path to the next, a joint that turns further has left its branch [rad]."""
 
 
@@ -78,13 +78,13 @@ class UrInverseKinematics:
 
     Attributes:
         parameters: Of the arm.
-        joints: Range of the joints.
+        joint_range: Range of the joints.
         X_0B: Of the model's base in frame 0 of the convention; None: the identity. Shape (4, 4).
         X_F6: Of frame 6 of the convention in the flange; None: the identity. Shape (4, 4).
     """
 
     parameters: DenavitHartenberg
-    joints: JointRange
+    joint_range: JointRange
     X_0B: Floats | None = None
     X_F6: Floats | None = None
 
@@ -96,9 +96,13 @@ class UrInverseKinematics:
     def solve(self, X_BF: Floats) -> Floats:
         """Return all branches, see `InverseKinematics`; where singular, they coincide."""
         X = X_BF if self.X_0B is None else self.X_0B @ X_BF
-        q = branches(X if self.X_F6 is None else X @ self.X_F6, parameters=self.parameters)
-        lower, upper = self.joints.limits.T
-        return q if (lower <= -np.pi).all() and (upper >= np.pi).all() else self.joints.within(q)
+        q = ik_branches(X if self.X_F6 is None else X @ self.X_F6, parameters=self.parameters)
+        lower, upper = self.joint_range.limits.T
+        return (
+            q
+            if (lower <= -np.pi).all() and (upper >= np.pi).all()
+            else self.joint_range.wrap_to_limits(q)
+        )
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
         """Return q_to, whose rows are branches already."""
@@ -106,16 +110,16 @@ class UrInverseKinematics:
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
         """Return the branch of q_start along poses, see `InverseKinematics`."""
-        q = self.solve(X_BF)[:, branch_of(q_start, self.parameters)]
+        q = self.solve(X_BF)[:, branch_index(q_start, self.parameters)]
         if not np.isfinite(q).all():
             return None
         q[0] = q_start
         for k in range(1, len(q)):
-            q[k] = self.joints.unwrap(q[k], q[k - 1])
-        return None if (np.abs(np.diff(q, axis=0)) > JUMP).any() else q
+            q[k] = self.joint_range.unwrap(q[k], q[k - 1])
+        return None if (np.abs(np.diff(q, axis=0)) > MAX_JOINT_JUMP).any() else q
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
         """Return the branch of q at a pose, see `InverseKinematics`."""
-        q_branch = self.solve(X_BF)[branch_of(q, self.parameters)]
-        found = self.joints.unwrap(q_branch, q)
+        q_branch = self.solve(X_BF)[branch_index(q, self.parameters)]
+        found = self.joint_range.unwrap(q_branch, q)
         return found if np.isfinite(found).all() else None

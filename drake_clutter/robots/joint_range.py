@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-TURN = 2 * np.pi
+FULL_TURN = 2 * np.pi
 _ROUNDING = 1e-9
 """A joint that is no further outside of its range is put on its limit [rad or m]."""
 
@@ -25,9 +25,9 @@ class JointRange:
     revolute: NDArray[np.bool_]
 
     @property
-    def more_than_a_turn(self) -> NDArray[np.bool_]:
+    def exceeds_full_turn(self) -> NDArray[np.bool_]:
         """Which joints can reach a pose at more than one angle. Shape (n,)."""
-        return np.asarray(self.revolute & (self.limits[:, 1] - self.limits[:, 0] > TURN))
+        return np.asarray(self.revolute & (self.limits[:, 1] - self.limits[:, 0] > FULL_TURN))
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
         """Return equivalent positions that are nearest to others.
@@ -39,15 +39,15 @@ class JointRange:
         Returns:
             q, joints with a range of more than a turn moved by whole turns. Shape (..., n).
         """
-        turned = q + TURN * np.round((reference - q) / TURN)
+        turned = q + FULL_TURN * np.round((reference - q) / FULL_TURN)
         turned = np.where(
             turned > self.limits[:, 1],
-            turned - TURN,
-            np.where(turned < self.limits[:, 0], turned + TURN, turned),
+            turned - FULL_TURN,
+            np.where(turned < self.limits[:, 0], turned + FULL_TURN, turned),
         )
-        return np.asarray(np.where(self.more_than_a_turn, turned, q))
+        return np.asarray(np.where(self.exceeds_full_turn, turned, q))
 
-    def within(self, q: Floats) -> Floats:
+    def wrap_to_limits(self, q: Floats) -> Floats:
         """Return equivalent positions within the limits; all NaN if one joint has none.
 
         Args:
@@ -55,7 +55,7 @@ class JointRange:
         """
         lower, upper = self.limits.T
         middle = (lower + upper) / 2
-        moved = np.where(self.revolute, q - TURN * np.round((q - middle) / TURN), q)
+        moved = np.where(self.revolute, q - FULL_TURN * np.round((q - middle) / FULL_TURN), q)
         q = np.where((q >= lower) & (q <= upper), q, moved)
         inside = ((q >= lower - _ROUNDING) & (q <= upper + _ROUNDING)).all(axis=-1, keepdims=True)
         return np.where(inside, np.clip(q, lower, upper), np.nan)

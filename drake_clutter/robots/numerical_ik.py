@@ -15,30 +15,30 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from drake_clutter.robots.inverse_kinematics import JUMP
-from drake_clutter.robots.joint_range import TURN, JointRange
+from drake_clutter.robots.inverse_kinematics import MAX_JOINT_JUMP
+from drake_clutter.robots.joint_range import FULL_TURN, JointRange
 from drake_clutter.robots.serial_chain import SerialChain, chain_frames, chain_jacobian
 
 Floats = NDArray[np.float64]
 
-SOLUTIONS = 8
+MAX_SOLUTIONS = 8
 """Solutions of one pose that are looked for."""
-_TABLE = 20_000
+_TABLE_SIZE = 20_000
 """Configurations among which starts are chosen."""
-_STARTS = 48
+_NUM_STARTS = 48
 """Starts for each pose; those of the table whose poses are nearest."""
-_SAME = 0.1
+_MIN_SOLUTION_DISTANCE = 0.1
 """Solutions that differ less in every joint are one [rad]."""
 _ROTATION_WEIGHT = 0.5
 """Of the flange's axes beside its position in units of the arm's length, to choose starts."""
-_ITERATIONS = 40
-_DRAWN = 20
+_MAX_ITERATIONS = 40
+_NULL_SPACE_ITERATIONS = 20
 """Iterations in which a redundant arm is drawn to its home."""
-_GAIN = 0.5
+_NULL_SPACE_GAIN = 0.5
 """Share of the way home that is taken in one of them."""
-_HOPELESS = 12
+_ABANDON_ITERATION = 12
 """Iterations after which a start that is not near a solution is given up."""
-_CONVERGED = 1e-10
+_ERROR_TOLERANCE = 1e-10
 """Error of a solution [rad and m]."""
 
 
@@ -48,34 +48,34 @@ class NumericalInverseKinematics:
 
     Attributes:
         chain: The arm.
-        joints: Range of the joints.
+        joint_range: Range of the joints.
         home: Redundant arms are drawn to it; solutions near to it come first. Shape (n,).
     """
 
     chain: SerialChain
-    joints: JointRange
+    joint_range: JointRange
     home: Floats
 
     @property
     def num_solutions(self) -> int:
         """Solutions that are given for each pose at most."""
-        return SOLUTIONS
+        return MAX_SOLUTIONS
 
     @cached_property
     def _start_range(self) -> Floats:
         """Positions that are tried: one turn at most. Shape (n, 2)."""
-        middle = self.joints.limits.mean(axis=1, keepdims=True)
+        middle = self.joint_range.limits.mean(axis=1, keepdims=True)
         turn = middle + np.array([-np.pi, np.pi])
-        return np.where(self.joints.more_than_a_turn[:, None], turn, self.joints.limits)
+        return np.where(self.joint_range.exceeds_full_turn[:, None], turn, self.joint_range.limits)
 
     @cached_property
-    def _table(self) -> tuple[Floats, cKDTree]:
+    def _start_table(self) -> tuple[Floats, cKDTree]:
         """Configurations, and a tree of their flanges' poses."""
         lower, upper = self._start_range.T
-        q = np.random.default_rng(0).uniform(lower, upper, (_TABLE, len(lower)))
-        return q, cKDTree(self._features(self.chain.forward_kinematics(q)))
+        q = np.random.default_rng(0).uniform(lower, upper, (_TABLE_SIZE, len(lower)))
+        return q, cKDTree(self._pose_features(self.chain.forward_kinematics(q)))
 
-    def _features(self, X_BF: Floats) -> Floats:
+    def _pose_features(self, X_BF: Floats) -> Floats:
         reach = np.linalg.norm(self.chain.fixed[:, :3, 3], axis=1).sum()
         rotation = X_BF[..., :3, [0, 2]].reshape(*X_BF.shape[:-2], 6)
         return np.concatenate([X_BF[..., :3, 3] / reach, _ROTATION_WEIGHT * rotation], axis=-1)
@@ -83,18 +83,20 @@ class NumericalInverseKinematics:
     def solve(self, X_BF: Floats) -> Floats:
         """Return distinct solutions, the nearest to home first, see `InverseKinematics`."""
         X = np.ascontiguousarray(X_BF, float).reshape(-1, 4, 4)
-        q_table, tree = self._table
-        starts = q_table[tree.query(self._features(X), _STARTS)[1]]
-        found = _solutions(*self._arm, X, starts)
+        q_table, tree = self._start_table
+        starts = q_table[tree.query(self._pose_features(X), _NUM_STARTS)[1]]
+        found = _solve_poses(*self._arm_arguments, X, starts)
         lower = self._start_range[:, 0]
-        found = np.where(self.joints.more_than_a_turn, (found - lower) % TURN + lower, found)
+        found = np.where(
+            self.joint_range.exceeds_full_turn, (found - lower) % FULL_TURN + lower, found
+        )
         order = np.argsort(np.linalg.norm(found - self.home, axis=-1), axis=-1, kind="stable")
         found = np.take_along_axis(found, order[..., None], axis=1)
-        return np.asarray(found.reshape(*X_BF.shape[:-2], SOLUTIONS, self.chain.num_joints))
+        return np.asarray(found.reshape(*X_BF.shape[:-2], MAX_SOLUTIONS, self.chain.num_joints))
 
     @property
-    def _arm(self) -> tuple[Floats, NDArray[np.bool_], Floats, Floats]:
-        return self.chain.fixed, self.chain.revolute, self.joints.limits, self.home
+    def _arm_arguments(self) -> tuple[Floats, NDArray[np.bool_], Floats, Floats]:
+        return self.chain.fixed, self.chain.revolute, self.joint_range.limits, self.home
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
         """Return solutions near to q_from at the poses of q_to, see `InverseKinematics`.
@@ -110,34 +112,36 @@ class NumericalInverseKinematics:
         which = np.isfinite(given[..., 0]).argmax(axis=-1)
         X_BF = self.chain.forward_kinematics(given[np.arange(len(given)), which])
         for k in np.flatnonzero(there):
-            near = _from_starts(*self._arm, X_BF[k], np.ascontiguousarray(start[k]))
+            near = _solve_from_starts(*self._arm_arguments, X_BF[k], np.ascontiguousarray(start[k]))
             for row in np.flatnonzero(np.isfinite(start[k, :, 0])):
                 choice = np.vstack([near[row], given[k]])
                 found[k, row] = self._nearest(choice, start[k, row])
         return found.reshape(np.broadcast_shapes(q_from.shape, q_to.shape))
 
     def _nearest(self, choice: Floats, q: Floats) -> Floats:
-        apart = np.abs(self.joints.unwrap(choice, q) - q).max(axis=-1)
+        apart = np.abs(self.joint_range.unwrap(choice, q) - q).max(axis=-1)
         return np.asarray(choice[np.nanargmin(apart)])
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
         """Return the path that goes on from q_start step by step, see `InverseKinematics`."""
         path = np.empty((len(X_BF), len(q_start)))
         path[0] = q_start
-        on_the_way = _tracked(*self._arm, np.ascontiguousarray(X_BF, float), path)
+        on_the_way = _track_path(*self._arm_arguments, np.ascontiguousarray(X_BF, float), path)
         return path if on_the_way else None
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
         """Return a solution near to q, see `InverseKinematics`."""
-        near = _from_starts(*self._arm, np.ascontiguousarray(X_BF, float), q[None].copy())
+        near = _solve_from_starts(
+            *self._arm_arguments, np.ascontiguousarray(X_BF, float), q[None].copy()
+        )
         choice = np.vstack([near, self.solve(X_BF)])
         if np.isnan(choice).all():
             return None
-        return self.joints.unwrap(self._nearest(choice, q), q)
+        return self.joint_range.unwrap(self._nearest(choice, q), q)
 
 
 @njit(cache=True)
-def _error(X_target, X, e):  # type: ignore[no-untyped-def]
+def _pose_error(X_target, X, e):  # type: ignore[no-untyped-def]
     """Write rotation vector and shift from X to X_target into e (6,); return e^2."""
     R = np.empty((3, 3))
     for i in range(3):
@@ -156,7 +160,7 @@ def _error(X_target, X, e):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _solved(A, b):  # type: ignore[no-untyped-def]
+def _solve_cholesky(A, b):  # type: ignore[no-untyped-def]
     """Solve A x = b in place of b by Cholesky's method; A (6, 6) is overwritten."""
     for j in range(6):
         for k in range(j):
@@ -176,58 +180,60 @@ def _solved(A, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _step(J, e, damping, pull, dq):  # type: ignore[no-untyped-def]
+def _damped_step(J, e, damping, dq_null, dq):  # type: ignore[no-untyped-def]
     """Write J^T (J J^T + damping)^-1 (e - J pull) + pull into dq."""
     n = J.shape[1]
     A, b = np.empty((6, 6)), np.empty(6)
     for i in range(6):
         b[i] = e[i]
         for k in range(n):
-            b[i] -= J[i, k] * pull[k]
+            b[i] -= J[i, k] * dq_null[k]
         for j in range(i + 1):
             A[i, j] = 0.0
             for k in range(n):
                 A[i, j] += J[i, k] * J[j, k]
         A[i, i] += damping
-    _solved(A, b)
+    _solve_cholesky(A, b)
     for k in range(n):
-        dq[k] = pull[k]
+        dq[k] = dq_null[k]
         for i in range(6):
             dq[k] += J[i, k] * b[i]
 
 
 @njit(cache=True)
-def _reached(fixed, revolute, limits, home, X, q, drawn):  # type: ignore[no-untyped-def]
+def _iterate(fixed, revolute, limits, home, X, q, null_space_iterations):  # type: ignore[no-untyped-def]
     """Move q (n,) until the flange is at X, first drawn to home; False if it does not arrive."""
     n = len(q)
     frames, J, e = np.empty((n + 1, 4, 4)), np.empty((6, n)), np.empty(6)
     pull, dq = np.zeros(n), np.empty(n)
-    for iteration in range(_ITERATIONS):
+    for iteration in range(_MAX_ITERATIONS):
         chain_frames(fixed, revolute, q, frames)
-        square = _error(X, frames[n], e)
-        if iteration >= drawn and square < _CONVERGED**2:
+        square = _pose_error(X, frames[n], e)
+        if iteration >= null_space_iterations and square < _ERROR_TOLERANCE**2:
             return True
-        if iteration == _HOPELESS and square > 0.05:
+        if iteration == _ABANDON_ITERATION and square > 0.05:
             return False
         chain_jacobian(frames, revolute, J)
         for k in range(n):
-            pull[k] = _GAIN * (home[k] - q[k]) if iteration < drawn else 0.0
-        _step(J, e, square + 1e-12, pull, dq)
+            pull[k] = (
+                _NULL_SPACE_GAIN * (home[k] - q[k]) if iteration < null_space_iterations else 0.0
+            )
+        _damped_step(J, e, square + 1e-12, pull, dq)
         for k in range(n):
             q[k] = min(max(q[k] + dq[k], limits[k, 0]), limits[k, 1])
     return False
 
 
 @njit(cache=True)
-def _solutions(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
+def _solve_poses(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
     n = len(revolute)
-    found = np.full((len(X), SOLUTIONS, n), np.nan)
+    found = np.full((len(X), MAX_SOLUTIONS, n), np.nan)
     for k in range(len(X)):
         count = 0
         for start in range(starts.shape[1]):
             q = starts[k, start].copy()
-            drawn = _DRAWN if n > 6 and start % 2 == 0 else 0
-            if not _reached(fixed, revolute, limits, home, X[k], q, drawn):
+            drawn = _NULL_SPACE_ITERATIONS if n > 6 and start % 2 == 0 else 0
+            if not _iterate(fixed, revolute, limits, home, X[k], q, drawn):
                 continue
             new = True
             for other in range(count):
@@ -237,31 +243,31 @@ def _solutions(fixed, revolute, limits, home, X, starts):  # type: ignore[no-unt
                     if revolute[joint]:
                         difference = abs((difference + np.pi) % (2 * np.pi) - np.pi)
                     apart = max(apart, difference)
-                new = new and apart > _SAME
+                new = new and apart > _MIN_SOLUTION_DISTANCE
             if new:
                 found[k, count] = q
                 count += 1
-                if count == SOLUTIONS:
+                if count == MAX_SOLUTIONS:
                     break
     return found
 
 
 @njit(cache=True)
-def _from_starts(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
+def _solve_from_starts(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
     """Return where iterations from starts (K, n) lead; NaN where they do not reach X (4, 4)."""
     found = starts.copy()
     for k in range(len(starts)):
-        if not _reached(fixed, revolute, limits, home, X, found[k], 0):
+        if not _iterate(fixed, revolute, limits, home, X, found[k], 0):
             found[k] = np.nan
     return found
 
 
 @njit(cache=True)
-def _tracked(fixed, revolute, limits, home, X, path):  # type: ignore[no-untyped-def]
+def _track_path(fixed, revolute, limits, home, X, path):  # type: ignore[no-untyped-def]
     for k in range(1, len(X)):
         path[k] = path[k - 1]
-        if not _reached(fixed, revolute, limits, home, X[k], path[k], 0):
+        if not _iterate(fixed, revolute, limits, home, X[k], path[k], 0):
             return False
-        if np.abs(path[k] - path[k - 1]).max() > JUMP:
+        if np.abs(path[k] - path[k - 1]).max() > MAX_JOINT_JUMP:
             return False
     return True

@@ -20,15 +20,15 @@ from pydrake.multibody.tree import (
 
 from drake_clutter.cell.robot import RobotSpec
 from drake_clutter.files import InputError
-from drake_clutter.robots.model_file import (
-    mimicking_joint,
-    model_path,
+from drake_clutter.robots.model_parsing import (
+    find_mimic_joint,
     parse_model,
-    torque_limits,
+    read_torque_limits,
+    resolve_model_path,
 )
 from drake_clutter.robots.serial_chain import SerialChain
 
-_OF_DRAKE = ("__model__", "_parent", "_child")
+_DRAKE_FRAME_SUFFIXES = ("__model__", "_parent", "_child")
 """Ends of the names of frames that Drake's parser adds."""
 
 
@@ -42,7 +42,7 @@ class ParsedArm:
         base: Frame B.
         flange: Frame F.
         joints: Those that move the flange, from the base on.
-        links: How many of the joints, from the base on, move a link.
+        link_depths: How many of the joints, from the base on, move a link.
     """
 
     plant: MultibodyPlant
@@ -50,7 +50,7 @@ class ParsedArm:
     base: Frame
     flange: Frame
     joints: tuple[Joint, ...]
-    links: Mapping[str, int]
+    link_depths: Mapping[str, int]
 
     @property
     def revolute(self) -> NDArray[np.bool_]:
@@ -60,7 +60,7 @@ class ParsedArm:
     @property
     def limits(self) -> Mapping[str, list[float]]:
         """Limits by kind, in the order of the joints; infinite where there is none."""
-        torques = torque_limits(self.path)
+        torques = read_torque_limits(self.path)
         return {
             "lower": [float(joint.position_lower_limits()[0]) for joint in self.joints],
             "upper": [float(joint.position_upper_limits()[0]) for joint in self.joints],
@@ -92,7 +92,7 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
     Raises:
         InputError: The file is not whole, has no such base or flange, or is not a serial arm.
     """
-    path, plant = model_path(spec.model), MultibodyPlant(0.0)
+    path, plant = resolve_model_path(spec.model), MultibodyPlant(0.0)
     instance = parse_model(plant, spec.model, visuals=True)  # so that each mesh is looked for
     above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
@@ -104,18 +104,18 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
         raise InputError(f"{path}: link {loose[0]!r} hangs on no joint; allowed is an arm alone")
     if not plant.HasFrameNamed(spec.tool_frame, instance):
         frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
-        known = ", ".join(name for name in frames if not name.endswith(_OF_DRAKE))
+        known = ", ".join(name for name in frames if not name.endswith(_DRAKE_FRAME_SUFFIXES))
         given = f"robot.tool_frame: {spec.tool_frame!r}"
         raise InputError(f"{given}; allowed in {path.name} are {known}")
     base = plant.GetFrameByName(spec.base_link, instance)
     flange = plant.GetFrameByName(spec.tool_frame, instance)
-    moving = _moving(_up_to_base(flange.body(), above))
+    moving = _movable_joints(_joints_to_base(flange.body(), above))
     if not moving:
         raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is one that joints move")
     _check_serial(path, _joints(plant, instance), moving)
     plant.WeldFrames(plant.world_frame(), base)
     plant.Finalize()
-    links = {body.name(): len(_moving(_up_to_base(body, above))) for body in bodies}
+    links = {body.name(): len(_movable_joints(_joints_to_base(body, above))) for body in bodies}
     return ParsedArm(plant, path, base, flange, tuple(moving), links)
 
 
@@ -123,26 +123,26 @@ def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
 
 
-def _up_to_base(body: RigidBody, above: Mapping[str, Joint]) -> list[Joint]:
+def _joints_to_base(body: RigidBody, parent_joints: Mapping[str, Joint]) -> list[Joint]:
     found = []
-    while (joint := above.get(body.name())) is not None:
+    while (joint := parent_joints.get(body.name())) is not None:
         found.append(joint)
         body = joint.parent_body()
     return found[::-1]
 
 
-def _moving(joints: list[Joint]) -> list[Joint]:
+def _movable_joints(joints: list[Joint]) -> list[Joint]:
     return [joint for joint in joints if joint.num_positions()]
 
 
 def _check_serial(path: Path, joints: list[Joint], moving: list[Joint]) -> None:
-    for joint in _moving(joints):
+    for joint in _movable_joints(joints):
         what = f"{path}: joint {joint.name()!r}"
         if joint not in moving:
             raise InputError(f"{what} does not move the tool frame; allowed is an arm alone")
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             kinds = "revolute, continuous and prismatic joints"
             raise InputError(f"{what} is of type {joint.type_name()}; allowed are {kinds}")
-    if (mimic := mimicking_joint(path)) is not None:
+    if (mimic := find_mimic_joint(path)) is not None:
         allowed = "joints that move by themselves"
         raise InputError(f"{path}: joint {mimic!r} mimics another; allowed are {allowed}")

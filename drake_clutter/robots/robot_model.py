@@ -23,9 +23,9 @@ from drake_clutter.robots.ur_fit import UrFit, fit_ur
 
 Floats = NDArray[np.float64]
 
-_FITS = 1e-6
+_MAX_FIT_ERROR = 1e-6
 """Largest error of the closed form's poses: entries of rotations, and positions [m]."""
-_UR_VERTICAL = np.array([[0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
+_UR_VERTICAL_TOOL_ROWS = np.array([[0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 """The three parallel axes tilt the tool by the sum of their angles, wrist 2 out of their plane."""
 
 
@@ -36,15 +36,15 @@ class RobotModel:
     Attributes:
         spec: What it was loaded from.
         joint_names: In the order of q.
-        joints: Range of the joints.
+        joint_range: Range of the joints.
         velocity_limits: [rad/s]. Shape (n,).
         acceleration_limits: [rad/s^2]. Shape (n,).
         jerk_limits: Infinite where the cell gives none [rad/s^3]. Shape (n,).
         torque_limits: [N m]. Shape (n,).
         home: Where moves begin and end [rad]. Shape (n,).
-        links: How many of the joints, from the base on, move a link.
+        link_depths: How many of the joints, from the base on, move a link.
         chain: Kinematics, as the model file has them.
-        ur: The same in closed form, of an arm of the UR family; else None.
+        ur_fit: The same in closed form, of an arm of the UR family; else None.
         ik: Inverse kinematics.
         vertical_tool_rows: Rows A with A dq = 0 exactly if a vertical tool axis stays vertical;
             None: the arm has no such linear relation. Shape (m, n).
@@ -52,15 +52,15 @@ class RobotModel:
 
     spec: RobotSpec
     joint_names: tuple[str, ...]
-    joints: JointRange
+    joint_range: JointRange
     velocity_limits: Floats
     acceleration_limits: Floats
     jerk_limits: Floats
     torque_limits: Floats
     home: Floats
-    links: Mapping[str, int]
+    link_depths: Mapping[str, int]
     chain: SerialChain
-    ur: UrFit | None
+    ur_fit: UrFit | None
     ik: InverseKinematics
     vertical_tool_rows: Floats | None
 
@@ -72,7 +72,7 @@ class RobotModel:
     @property
     def position_limits(self) -> Floats:
         """Least and greatest position [rad]. Shape (n, 2)."""
-        return self.joints.limits
+        return self.joint_range.limits
 
     @property
     def X_TB(self) -> RigidTransform:
@@ -81,11 +81,11 @@ class RobotModel:
 
     def forward_kinematics(self, q: Floats) -> Floats:
         """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
-        if self.ur is None:
+        if self.ur_fit is None:
             return self.chain.forward_kinematics(q)
-        X = kinematics.forward_kinematics(q, self.ur.parameters)
-        X = X if self.ur.X_B0 is None else self.ur.X_B0 @ X
-        return X if self.ur.X_6F is None else X @ self.ur.X_6F
+        X = kinematics.forward_kinematics(q, self.ur_fit.parameters)
+        X = X if self.ur_fit.X_B0 is None else self.ur_fit.X_B0 @ X
+        return X if self.ur_fit.X_6F is None else X @ self.ur_fit.X_6F
 
     def jacobian(self, q: Floats) -> Floats:
         """Return w_BF [rad/s] over v_BF [m/s] in B per joint velocity, (6, n), at q (n,)."""
@@ -93,13 +93,13 @@ class RobotModel:
 
     def manipulability(self, q: Floats) -> Floats:
         """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985); 0 if singular."""
-        if self.ur is None:
+        if self.ur_fit is None:
             return self.chain.manipulability(q)
-        return kinematics.manipulability(q, self.ur.parameters)
+        return kinematics.manipulability(q, self.ur_fit.parameters)
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
         """Return the equivalents of q nearest to a reference, (..., n), see `JointRange`."""
-        return self.joints.unwrap(q, reference)
+        return self.joint_range.unwrap(q, reference)
 
 
 @lru_cache(maxsize=32)
@@ -113,7 +113,7 @@ def load_robot(spec: RobotSpec) -> RobotModel:
     joints = JointRange(_position_limits(spec, arm), arm.revolute)
     home = _home(spec, arm, joints)
     unlimited, jerk = [np.inf] * len(arm.joints), spec.limits.jerk
-    fit = _fitted(arm) if spec.ik == "ur" else None
+    fit = _fit_ur_arm(arm) if spec.ik == "ur" else None
     ik: InverseKinematics = NumericalInverseKinematics(arm.chain, joints, home)
     if fit is not None:
         ik = UrInverseKinematics(fit.parameters, joints, _inverse(fit.X_B0), _inverse(fit.X_6F))
@@ -123,16 +123,16 @@ def load_robot(spec: RobotSpec) -> RobotModel:
         spec,
         tuple(joint.name() for joint in arm.joints),
         joints,
-        _limits("velocity", spec.limits.velocity, arm, arm.limits["velocity"]),
-        _limits("acceleration", spec.limits.acceleration, arm, unlimited),
-        np.array(unlimited) if jerk is None else _limits("jerk", jerk, arm, unlimited),
-        _limits("torque", spec.limits.torque, arm, arm.limits["torque"]),
+        _joint_limits("velocity", spec.limits.velocity, arm, arm.limits["velocity"]),
+        _joint_limits("acceleration", spec.limits.acceleration, arm, unlimited),
+        np.array(unlimited) if jerk is None else _joint_limits("jerk", jerk, arm, unlimited),
+        _joint_limits("torque", spec.limits.torque, arm, arm.limits["torque"]),
         home,
-        arm.links,
+        arm.link_depths,
         arm.chain,
         fit,
         ik,
-        _UR_VERTICAL if fit is not None and _upright(spec, fit) else None,
+        _UR_VERTICAL_TOOL_ROWS if fit is not None and _has_vertical_axes(spec, fit) else None,
     )
 
 
@@ -154,14 +154,14 @@ def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
         found = np.array(spec.limits.position)
     for joint, (lower, upper) in zip(arm.joints, found, strict=True):
         if not np.isfinite([lower, upper]).all():
-            raise _missing("position", joint.name())
+            raise _missing_limit("position", joint.name())
         if not lower < upper:
             given = f"robot.limits.position: {lower:g}, {upper:g} for joint {joint.name()!r}"
             raise InputError(f"{given}; allowed is the least, then the greatest")
     return found
 
 
-def _limits(
+def _joint_limits(
     kind: str,
     given: tuple[float, ...] | None,
     arm: ParsedArm,
@@ -173,7 +173,7 @@ def _limits(
         return np.array(given)
     for joint, limit in zip(arm.joints, of_model, strict=True):
         if not 0 < limit < np.inf:
-            raise _missing(kind, joint.name())
+            raise _missing_limit(kind, joint.name())
     return np.array(of_model)
 
 
@@ -184,14 +184,14 @@ def _check_length(field: str, length: int, arm: ParsedArm) -> None:
         raise InputError(f"robot.{field}: {length} values; allowed is {allowed}")
 
 
-def _missing(kind: str, joint: str) -> InputError:
+def _missing_limit(kind: str, joint: str) -> InputError:
     allowed = "a value for each joint, here or in the model file"
     return InputError(f"robot.limits.{kind}: is missing for joint {joint!r}; allowed is {allowed}")
 
 
-def _fitted(arm: ParsedArm) -> UrFit:
+def _fit_ur_arm(arm: ParsedArm) -> UrFit:
     fit = fit_ur(arm.chain) if len(arm.joints) == 6 and arm.revolute.all() else None
-    if fit is None or not fit.error < _FITS:
+    if fit is None or not fit.error < _MAX_FIT_ERROR:
         off = f"{len(arm.joints)} joints" if fit is None else f"off by {fit.error:.2g} m"
         what = f"{arm.path.name} is no arm of the UR family: {off}"
         raise InputError(f"robot.ik: 'ur' ({what}); allowed is 'numerical'")
@@ -202,7 +202,7 @@ def _inverse(X: Floats | None) -> Floats | None:
     return None if X is None else np.asarray(np.linalg.inv(X))
 
 
-def _upright(spec: RobotSpec, fit: UrFit) -> bool:
+def _has_vertical_axes(spec: RobotSpec, fit: UrFit) -> bool:
     """Whether the first axis is vertical and the tool's axis that of the last joint."""
     X_TB = spec.X_TB.GetAsMatrix4()
     X_T0 = X_TB if fit.X_B0 is None else X_TB @ fit.X_B0

@@ -33,7 +33,7 @@ class SerialChain:
         """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
         q = np.asarray(q, float)
         rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
-        poses = _poses(self.fixed, self.revolute, rows)
+        poses = _forward_kinematics(self.fixed, self.revolute, rows)
         return np.asarray(poses.reshape(*q.shape[:-1], 4, 4))
 
     def joint_frames(self, q: Floats) -> Floats:
@@ -57,7 +57,7 @@ class SerialChain:
 
 
 @njit(cache=True)
-def _times(A, B, C):  # type: ignore[no-untyped-def]
+def _multiply_transforms(A, B, C):  # type: ignore[no-untyped-def]
     """Write the product of two rigid transforms into C, which is neither."""
     for i in range(3):
         for j in range(4):
@@ -83,7 +83,7 @@ def chain_frames(fixed, revolute, q, frames):  # type: ignore[no-untyped-def]
         else:
             for i in range(3):
                 moved[i, 3] += frames[k, i, 2] * q[k]
-        _times(moved, fixed[k + 1], frames[k + 1])
+        _multiply_transforms(moved, fixed[k + 1], frames[k + 1])
 
 
 @njit(cache=True)
@@ -104,7 +104,7 @@ def chain_jacobian(frames, revolute, J):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _poses(fixed, revolute, q):  # type: ignore[no-untyped-def]
+def _forward_kinematics(fixed, revolute, q):  # type: ignore[no-untyped-def]
     n = len(revolute)
     found, frames = np.empty((len(q), 4, 4)), np.empty((n + 1, 4, 4))
     for k in range(len(q)):

@@ -13,9 +13,9 @@ from drake_clutter.robots.ur_kinematics import DenavitHartenberg, forward_kinema
 
 Floats = NDArray[np.float64]
 
-_DIGITS = 12
+_LENGTH_DECIMALS = 12
 """Decimals of a length [m] that are kept: what lies below is rounding."""
-_SAMPLES = 50
+_NUM_SAMPLES = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +53,23 @@ def fit_ur(chain: SerialChain) -> UrFit:
     p = (frames[:, :3, 3] - X_B0[:3, 3]) @ X_B0[:3, :3]
     a2, a3 = p[2, 0] - p[1, 0], p[3, 0] - p[2, 0]
     d1, d4, d5, d6 = p[1, 2], -p[4, 1], p[1, 2] - p[5, 2], p[4, 1] - p[6, 1]
-    a2, a3, d1, d4, d5, d6 = (round(float(length), _DIGITS) for length in (a2, a3, d1, d4, d5, d6))
+    a2, a3, d1, d4, d5, d6 = (
+        round(float(length), _LENGTH_DECIMALS) for length in (a2, a3, d1, d4, d5, d6)
+    )
     alpha = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
     parameters = DenavitHartenberg((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), alpha)
     X_6F = np.linalg.inv(X_B0 @ forward_kinematics(np.zeros(6), parameters)) @ frames[6]
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, 6))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_NUM_SAMPLES, 6))
     closed = X_B0 @ forward_kinematics(q, parameters) @ X_6F
     error = np.abs(closed - chain.forward_kinematics(q)).max()
     usable = min(abs(a2), abs(a3), abs(d6)) > 1e-3
     return UrFit(
         parameters,
-        _unless_identity(X_B0),
-        _unless_identity(X_6F),
+        _none_if_identity(X_B0),
+        _none_if_identity(X_6F),
         float(error) if usable else np.inf,
     )
 
 
-def _unless_identity(X: Floats) -> Floats | None:
-    return None if np.abs(X - np.eye(4)).max() < 10.0**-_DIGITS * 10 else X
+def _none_if_identity(X: Floats) -> Floats | None:
+    return None if np.abs(X - np.eye(4)).max() < 10.0**-_LENGTH_DECIMALS * 10 else X

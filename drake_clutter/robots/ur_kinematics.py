@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-JOINTS = (
+UR_JOINT_NAMES = (
     "shoulder_pan_joint",
     "shoulder_lift_joint",
     "elbow_joint",
@@ -21,7 +21,7 @@ JOINTS = (
     "wrist_3_joint",
 )
 """In the order of q, everywhere."""
-_SINGULAR = 1e-7
+_SINGULAR_SINE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DenavitHartenberg:
     alpha: tuple[float, ...]
 
 
-UR10 = DenavitHartenberg(
+UR10_PARAMETERS = DenavitHartenberg(
     a=(0.0, -0.612, -0.5723, 0.0, 0.0, 0.0),
     d=(0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922),
     alpha=(np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0),
@@ -41,14 +41,14 @@ UR10 = DenavitHartenberg(
 """Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR10."""
 
 
-def after_joint(parameters: DenavitHartenberg, joint: int) -> Floats:
+def fixed_link_transform(parameters: DenavitHartenberg, joint: int) -> Floats:
     """(4, 4) Tz(d) Tx(a) Rx(alpha) of a joint, counted from 0: what its link adds once the joint has turned."""
     a, d, alpha = parameters.a[joint], parameters.d[joint], parameters.alpha[joint]
     c, s = np.round([np.cos(alpha), np.sin(alpha)], 15)
     return np.array([[1.0, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1]])
 
 
-def _turned(angle: Floats) -> Floats:
+def _rotations_about_z(angle: Floats) -> Floats:
     """(..., 4, 4) Rz of angles (...)."""
     X = np.zeros((*np.shape(angle), 4, 4))
     X[..., 0, 0] = X[..., 1, 1] = np.cos(angle)
@@ -58,41 +58,41 @@ def _turned(angle: Floats) -> Floats:
     return X
 
 
-def link_poses(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
+def link_poses(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floats:
     """X_B1 to X_B6, (..., 6, 4, 4), at joint angles q (..., 6) rad."""
     q = np.asarray(q, float)
     X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
     found = []
     for joint in range(6):
-        X = X @ _turned(q[..., joint]) @ after_joint(parameters, joint)
+        X = X @ _rotations_about_z(q[..., joint]) @ fixed_link_transform(parameters, joint)
         found.append(X)
     return np.stack(found, axis=-3)
 
 
-def forward_kinematics(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
+def forward_kinematics(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floats:
     """X_B6, (..., 4, 4), at joint angles q (..., 6) rad."""
     return np.asarray(link_poses(q, parameters)[..., -1, :, :])
 
 
-def jacobian(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
+def jacobian(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floats:
     """(6, 6): w_B6 over v_B6, rad/s and m/s, from joint velocities, rad/s, at q (6,) rad."""
     X = np.concatenate([np.eye(4)[None], link_poses(q, parameters)])
     axes, p_B6 = X[:-1, :3, 2], X[-1, :3, 3]
     return np.vstack([axes.T, np.cross(axes, p_B6 - X[:-1, :3, 3]).T])
 
 
-def manipulability(q: Floats, parameters: DenavitHartenberg = UR10) -> Floats:
+def manipulability(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floats:
     """(...) |det J|, m^3, at joint angles (..., 6) rad (Yoshikawa 1985); 0 in a singular configuration.
 
     The reach of the wrist in the arm's plane, times the elbow's and the wrist's bend: the determinant of an arm of the UR family.
     """
     _, a2, a3 = parameters.a[:3]
     return np.asarray(
-        np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * _reach(q, parameters))
+        np.abs(a2 * a3 * np.sin(q[..., 2]) * np.sin(q[..., 4]) * _wrist_reach(q, parameters))
     )
 
 
-def _reach(q: Floats, parameters: DenavitHartenberg) -> Floats:
+def _wrist_reach(q: Floats, parameters: DenavitHartenberg) -> Floats:
     """Return the wrist's coordinate along the arm's plane, (...), at joint angles (..., 6) [m]."""
     _, a2, a3 = parameters.a[:3]
     in_plane = np.cumsum(q[..., 1:4], axis=-1)
@@ -100,36 +100,38 @@ def _reach(q: Floats, parameters: DenavitHartenberg) -> Floats:
     return np.asarray(bars + parameters.d[4] * np.sin(in_plane[..., 2]))
 
 
-def branch_of(q: Floats, parameters: DenavitHartenberg) -> int:
+def branch_index(q: Floats, parameters: DenavitHartenberg) -> int:
     """Return the number of the branch, see `branches`, on which joint angles (6,) are [rad]."""
-    turned_back = _reach(q, parameters) > 0, np.sin(q[4]) < 0, np.sin(q[2]) < 0
+    turned_back = _wrist_reach(q, parameters) > 0, np.sin(q[4]) < 0, np.sin(q[2]) < 0
     return int(np.dot(turned_back, (4, 2, 1)))
 
 
 def inverse_kinematics(
-    X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10
+    X_B6: Floats, singular_wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10_PARAMETERS
 ) -> Floats:
     """All joint angles that reach a pose, see `branches`.
 
     Args:
         X_B6: (4, 4), of the flange.
-        wrist_3: rad, taken where wrist 2 is straight, so that the last joint is free.
+        singular_wrist_3: rad, taken where wrist 2 is straight, so that the last joint is free.
         parameters: of the arm.
 
     Returns:
         (n, 6) rad, within -pi to pi, n up to 8; none if it is out of reach. Branches that coincide are repeated.
     """
-    found = branches(X_B6, wrist_3, parameters)
+    found = ik_branches(X_B6, singular_wrist_3, parameters)
     return found[np.isfinite(found[:, 0])]
 
 
-def branches(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10) -> Floats:
+def ik_branches(
+    X_B6: Floats, singular_wrist_3: float = 0.0, parameters: DenavitHartenberg = UR10_PARAMETERS
+) -> Floats:
     """The joint angles that reach poses, branch by branch (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots
     UR-5/UR-10 arms").
 
     Args:
         X_B6: (..., 4, 4), of the flange.
-        wrist_3: rad, taken where wrist 2 is straight, so that the last joint is free.
+        singular_wrist_3: rad, taken where wrist 2 is straight, so that the last joint is free.
         parameters: of an arm of the UR family.
 
     Returns:
@@ -145,12 +147,12 @@ def branches(X_B6: Floats, wrist_3: float = 0.0, parameters: DenavitHartenberg =
         parameters.d[5],
     )
     return np.asarray(
-        _branches(X.reshape(-1, 4, 4), wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6)
+        _ik_branches(X.reshape(-1, 4, 4), singular_wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6)
     )
 
 
 @njit(cache=True)
-def _branches(X_B6, wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped-def]
+def _ik_branches(X_B6, singular_wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped-def]
     found = np.full((len(X_B6), 8, 6), np.nan)
     for k in range(len(X_B6)):
         X = X_B6[k]
@@ -178,7 +180,11 @@ def _branches(X_B6, wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped
             s5 = np.sin(q5)
             # The axis of joint 2 (and 3, and 4), along x and y of the flange.
             along_x, along_y = X[0, 0] * s1 - X[1, 0] * c1, X[0, 1] * s1 - X[1, 1] * c1
-            q6 = np.arctan2(-along_y / s5, along_x / s5) if abs(s5) > _SINGULAR else wrist_3
+            q6 = (
+                np.arctan2(-along_y / s5, along_x / s5)
+                if abs(s5) > _SINGULAR_SINE
+                else singular_wrist_3
+            )
             # In the plane, whose x is c1, s1 and whose y is up: frame 4 is d5 behind frame 5 along its y.
             s6, c6 = np.sin(q6), np.cos(q6)
             u, v, w = (

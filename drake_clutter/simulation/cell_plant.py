@@ -18,9 +18,9 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
-from drake_clutter.robots.model_file import parse_model
+from drake_clutter.robots.model_parsing import parse_model
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.robots.robot_plant import PEDESTAL, add_robot, filter_collisions
+from drake_clutter.robots.robot_plant import PEDESTAL_NAME, add_robot, filter_collisions
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def add_work_cell(
     pedestal = cell.pedestal
     if pedestal is not None:
         X_TS, size = pedestal
-        _add_solid(plant, PEDESTAL, X_TS, Box(*size), _GREY)
+        _add_solid(plant, PEDESTAL_NAME, X_TS, Box(*size), _GREY)
     filter_collisions(plant, scene_graph, model, robot)
     bodies = _bodies(plant, robot, tool)
     cup = plant.GetFrameByName("cup", tool)

@@ -12,7 +12,7 @@ mass is assumed.
 import math
 
 from drake_clutter.cell.primitives import Rod
-from drake_clutter.robots.ur_kinematics import UR10
+from drake_clutter.robots.ur_kinematics import UR10_PARAMETERS
 from ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
 from ur_family import JOINT_RANGE as JOINT_RANGE
 
@@ -107,7 +107,9 @@ LINKS = (
 )
 BASE_OUTLINE = (Rod((0.0, -0.0247, 0.0091), (0.0, 0.0245, 0.0083), 0.0825),)
 BASE_LOOKS = (Rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.0380), 0.0750, JOINT),)
-UR10_ARM = UrArm("ur10", UR10, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "models/generators/ur10.py")
+UR10_ARM = UrArm(
+    "ur10", UR10_PARAMETERS, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "models/generators/ur10.py"
+)
 
 
 def ur10_sdf() -> str:

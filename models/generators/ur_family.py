@@ -11,7 +11,11 @@ import numpy as np
 
 from arm_sdf import ArmLink, arm_sdf
 from drake_clutter.cell.primitives import Point, Rod
-from drake_clutter.robots.ur_kinematics import JOINTS, DenavitHartenberg, after_joint
+from drake_clutter.robots.ur_kinematics import (
+    UR_JOINT_NAMES,
+    DenavitHartenberg,
+    fixed_link_transform,
+)
 
 JOINT_RANGE = 2 * math.pi
 """Greatest angle of all joints, either way [rad] (data sheets)."""
@@ -70,8 +74,8 @@ def ur_sdf(arm: UrArm) -> str:
     p_BCm = np.array([0.0, 0.0, arm.base_looks[-1].end[2] / 2])
     made = [ArmLink("base", arm.base_mass, p_BCm, arm.base_outline, arm.base_looks)]
     X_PL = np.eye(4)
-    for number, (joint, link) in enumerate(zip(JOINTS, arm.links, strict=True)):
-        X_LDh = after_joint(arm.parameters, number)
+    for number, (joint, link) in enumerate(zip(UR_JOINT_NAMES, arm.links, strict=True)):
+        X_LDh = fixed_link_transform(arm.parameters, number)
         p_LCm = X_LDh[:3, :3] @ np.array(link.p_DhCm) + X_LDh[:3, 3]
         shape = link.mass, p_LCm, link.outline, link.looks
         made.append(ArmLink(link.name, *shape, joint, X_PL, JOINT_RANGE, link.torque, link.speed))

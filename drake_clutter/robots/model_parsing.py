@@ -12,7 +12,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
-from drake_clutter.robots.stl import stl_as_obj
+from drake_clutter.robots.stl_conversion import convert_stl_to_obj
 
 PACKAGE = "drake_clutter_models"
 """Name of the package whose files ship as `models/`."""
@@ -20,7 +20,7 @@ _DRAKE = "drake.mit.edu"
 """Namespace of Drake's own elements and attributes."""
 
 
-def model_path(model: str, field: str = "robot.model") -> Path:
+def resolve_model_path(model: str, field: str = "robot.model") -> Path:
     """Return the file of a model.
 
     Args:
@@ -38,7 +38,7 @@ def model_path(model: str, field: str = "robot.model") -> Path:
     return path
 
 
-def package_map(path: Path) -> PackageMap:
+def find_packages(path: Path) -> PackageMap:
     """Return the packages that a model file may name.
 
     Those of ROS_PACKAGE_PATH, that of the next folder above with a package.xml, and
@@ -55,7 +55,7 @@ def package_map(path: Path) -> PackageMap:
 
 
 @lru_cache(maxsize=32)
-def model_text(path: Path, *, visuals: bool) -> str:
+def read_model_text(path: Path, *, visuals: bool) -> str:
     """Return a model that is not static, with absolute paths of its meshes, for Drake's parser.
 
     Drake parses a text in a few milliseconds, and the file that it came from in sixty.
@@ -67,23 +67,23 @@ def model_text(path: Path, *, visuals: bool) -> str:
     Raises:
         InputError: The file is not XML, or a mesh that it names is missing.
     """
-    root = _root(path)
+    root = _read_xml(path)
     for link in root.iter("link"):
         for visual in () if visuals else link.findall("visual"):
             link.remove(visual)
     for model in root.iter("model"):
         for static in model.findall("static"):
             model.remove(static)  # else it is fixed to the world's origin
-    packages = package_map(path)
+    packages = find_packages(path)
     for mesh in root.iter("mesh"):
         if (uri := mesh.find("uri")) is not None:
-            uri.text = _mesh_file(path, (uri.text or "").strip(), packages).as_uri()
+            uri.text = _resolve_mesh(path, (uri.text or "").strip(), packages).as_uri()
         elif filename := mesh.get("filename"):
-            mesh.set("filename", _mesh_file(path, filename, packages).as_uri())
+            mesh.set("filename", _resolve_mesh(path, filename, packages).as_uri())
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _root(path: Path) -> ElementTree.Element:
+def _read_xml(path: Path) -> ElementTree.Element:
     ElementTree.register_namespace("drake", _DRAKE)  # else the prefix is renamed
     try:
         text = path.read_text(encoding="utf-8")
@@ -94,7 +94,7 @@ def _root(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: is not XML ({error}); allowed is an SDF or URDF") from error
 
 
-def _mesh_file(path: Path, uri: str, packages: PackageMap) -> Path:
+def _resolve_mesh(path: Path, uri: str, packages: PackageMap) -> Path:
     scheme, _, rest = uri.partition("://")
     package, _, inside = rest.partition("/")
     if scheme in ("package", "model") and packages.Contains(package):
@@ -104,7 +104,7 @@ def _mesh_file(path: Path, uri: str, packages: PackageMap) -> Path:
     if not file.is_file():
         raise InputError(f"{path}: mesh: {uri!r} is missing; allowed is a file")
     file = file.resolve()
-    return stl_as_obj(file) if file.suffix.lower() == ".stl" else file
+    return convert_stl_to_obj(file) if file.suffix.lower() == ".stl" else file
 
 
 def parse_model(
@@ -119,8 +119,8 @@ def parse_model(
     Raises:
         InputError: The file is missing or damaged, or does not hold one model.
     """
-    path = model_path(model, field)
-    text = model_text(path, visuals=visuals)
+    path = resolve_model_path(model, field)
+    text = read_model_text(path, visuals=visuals)
     try:
         parser = Parser(plant)
         parser.SetAutoRenaming(True)  # of a second model of one name
@@ -133,23 +133,23 @@ def parse_model(
     return instances[0]
 
 
-def mimicking_joint(path: Path) -> str | None:
+def find_mimic_joint(path: Path) -> str | None:
     """Return the name of a joint of a model file that follows another one; None: it has none."""
-    joints = _root(path).iter("joint")
+    joints = _read_xml(path).iter("joint")
     return next(
         (joint.get("name", "") for joint in joints if joint.find(".//mimic") is not None), None
     )
 
 
 @lru_cache(maxsize=32)
-def torque_limits(path: Path) -> dict[str, float]:
+def read_torque_limits(path: Path) -> dict[str, float]:
     """Return the largest torque [N m] or force [N] of the joints of a model file, by name.
 
     Drake reads them from a URDF only if it has transmissions, which many have not. A joint without
     a value, or with 0, is missing here.
     """
     found = {}
-    for joint in _root(path).iter("joint"):
+    for joint in _read_xml(path).iter("joint"):
         limit = joint.find("limit") if joint.find("limit") is not None else joint.find("axis/limit")
         text = None if limit is None else limit.get("effort") or limit.findtext("effort")
         if text is not None and 0 < float(text) < math.inf:
