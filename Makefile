@@ -24,7 +24,7 @@ test-any:
 
 docs: .venv/installed
 	.venv/bin/pdoc -d google drake_clutter -o out/api
-	.venv/bin/python -m drake_clutter.reports.diagram_picture docs/images/closed_loop.svg
+	.venv/bin/python -m drake_clutter.reports.diagram_drawing docs/images/closed_loop.svg
 
 .venv/locked: requirements.lock
 	$(PYTHON) -m venv --clear .venv

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate import JOB_FILE, PROGRESS_FILE, SCENES
+from drake_clutter.commands.generate_scenes import JOB_FILE, PROGRESS_FILE, SCENES_FOLDER
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
@@ -38,7 +38,7 @@ def counted(folder: Path) -> dict[str, Any]:
     counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
     answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(answers):
-        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalog)
+        file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         if file.verdict is not None and file.verdict.stable:
             counts[
                 judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value

@@ -24,7 +24,7 @@ from rich.table import Table
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.explore import explore
+from drake_clutter.commands.explore_scene import explore_scene
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import resource_path
@@ -87,7 +87,7 @@ def measure(
     episodes = list[dict[str, Any]]()
     for number in track(EPISODES[1], "episodes", console=Console(stderr=True)):
         start = time.perf_counter()
-        task = explore(
+        task = explore_scene(
             _frozen(number, config), EPISODES[2], "arm", 20, number, config, lambda _: None
         )
         episodes.append(

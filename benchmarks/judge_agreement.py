@@ -33,7 +33,7 @@ from benchmarks.collect_drake_verdicts import (
     settled_scene,
 )
 from drake_clutter.files import write_json
-from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import (
     InconclusiveReason,
@@ -297,7 +297,7 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
             seen.add(kind)
             chosen.append(item)
     chosen = sorted(chosen, key=lambda item: item.fast != "stable")[:SHOWN]
-    camera = PictureCamera()
+    camera = SceneRenderer()
     figure, axes = plt.subplots(2, SHOWN // 2, figsize=(14, 8.4), layout="constrained")
     for axis in axes.flat:
         axis.set_axis_off()
@@ -306,7 +306,7 @@ def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
         centred = tuple(
             replace(o, X_TO=o.X_TO.translated((-x, -y, 0.0))) for o in item.objects.objects
         )
-        picture = camera.oblique(replace(item.objects, objects=centred, graph=None))
+        picture = camera.render_oblique(replace(item.objects, objects=centred, graph=None))
         axis.imshow(picture[110:510, 290:690])
         axis.set_title(f"fast: {item.fast}\nDrake: {item.drake}", fontsize=13)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,11 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.reports.arm_pictures import arm_moments, quarter_turn_to_base, strip
+from drake_clutter.reports.filmstrip import (
+    render_filmstrip,
+    rotation_to_base_side,
+    select_key_frames,
+)
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
@@ -260,13 +264,13 @@ def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path
     motion = StationSimulation(DEFAULT_CELL, SCENE).execute(plan, record=True).motion
     assert motion[0].arm is not None
     assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)
-    moments = arm_moments(motion, "sugar_box")
+    moments = select_key_frames(motion, "sugar_box")
     times = [frame.time for frame in moments]
     assert times == sorted(times)
     assert moments[0].poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.01)
     assert moments[1].poses["sugar_box"].p[2] > 0.1
     assert moments[2].poses["sugar_box"].p[:2] == pytest.approx(PLACE.p[:2], abs=0.005)
-    picture = strip(SCENE, moments, DEFAULT_CELL)
+    picture = render_filmstrip(SCENE, moments, DEFAULT_CELL)
     assert picture.shape == (480, 4 * 480, 3)
     quarters = np.split(picture.astype(int), 4, axis=1)
     assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"
@@ -282,12 +286,12 @@ def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path
 
 
 def test_pictures_are_taken_from_where_the_arm_is_not_in_the_way() -> None:
-    assert quarter_turn_to_base(DEFAULT_CELL).tolist() == np.eye(3).tolist()
-    other_side = quarter_turn_to_base(cell_with("robot.base.x=0.65"))
+    assert rotation_to_base_side(DEFAULT_CELL).tolist() == np.eye(3).tolist()
+    other_side = rotation_to_base_side(cell_with("robot.base.x=0.65"))
     assert (other_side @ [-1.0, 0.0, 0.0]).tolist() == [1.0, 0.0, 0.0]
-    beside = quarter_turn_to_base(cell_with("robot.base.x=0.1", "robot.base.y=-0.65"))
+    beside = rotation_to_base_side(cell_with("robot.base.x=0.1", "robot.base.y=-0.65"))
     assert (beside @ [-1.0, 0.0, 0.0]).tolist() == [0.0, -1.0, 0.0]
-    above = quarter_turn_to_base(cell_with("robot.base.x=0.0", "robot.base.y=0.0"))
+    above = rotation_to_base_side(cell_with("robot.base.x=0.0", "robot.base.y=0.0"))
     assert above.tolist() == np.eye(3).tolist()
 
 

@@ -17,7 +17,7 @@ from drake_clutter.cell.camera import Camera, pixel_grid
 from drake_clutter.cell.pinhole import backproject, in_camera, pose_in_camera, project
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.commands.render import render_scene
+from drake_clutter.commands.render_scene import render_scene
 from drake_clutter.config import upgrade
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
@@ -25,7 +25,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.perception.pose_fit import PoseFitter, pose_error
 from drake_clutter.perception.pose_selection import evaluate_pose
 from drake_clutter.perception.segmentation import ImageWindow
-from drake_clutter.reports.detections_picture import SIDE, detections_picture
+from drake_clutter.reports.detection_image import IMAGE_SIDE, draw_detections
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.occlusion import occluded_boxes
 from drake_clutter.scenes.placement import has_clear_top, is_observed_free
@@ -241,8 +241,8 @@ def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
 
 
 def test_detections_are_drawn(tilted: LabelDetector) -> None:
-    picture = detections_picture(tilted.perceive(SCENES["laid out"]).observation)
-    assert picture.shape == (SIDE, SIDE, 3)
+    picture = draw_detections(tilted.perceive(SCENES["laid out"]).observation)
+    assert picture.shape == (IMAGE_SIDE, IMAGE_SIDE, 3)
 
 
 # --- What is free, and what is unseen ---

@@ -204,7 +204,7 @@ def test_evaluate_knows_the_frozen_sets_by_name() -> None:
         "evaluate",
         "--scenes",
         "sg_star_10",
-        "--count",
+        "--max-scenes",
         "2",
         "--agents",
         "largest-clear",

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.cli import app
+from drake_clutter.cli.config_from_options import load_config_from_options
 from drake_clutter.cli.run import _load_scenario
-from drake_clutter.cli.world import load_world
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene_file import load_scene, save_scene
@@ -183,7 +183,7 @@ def test_a_model_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mo
     """Options name it from the folder of the command; what is written has its absolute path."""
     monkeypatch.chdir(tmp_path)
     Path("arm.sdf").write_text(resource_path("models/robots/ur10.sdf").read_text())
-    world = load_world(None, None, ["robot.model=arm.sdf"])
+    world = load_config_from_options(None, None, ["robot.model=arm.sdf"])
     assert world.cell.robot.model == str(tmp_path / "arm.sdf")
 
 
@@ -191,7 +191,7 @@ def test_a_config_goes_over_the_cell(tmp_path: Path) -> None:
     """In all commands; here one of version 0.1."""
     config = tmp_path / "config.yaml"
     config.write_text("{layout: {tray_side: 0.5}, camera: {altitude: 1.4}}")
-    world = load_world(config, UR5E, ["robot.base.z=0.35"])
+    world = load_config_from_options(config, UR5E, ["robot.base.z=0.35"])
     assert world.cell.robot.model == load_cell(UR5E).robot.model
     assert world.cell.robot.base.translation[2] == 0.35
     assert world.cell.support.size == (0.5, 0.5)
@@ -203,6 +203,7 @@ def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> 
     other = tmp_path / "other" / UR5E.name
     other.write_text(config_yaml(load_cell(UR5E)))
     with pytest.raises(
-        InputError, match="--cell, --arm: ur5e_epick_tray is there twice; allowed are files"
+        InputError,
+        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are files",
     ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

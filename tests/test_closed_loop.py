@@ -12,8 +12,8 @@ from pydrake.systems.framework import Context
 
 from drake_clutter.agents.exploration import largest_clear
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.commands.run import play, write
-from drake_clutter.commands.run import scene_of as scenario_scene
+from drake_clutter.commands.run_scenario import load_or_generate_scene as scenario_scene
+from drake_clutter.commands.run_scenario import run_closed_loop, write_scenario_results
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
 from drake_clutter.files import InputError
 from drake_clutter.planning.pick_place_plan import (
@@ -233,7 +233,9 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert task.end is EpisodeEnd.ALL_FOUND
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
     assert 3 < timing.robot < 15
-    fields = write(tmp_path, Scenario(agent="largest-clear"), task, timing, "A test")
+    fields = write_scenario_results(
+        tmp_path, Scenario(agent="largest-clear"), task, timing, "A test"
+    )
     assert (fields["success"], fields["ended"]) == (True, "all found")
     assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
     assert {path.name for path in tmp_path.iterdir()} >= {
@@ -258,7 +260,7 @@ def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfi
 
 
 def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:
-    task, _ = play(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
+    task, _ = run_closed_loop(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
     assert task.end is EpisodeEnd.ALL_FOUND
 
 
@@ -281,7 +283,7 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
 
 
 def test_a_random_explorer_plays(config: ClutterConfig) -> None:
-    task, timing = play(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
+    task, timing = run_closed_loop(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
     assert len(task.steps) == 1
     assert timing.robot > 0
 

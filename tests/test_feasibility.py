@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
-from drake_clutter.commands import feasibility as command
+from drake_clutter.commands import feasibility_job as command
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
@@ -162,7 +162,9 @@ def test_the_map_covers_the_support_and_no_more() -> None:
 def test_all_moves_are_in_the_picture_over_the_support() -> None:
     row = {"setup": "it", "result": PLANNED}
     moves = [row | {"pick_x": 0.1, "pick_y": 0.45}, row | {"pick_x": -0.14, "pick_y": -0.4}]
-    figure = feasibility_report._over_tray(moves, {"it": cell_with("support.size=[0.3, 1.0]")})
+    figure = feasibility_report._plot_by_pick_position(
+        moves, {"it": cell_with("support.size=[0.3, 1.0]")}
+    )
     (panel, _) = figure.axes
     assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
     assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
@@ -171,7 +173,7 @@ def test_all_moves_are_in_the_picture_over_the_support() -> None:
 
 def test_another_base_keeps_the_roll_and_pitch_of_the_cell_s() -> None:
     hanging = cell_with("robot.base.roll=180")
-    (cell,) = command.setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
+    (cell,) = command.make_setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
     assert cell.robot.base.translation == (0.1, -0.2, 1.4)
     assert cell.robot.base.rpy_deg == (180.0, 0.0, 30.0)
 
@@ -203,11 +205,11 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "BASE_X", [-0.8, -0.6])
-    monkeypatch.setattr(command, "BASE_Y", [0.0, 0.2])
-    monkeypatch.setattr(command, "SPACING", 0.3)
-    monkeypatch.setattr(command, "HEIGHTS", (0.05, 0.3))
-    monkeypatch.setattr(feasibility_report, "WORST", 1)
+    monkeypatch.setattr(command, "BASE_GRID_X", [-0.8, -0.6])
+    monkeypatch.setattr(command, "BASE_GRID_Y", [0.0, 0.2])
+    monkeypatch.setattr(command, "MAP_SPACING", 0.3)
+    monkeypatch.setattr(command, "MAP_HEIGHTS", (0.05, 0.3))
+    monkeypatch.setattr(feasibility_report, "CASES_PER_KIND", 1)
     monkeypatch.setattr(tasks_feasibility, "NOISY_MOVES", 1)
 
 
@@ -231,7 +233,7 @@ def test_a_study_from_the_command_line(
         str(out),
         "--base=-0.7,0,0.3,0",
         "--tray=0.65,0,-0.3,0",
-        "--arm",
+        "--cell-override",
         str(small),
     ]
     told = CliRunner().invoke(app, [*arguments, "--targets", str(targets), "--json"])
@@ -267,7 +269,7 @@ def test_a_study_from_the_command_line(
     assert "http:" not in page
     assert "https:" not in page
     # What is done is not done again, and what is missing is.
-    monkeypatch.setattr(command, "write_report", lambda *_: None)
+    monkeypatch.setattr(command, "write_feasibility_report", lambda *_: None)
     before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
     (gone := next(path for path in (out / "parts").iterdir() if "scene_0001" in path.name)).unlink()
     told = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])
@@ -289,7 +291,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     arguments = ["feasibility", str(tmp_path / "pile.yaml"), "--out", str(out)]
     names = ["iiwa14_epick_tray", "ur5e_epick_tray", "ur10e_epick_tray"]
     for name in names:
-        option = "--cell" if name == names[-1] else "--arm"
+        option = "--cell" if name == names[-1] else "--cell-override"
         arguments += [option, str(resource_path(f"models/cells/{name}.yaml"))]
     told = CliRunner().invoke(app, arguments)
     assert told.exit_code == 0, told.output
@@ -309,7 +311,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
-    (one,) = command.setups([], [[0.4, 0.5, -0.3, 30.0]], [], DEFAULT_CELL).values()
+    (one,) = command.make_setups([], [[0.4, 0.5, -0.3, 30.0]], [], DEFAULT_CELL).values()
     X_BT = one.robot.X_TB.inverse().GetAsMatrix4()
     assert X_BT[:3, 3] == pytest.approx([0.4, 0.5, -0.3])
     assert math.degrees(math.atan2(X_BT[1, 0], X_BT[0, 0])) == pytest.approx(30.0)
@@ -359,13 +361,13 @@ def test_arms_that_are_none(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        command.setups([], [], [path], DEFAULT_CELL)
+        command.make_setups([], [], [path], DEFAULT_CELL)
 
 
 def test_an_arm_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
-    found: dict[str, Any] = command.setups([], [], [path], DEFAULT_CELL)
+    found: dict[str, Any] = command.make_setups([], [], [path], DEFAULT_CELL)
     assert found == {
         "long": cell_with(
             *[

@@ -14,12 +14,12 @@ from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, TILE, write_contact_sheet
-from drake_clutter.reports.detections_picture import detections_picture
-from drake_clutter.reports.diagram_picture import connections, draw_diagram
+from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, TILE_SIZE, write_contact_sheet
+from drake_clutter.reports.detection_image import draw_detections
+from drake_clutter.reports.diagram_drawing import connection_graph, draw_diagram
 from drake_clutter.reports.episode_page import write_episode_page
-from drake_clutter.reports.pictures import Mark, Marks, humanised
 from drake_clutter.reports.recording import FRAMES_PER_SECOND, episode_frames, write_recording
+from drake_clutter.reports.scene_images import Annotations, Highlight, display_name
 from drake_clutter.scenes.interfaces import (
     Instability,
     InstabilityReason,
@@ -141,23 +141,23 @@ def test_pictures_have_their_size_and_show_something(folder: Path) -> None:
 
 
 def test_hidden_and_found_objects_are_marked(folder: Path) -> None:
-    def pixels(name: str, mark: Mark) -> int:
+    def pixels(name: str, mark: Highlight) -> int:
         colour = [int(mark.value[i : i + 2], 16) for i in (1, 3, 5)]
         with Image.open(folder / "images" / name) as picture:
             return int((np.abs(np.asarray(picture, int) - colour).max(axis=2) < 3).sum())
 
-    assert pixels("start_overhead.png", Mark.HIDDEN) > 500
-    assert pixels("start_overhead.png", Mark.MOVED) == 0
-    assert pixels("move_01_before.png", Mark.MOVED) > 500
-    assert pixels("move_01_after.png", Mark.FOUND) > 500
-    assert pixels("move_01_after.png", Mark.HIDDEN) == 0
-    assert pixels("move_03_after.png", Mark.FALLEN) > 500
+    assert pixels("start_overhead.png", Highlight.HIDDEN) > 500
+    assert pixels("start_overhead.png", Highlight.MOVED) == 0
+    assert pixels("move_01_before.png", Highlight.MOVED) > 500
+    assert pixels("move_01_after.png", Highlight.FOUND) > 500
+    assert pixels("move_01_after.png", Highlight.HIDDEN) == 0
+    assert pixels("move_03_after.png", Highlight.FALLEN) > 500
 
 
 def test_what_fell_is_marked_as_fallen_even_if_it_was_moved() -> None:
-    assert Marks(fallen=("a",), moved="a").of("a") is Mark.FALLEN
-    assert Marks(found=("a",), moved="a").of("a") is Mark.MOVED
-    assert Marks().of("a") is Mark.IN_VIEW
+    assert Annotations(fallen=("a",), moved="a").highlight("a") is Highlight.FALLEN
+    assert Annotations(found=("a",), moved="a").highlight("a") is Highlight.MOVED
+    assert Annotations().highlight("a") is Highlight.VISIBLE
 
 
 def test_the_recording_is_one_file_that_moves(folder: Path, tmp_path: Path) -> None:
@@ -224,8 +224,8 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
     assert f"it knew 2 of {len(task.scene.objects)} objects" in text
     assert text.index("60%") < text.index("40%")
-    assert f"Passed over, as there was no room for it: {humanised(other)}." in text
-    assert f"What it knew{humanised(other)}, {humanised(step.move.pick)}." in text
+    assert f"Passed over, as there was no room for it: {display_name(other)}." in text
+    assert f"What it knew{display_name(other)}, {display_name(step.move.pick)}." in text
 
 
 def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> 
     picture = np.asarray(Image.open(tmp_path / "images/move_01_seen.png"))
     assert picture.shape == (720, 720, 3)
     assert "recognised in it: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()
-    unseen = detections_picture(replace(seen, detections=()))
+    unseen = draw_detections(replace(seen, detections=()))
     assert (picture != unseen).any(axis=2).mean() > 0.01, "outlines and labels"
     assert (unseen[:40, :40] == unseen[0, 0]).all(), "the tray's floor"
 
@@ -248,13 +248,13 @@ def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> N
         tmp_path / "sheet.png", [(picture, f"{i:04d}  hidden 2", i != 1) for i in range(count)]
     )
     with Image.open(tmp_path / "sheet.png") as sheet:
-        gap = sheet.width - columns * TILE[0]
-        assert sheet.size == (columns * TILE[0] + gap, rows * TILE[1] + gap)
+        gap = sheet.width - columns * TILE_SIZE[0]
+        assert sheet.size == (columns * TILE_SIZE[0] + gap, rows * TILE_SIZE[1] + gap)
         assert 0 < gap < 20
         red, green, _ = sheet.convert("RGB").getpixel((gap + 1, gap + 1))  # type: ignore[misc]
         assert green > red
         if count > 1:
-            red, green, _ = sheet.convert("RGB").getpixel((gap + TILE[0] + 1, gap + 1))  # type: ignore[misc]
+            red, green, _ = sheet.convert("RGB").getpixel((gap + TILE_SIZE[0] + 1, gap + 1))  # type: ignore[misc]
             assert red > green
 
 
@@ -276,7 +276,7 @@ def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> Non
     builder.Connect(back.get_output_port(), there.get_input_port())
     diagram = builder.Build()
     ports = {"ports": ["y → u"]}
-    assert list(connections(diagram).edges(data=True)) == [
+    assert list(connection_graph(diagram).edges(data=True)) == [
         ("there", "back", ports),
         ("back", "there", ports),
     ]
@@ -286,5 +286,5 @@ def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> Non
 
 
 def test_humanised() -> None:
-    assert humanised("sugar_box_3") == "Sugar box 3"
-    assert humanised("hidden_at_start") == "Hidden at start"
+    assert display_name("sugar_box_3") == "Sugar box 3"
+    assert display_name("hidden_at_start") == "Hidden at start"

@@ -76,7 +76,7 @@ def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
     write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], CELL)
     scene, cell, ((_, frames),) = read_trajectories(path, load_catalog())
     assert cell == CELL
-    _, _, drawn_at = recording._shown(scene, cell, arm=True)
+    _, _, drawn_at = recording._build_viewer(scene, cell, arm=True)
     for frame, poses in zip(frames, simulated, strict=True):
         assert frame.arm is not None
         drawn = drawn_at(frame.arm.q)

@@ -5,8 +5,8 @@ import pytest
 from drake_clutter.agents.backends import backends
 from drake_clutter.agents.exploration import largest_clear
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.commands.run import play as play_loop
-from drake_clutter.commands.run import scene_of
+from drake_clutter.commands.run_scenario import load_or_generate_scene
+from drake_clutter.commands.run_scenario import run_closed_loop as play_loop
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import MoveResult
@@ -23,7 +23,7 @@ SCENARIO = Scenario(generator="random", nodes=8, agent="largest-clear", max_move
 @pytest.fixture(scope="module")
 def generated() -> Scene:
     """A scene at rest in which the tilted camera does not see something."""
-    return scene_of(SCENARIO)[0]
+    return load_or_generate_scene(SCENARIO)[0]
 
 
 @pytest.mark.parametrize("fidelity", ["fast", "settle", "arm"])

@@ -11,7 +11,7 @@ from pydrake.math import RollPitchYaw
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pose import PoseSpec
 from drake_clutter.cell.support_sdf import support_sdf
-from drake_clutter.commands.render import render_scene
+from drake_clutter.commands.render_scene import render_scene
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import PickPlacePlan

@@ -30,7 +30,7 @@ from drake_clutter.config import ClutterConfig, upgrade_head
 from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.learning.shipped import weights_of
 from drake_clutter.records import resume_jsonl
-from drake_clutter.reports.in_words import in_words
+from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import bootstrap_ratio_interval
@@ -186,7 +186,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
         }
         ratios = {f"to {name}": row.get(f"moves_to_{name}") for name in COMPARED}
         end = {name: "" if ratio is None else f"{ratio:.2f}" for name, ratio in ratios.items()}
-        told += [begin | cells | end for cells in in_words(row, LIMITS)]
+        told += [begin | cells | end for cells in evaluation_table_rows(row, LIMITS)]
     table = Table(*told[0])
     for cells in told:
         table.add_row(*cells.values())

@@ -24,7 +24,7 @@ from rich.table import Table
 
 from drake_clutter.agents.generation import TRAINED, GenerationJob
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate import SCENES, generate
+from drake_clutter.commands.generate_scenes import SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, write_json
 from drake_clutter.resources import git_commit, resource_path
@@ -79,11 +79,11 @@ def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return track(made, row.folder, total=total, completed=done, console=Console(stderr=True))
 
-    summary = generate(job, row.count, folder, workers, progress)
+    summary = generate_scenes(job, row.count, folder, workers, progress)
     catalog, judge = load_catalog(), FastJudge(job.config)
     confusion: Counter[str] = Counter()
     heights: Counter[int] = Counter()
-    for path in sorted((folder / SCENES).iterdir())[: row.count]:
+    for path in sorted((folder / SCENES_FOLDER).iterdir())[: row.count]:
         file = load_scene(path, catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None

@@ -23,7 +23,7 @@ from rich.progress import track
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate import PROGRESS_FILE, SCENES, generate
+from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.grammar import canonical_form
@@ -51,7 +51,7 @@ def judged_by_drake(folder: Path) -> Iterator[SceneRecord]:
     catalog = load_catalog()
     solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(solvable):
-        file = load_scene(folder / SCENES / f"{index:04d}.yaml", catalog)
+        file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None
         if file.verdict.stable and file.verdict.hidden:
@@ -171,7 +171,7 @@ def main(
         judged.close()
     while frozen and len(found) < count and drawn < MOST_DRAWS * count:
         drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
-        generate(
+        generate_scenes(
             job,
             drawn,
             work,

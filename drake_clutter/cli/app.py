@@ -10,6 +10,7 @@ from drake_clutter.cli.export import export
 from drake_clutter.cli.feasibility import feasibility
 from drake_clutter.cli.generate import generate
 from drake_clutter.cli.move import move
+from drake_clutter.cli.renamed import RenamingCommand
 from drake_clutter.cli.render import render
 from drake_clutter.cli.replay import replay
 from drake_clutter.cli.run import demo, run
@@ -37,7 +38,7 @@ for command in (
     export,
     doctor,
 ):
-    app.command()(command)
+    app.command(cls=RenamingCommand)(command)
 app.add_typer(assets_app, name="assets")
 
 

@@ -7,7 +7,7 @@ import typer
 from rich.table import Table
 
 from drake_clutter.cli.options import JsonOption
-from drake_clutter.cli.output import out_console, plain
+from drake_clutter.cli.output import escape_markup, out_console
 
 
 def doctor(as_json: JsonOption = False) -> None:
@@ -20,9 +20,12 @@ def doctor(as_json: JsonOption = False) -> None:
     else:
         table = Table("", "check", "found", "how to mend it")
         for check in found:
-            remedy = "" if check.ok else plain(check.remedy)
+            remedy = "" if check.ok else escape_markup(check.remedy)
             table.add_row(
-                "[green]ok" if check.ok else "[red]no", check.name, plain(check.detail), remedy
+                "[green]ok" if check.ok else "[red]no",
+                check.name,
+                escape_markup(check.detail),
+                remedy,
             )
         out_console.print(table)
     if not all(check.ok for check in found):

@@ -9,6 +9,7 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
+from drake_clutter.cli.config_from_options import load_config_from_options, reject_support_settings
 from drake_clutter.cli.options import (
     CatalogOption,
     CellOption,
@@ -23,12 +24,11 @@ from drake_clutter.cli.options import (
     WorkersOption,
 )
 from drake_clutter.cli.output import out_console, progress_bar
-from drake_clutter.cli.world import load_world, refuse_support
 from drake_clutter.files import InputError
 
 
 def evaluate(
-    place: Annotated[
+    source: Annotated[
         str | None,
         typer.Argument(metavar="SCENES", help="The same as --scenes.", show_default=False),
     ] = None,
@@ -54,7 +54,7 @@ def evaluate(
     ] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
-    count: Annotated[
+    max_scenes: Annotated[
         int | None, typer.Option(min=1, help="Evaluate only the first N scenes.")
     ] = None,
     seed: SeedOption = 0,
@@ -68,25 +68,37 @@ def evaluate(
 ) -> None:
     """Compare explorers on scenes that hide something."""
     from drake_clutter.agents.exploration import BASELINES
-    from drake_clutter.commands import evaluate as command
-    from drake_clutter.reports.in_words import in_words
+    from drake_clutter.commands import evaluate_explorers as command
+    from drake_clutter.reports.terminal_text import evaluation_table_rows
 
-    named = scenes or place
-    if named is None or None not in (scenes, place):
+    scenes_source = scenes or source
+    if scenes_source is None or None not in (scenes, source):
         raise InputError(
             "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
         )
-    refuse_support(settings)
-    played = command.playable(named, catalog)[:count]
-    world = load_world(config, cell, settings, None if cell else command.cell_of(played))
+    reject_support_settings(settings)
+    evaluation_scenes = command.load_evaluation_scenes(scenes_source, catalog)[:max_scenes]
+    world = load_config_from_options(
+        config, cell, settings, None if cell else command.common_cell(evaluation_scenes)
+    )
     names = [name for some in agents or BASELINES for name in some.split(",")]
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return progress_bar("episodes", results, 0, total)
 
-    rows = command.evaluate(
-        played, names, limit, fidelity.value, seed, world, catalog, workers, out, progress, ray
+    rows = command.evaluate_explorers(
+        evaluation_scenes,
+        names,
+        limit,
+        fidelity.value,
+        seed,
+        world,
+        catalog,
+        workers,
+        out,
+        progress,
+        ray,
     )
     if as_json:
         print(json.dumps(rows, indent=2))
@@ -94,9 +106,9 @@ def evaluate(
     shown = [
         {"agent": row["agent"]} | cells
         for row in rows
-        for cells in in_words(row, command.limits(limit))
+        for cells in evaluation_table_rows(row, command.move_limits(limit))
     ]
-    title = f"{named}: {rows[0]['episodes']} scenes, {rows[0]['hidden']:.1f} objects hidden"
+    title = f"{scenes_source}: {rows[0]['episodes']} scenes, {rows[0]['hidden']:.1f} objects hidden"
     table = Table(
         *shown[0],
         title=title,

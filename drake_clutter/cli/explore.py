@@ -1,5 +1,6 @@
 """`drake-clutter explore`."""
 
+from drake_clutter.cli.config_from_options import load_scene_and_config
 from drake_clutter.cli.options import (
     CatalogOption,
     CellOption,
@@ -14,8 +15,7 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import report_step, show_episode
-from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.cli.output import print_episode, print_transition
 from drake_clutter.files import prepare_output_directory
 
 
@@ -33,21 +33,21 @@ def explore(
     as_json: JsonOption = False,
 ) -> None:
     """Search a scene for what it hides; writes episode.json and a page, index.html."""
-    from drake_clutter.commands import explore as command
+    from drake_clutter.commands import explore_scene as command
 
-    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
+    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
     limit = max_moves or world.exploration.max_moves
-    task = command.explore(
-        command.at_rest(file.scene, world, seed),
+    task = command.explore_scene(
+        command.settle_scene(file.scene, world, seed),
         agent,
         fidelity.value,
         limit,
         seed,
         world,
-        report_step,
+        print_transition,
     )
     title = f"{agent} explores {scene.name}"
-    show_episode(
+    print_episode(
         command.write_episode(out, task, title, agent, fidelity.value, seed, world), as_json, out
     )

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.cli.options import CatalogOption, LaidOutOption, OutOption, SceneArgument
+from drake_clutter.cli.options import CatalogOption, InitialPosesOption, OutOption, SceneArgument
 from drake_clutter.cli.output import out_console
 from drake_clutter.files import prepare_output_directory
 
@@ -26,7 +26,7 @@ def export(
         Format,
         typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer."),
     ],
-    laid_out: LaidOutOption = False,
+    initial_poses: InitialPosesOption = False,
     catalog: CatalogOption = None,
 ) -> None:
     """Export a scene to a self-contained folder."""
@@ -37,5 +37,5 @@ def export(
     file = load_scene(scene, load_catalog(catalog))
     prepare_output_directory(out)
     out_console.print(
-        f"wrote {export_scene(file.scene if laid_out else file.settled_scene, ExportFormat(format.value), out)}"
+        f"wrote {export_scene(file.scene if initial_poses else file.settled_scene, ExportFormat(format.value), out)}"
     )

@@ -6,6 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_clutter.cli.config_from_options import (
+    load_config_from_options,
+    load_scene_and_config,
+    reject_support_settings,
+)
 from drake_clutter.cli.options import (
     CatalogOption,
     ConfigOption,
@@ -14,14 +19,13 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import progress_bar, show
-from drake_clutter.cli.world import load_scene_and_world, load_world, refuse_support
+from drake_clutter.cli.output import print_result, progress_bar
 from drake_clutter.files import InputError
 
-PLACE = "X,Y,Z,YAW"
+POSE_METAVAR = "X,Y,Z,YAW"
 
 
-def _numbers(option: str, text: str) -> list[float]:
+def _parse_pose(option: str, text: str) -> list[float]:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -50,15 +54,16 @@ def feasibility(
     settings: SetOption = None,
     base: Annotated[
         list[str] | None,
-        typer.Option(metavar=PLACE, help="Place of the arm's base in T; may be repeated."),
+        typer.Option(metavar=POSE_METAVAR, help="Place of the arm's base in T; may be repeated."),
     ] = None,
     tray: Annotated[
         list[str] | None,
         typer.Option(
-            metavar=PLACE, help="Instead: the tray's place, seen from the base; may be repeated."
+            metavar=POSE_METAVAR,
+            help="Instead: the tray's place, seen from the base; may be repeated.",
         ),
     ] = None,
-    arm: Annotated[
+    cell_override: Annotated[
         list[Path] | None,
         typer.Option(metavar="FILE", help="YAML with single fields of the cell; may be repeated."),
     ] = None,
@@ -76,21 +81,21 @@ def feasibility(
     as_json: JsonOption = False,
 ) -> None:
     """Ask an arm about every legal move of scenes: tables, pictures and a report. A study that was stopped goes on."""
-    from drake_clutter.commands import feasibility as command
+    from drake_clutter.commands import feasibility_job as command
 
-    refuse_support(settings)
-    files = command.scene_files(scenes)
-    _, world = load_scene_and_world(files[0], catalog, config, None, settings)
-    command.check_names("--cell, --arm", [*(cell or []), *(arm or [])])
+    reject_support_settings(settings)
+    files = command.collect_scene_files(scenes)
+    _, world = load_scene_and_config(files[0], catalog, config, None, settings)
+    command.check_unique_names("--cell, --cell-override", [*(cell or []), *(cell_override or [])])
     support = world.cell.support
     cells = {
-        path.stem: load_world(config, path, settings).cell.with_support(support)
+        path.stem: load_config_from_options(config, path, settings).cell.with_support(support)
         for path in cell or []
     }
-    setups = command.setups(
-        [_numbers("--base", text) for text in base or []],
-        [_numbers("--tray", text) for text in tray or []],
-        arm or [],
+    setups = command.make_setups(
+        [_parse_pose("--base", text) for text in base or []],
+        [_parse_pose("--tray", text) for text in tray or []],
+        cell_override or [],
         next(iter(cells.values()), world.cell),
     )
     if cells:
@@ -101,10 +106,14 @@ def feasibility(
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return progress_bar("parts", made, done, total)
 
-    summary = command.feasibility(job, out, workers, progress)
-    words = {
+    summary = command.run_feasibility_study(job, out, workers, progress)
+    lines = {
         name: f"{found['planned']} of {found['moves']} planned; "
         + ", ".join(f"{n} {why}" for why, n in found["results"].items() if why != "planned")
         for name, found in summary["setups"].items()
     }
-    show(summary if as_json else words | {"report": str(out / command.REPORT)}, as_json, f"{out}")
+    print_result(
+        summary if as_json else lines | {"report": str(out / command.REPORT_FILE)},
+        as_json,
+        f"{out}",
+    )

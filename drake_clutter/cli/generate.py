@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_clutter.cli.config_from_options import load_config_from_options
 from drake_clutter.cli.options import (
     CatalogOption,
     CellOption,
@@ -18,8 +19,7 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import progress_bar, show
-from drake_clutter.cli.world import load_world
+from drake_clutter.cli.output import print_result, progress_bar
 
 
 def generate(
@@ -46,15 +46,21 @@ def generate(
 ) -> None:
     """Generate scenes, settle them in Drake and say which are stable and what they hide. A run that was stopped goes on."""
     from drake_clutter.agents.generation import GenerationJob
-    from drake_clutter.commands import generate as command
+    from drake_clutter.commands import generate_scenes as command
 
     job = GenerationJob(
-        agent, objects, catalog, nodes, seed, load_world(config, cell, settings), temperature
+        agent,
+        objects,
+        catalog,
+        nodes,
+        seed,
+        load_config_from_options(config, cell, settings),
+        temperature,
     )
 
     def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
         return progress_bar("scenes", made, done, total)
 
-    summary = command.generate(job, count, out, workers, progress, ray)
+    summary = command.generate_scenes(job, count, out, workers, progress, ray)
     shown = {key: value for key, value in summary.items() if key != "config"}
-    show(summary if as_json else shown, as_json, f"{out}")
+    print_result(summary if as_json else shown, as_json, f"{out}")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from drake_clutter.cli.config_from_options import load_scene_and_config
 from drake_clutter.cli.options import (
     CatalogOption,
     CellOption,
@@ -17,8 +18,7 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import report_step, show, show_episode
-from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.cli.output import print_episode, print_result, print_transition
 from drake_clutter.files import InputError, prepare_output_directory
 
 
@@ -49,8 +49,8 @@ def move(
     as_json: JsonOption = False,
 ) -> None:
     """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
-    from drake_clutter.commands import explore as command
-    from drake_clutter.reports.in_words import plans_in_words
+    from drake_clutter.commands import explore_scene as command
+    from drake_clutter.reports.terminal_text import describe_plans
     from drake_clutter.scenes.interfaces import Move
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
@@ -58,15 +58,15 @@ def move(
     if plan_only and fidelity is not Fidelity.ARM:
         raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
     chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
-    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
+    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
-    start = command.at_rest(file.scene, world, seed)
+    start = command.settle_scene(file.scene, world, seed)
     if plan_only:
-        plans = command.plan_only(start, chosen, seed, world, out)
-        show({"plans": plans} if as_json else plans_in_words(plans), as_json, f"{out}")
+        plans = command.plan_moves(start, chosen, seed, world, out)
+        print_result({"plans": plans} if as_json else describe_plans(plans), as_json, f"{out}")
         return
-    task = command.carry_out(start, chosen, seed, world, report_step, fidelity.value)
+    task = command.execute_moves(start, chosen, seed, world, print_transition, fidelity.value)
     fields = command.write_episode(
         out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world
     )
-    show_episode(fields, as_json, out)
+    print_episode(fields, as_json, out)

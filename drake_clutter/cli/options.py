@@ -31,7 +31,6 @@ CatalogOption = Annotated[
     Path | None,
     typer.Option(
         "--catalog",
-        "--catalogue",
         metavar="DIR",
         help="An asset folder with object classes of your own.",
     ),
@@ -96,6 +95,6 @@ FidelityOption = Annotated[
 NodesOption = Annotated[
     int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")
 ]
-LaidOutOption = Annotated[
-    bool, typer.Option("--laid-out", help="Take the objects as laid out, not as settled.")
+InitialPosesOption = Annotated[
+    bool, typer.Option("--initial-poses", help="Use initial poses instead of settled poses.")
 ]

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 out_console, err_console = Console(), Console(stderr=True)
 
 
-def plain(text: str) -> str:
+def escape_markup(text: str) -> str:
     """Return text that Rich takes as it is."""
     return text.replace("[", "\\[")
 
 
-def show(fields: dict[str, Any], as_json: bool, title: str) -> None:
+def print_result(fields: dict[str, Any], as_json: bool, title: str) -> None:
     """Print a result, as a table or as JSON."""
     if as_json:
         print(json.dumps(fields, indent=2))
@@ -50,67 +50,77 @@ def show(fields: dict[str, Any], as_json: bool, title: str) -> None:
             value = ", ".join(str(v) for v in value) or "none"
         elif isinstance(value, dict):
             value = ", ".join(f"{v} {k}" for k, v in value.items()) or "none"
-        table.add_row(key.replace("_", " "), plain(str(value)))
+        table.add_row(key.replace("_", " "), escape_markup(str(value)))
     out_console.print(table)
 
 
-def report_step(step: "Step") -> None:
+def print_transition(transition: "Step") -> None:
     """Print how a move went, on standard error."""
-    found = f", found {', '.join(step.newly_found)}" if step.newly_found else ""
-    reasons = [str(reason) for reason in (step.outcome.instability, step.outcome.detail) if reason]
+    found = f", found {', '.join(transition.newly_found)}" if transition.newly_found else ""
+    reasons = [
+        str(reason)
+        for reason in (transition.outcome.instability, transition.outcome.detail)
+        if reason
+    ]
     why = f" ({'; '.join(reasons)})" if reasons else ""
-    err_console.print(f"{step.move}: {step.outcome.result.value}{why}{found}", highlight=False)
+    err_console.print(
+        f"{transition.move}: {transition.outcome.result.value}{why}{found}", highlight=False
+    )
 
 
-def show_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
+def print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
     """Print what `episode.json` holds."""
     if as_json:
-        show(fields, True, "")
+        print_result(fields, True, "")
         return
     shown = {
         key: fields[key]
         for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")
     }
-    show(shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}")
+    print_result(
+        shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}"
+    )
 
 
-def progress_bar(what: str, items: Iterable[Any], done: int, total: int) -> Iterator[Any]:
+def progress_bar(
+    description: str, items: Iterable[Any], num_done: int, total: int
+) -> Iterator[Any]:
     """Yield the items, with a progress bar that appears with the first of them.
 
     While they are made, standard output goes to standard error: Ray writes its messages there, and --json's result has to
     stay alone.
     """
     columns = (
-        TextColumn(what),
+        TextColumn(description),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with redirect_stdout(sys.stderr), Progress(*columns, console=err_console) as bar:
-        yield from bar.track(items, total=total, completed=done)
+        yield from bar.track(items, total=total, completed=num_done)
 
 
-def watch(
+def show_recording(
     name: Path,
     scene: "Scene",
     frames: Sequence["MotionSample"],
     cell: "WorkCell",
-    html: Path | None,
+    html_file: Path | None,
 ) -> None:
     """Show frames in the browser until it is interrupted, or write them to one HTML file."""
-    from drake_clutter.reports.recording import serve, write_recording
+    from drake_clutter.reports.recording import serve_recording, write_recording
 
-    if html is not None:
+    if html_file is not None:
         try:
-            write_recording(html, scene, frames, cell)
+            write_recording(html_file, scene, frames, cell)
         except OSError as error:
             raise InputError(
-                f"--html {html}: cannot be written ({error.strerror}); allowed is a place you may write"
+                f"--html {html_file}: cannot be written ({error.strerror}); allowed is a place you may write"
             ) from error
-        out_console.print(f"wrote {html}")
+        out_console.print(f"wrote {html_file}")
         return
-    meshcat = serve(scene, frames, cell)
+    meshcat = serve_recording(scene, frames, cell)
     out_console.print(f"{name} is at {meshcat.web_url()}; Ctrl-C ends it")
     while True:
         time.sleep(1)

@@ -7,6 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from drake_clutter.cli.config_from_options import (
+    check_cell_models,
+    qualify_setting,
+    reject_support_settings,
+)
 from drake_clutter.cli.options import (
     CellOption,
     JsonOption,
@@ -15,19 +20,18 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import report_step, show_episode
-from drake_clutter.cli.world import check_cell, in_world, refuse_support
+from drake_clutter.cli.output import print_episode, print_transition
 from drake_clutter.files import prepare_output_directory
 
 if TYPE_CHECKING:
     from drake_clutter.systems.scenario import Scenario
 
-_WORLD_FIELDS = frozenset({"layout", "settle", "exploration", "cell", "camera"})
+_CONFIG_FIELDS = frozenset({"layout", "settle", "exploration", "cell", "camera"})
 
 
-def _in_scenario(setting: str) -> str:
-    name = in_world(setting)
-    return f"world.{name}" if name.split("=")[0].split(".")[0] in _WORLD_FIELDS else name
+def _qualify_scenario_setting(setting: str) -> str:
+    name = qualify_setting(setting)
+    return f"world.{name}" if name.split("=")[0].split(".")[0] in _CONFIG_FIELDS else name
 
 
 def _load_scenario(
@@ -41,23 +45,26 @@ def _load_scenario(
     from drake_clutter.systems.scenario import Scenario
     from drake_clutter.validation import load_config_as
 
-    names = [_in_scenario(setting) for setting in settings or ()]
-    which_scene = [name for name in names if name.startswith(("scene=", "catalog=", "catalogue="))]
-    base, named = Scenario(), load_config_as(Scenario(), file, which_scene, upgrade)
+    names = [_qualify_scenario_setting(setting) for setting in settings or ()]
+    scene_settings = [
+        name for name in names if name.startswith(("scene=", "catalog=", "catalogue="))
+    ]
+    defaults, named = Scenario(), load_config_as(Scenario(), file, scene_settings, upgrade)
     if named.scene:
-        refuse_support(names)
+        reject_support_settings(names)
         catalog = load_catalog(Path(named.catalog) if named.catalog else None)
-        base = replace(
-            base, world=replace(base.world, cell=load_scene(Path(named.scene), catalog).cell)
+        defaults = replace(
+            defaults,
+            world=replace(defaults.world, cell=load_scene(Path(named.scene), catalog).cell),
         )
-    scenario = load_config_as(base, file, upgrade=upgrade)
+    scenario = load_config_as(defaults, file, upgrade=upgrade)
     if cell is not None:
-        given = load_cell(cell)
+        loaded_cell = load_cell(cell)
         if named.scene:  # the objects stand on its support
-            given = given.with_support(base.world.cell.support)
-        scenario = replace(scenario, world=replace(scenario.world, cell=given))
+            loaded_cell = loaded_cell.with_support(defaults.world.cell.support)
+        scenario = replace(scenario, world=replace(scenario.world, cell=loaded_cell))
     scenario = load_config_as(scenario, settings=names, upgrade=upgrade)
-    check_cell(scenario.world.cell, base.world.cell, cell or file)
+    check_cell_models(scenario.world.cell, defaults.world.cell, cell or file)
     return scenario
 
 
@@ -78,11 +85,11 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Play the closed loop: camera images in, arm motion out, until nothing is hidden; writes episode.json and a page."""
-    from drake_clutter.commands import run as command
+    from drake_clutter.commands import run_scenario as command
 
     given = _load_scenario(scenario, cell, settings)
     prepare_output_directory(out)
-    show_episode(command.run(given, out, report_step), as_json, out)
+    print_episode(command.run_scenario(given, out, print_transition), as_json, out)
 
 
 def demo(
@@ -94,10 +101,10 @@ def demo(
     as_json: JsonOption = False,
 ) -> None:
     """SG* makes a scene, and the arm searches it until everything is found; write a page to watch."""
-    from drake_clutter.commands import run as command
+    from drake_clutter.commands import run_scenario as command
 
     given = replace(
         _load_scenario(None, cell, settings), seed=seed, nodes=nodes, perception="depth"
     )
     prepare_output_directory(out)
-    show_episode(command.demo(given, out, report_step), as_json, out)
+    print_episode(command.run_demo(given, out, print_transition), as_json, out)

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from drake_clutter.cli.config_from_options import load_scene_and_config
 from drake_clutter.cli.options import (
     CatalogOption,
     CellOption,
@@ -14,8 +15,7 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import report_step, show
-from drake_clutter.cli.world import load_scene_and_world
+from drake_clutter.cli.output import print_result, print_transition
 from drake_clutter.files import prepare_output_directory
 
 
@@ -33,11 +33,17 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """Find the fewest moves that reveal everything, with full knowledge of the scene; Drake confirms the plan."""
-    from drake_clutter.commands import explore, solve
+    from drake_clutter.commands import explore_scene, solve_scene
 
-    file, world = load_scene_and_world(scene, catalog, config, cell, settings)
+    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
     prepare_output_directory(out)
-    fields = solve.solve(
-        explore.at_rest(file.scene, world, seed), scene.name, out, seed, budget, world, report_step
+    fields = solve_scene.solve_scene(
+        explore_scene.settle_scene(file.scene, world, seed),
+        scene.name,
+        out,
+        seed,
+        budget,
+        world,
+        print_transition,
     )
-    show(fields, as_json, f"{out}")
+    print_result(fields, as_json, f"{out}")

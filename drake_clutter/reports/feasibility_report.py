@@ -25,8 +25,8 @@ from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
-from drake_clutter.reports.arm_pictures import strip
-from drake_clutter.reports.pictures import Marks, PictureCamera
+from drake_clutter.reports.filmstrip import render_filmstrip
+from drake_clutter.reports.scene_images import Annotations, SceneRenderer
 from drake_clutter.scenes.interfaces import ArmState, MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import pose_of
@@ -35,7 +35,7 @@ from drake_clutter.tasks.feasibility import PLANNED
 
 Rows = Sequence[Mapping[str, Any]]
 
-WORST = 3
+CASES_PER_KIND = 3
 """Moves that are shown of each kind: nearest to a collision, longest, and one for each reason."""
 _STYLE: dict[Any, Any] = {
     "font.size": 15,
@@ -50,17 +50,17 @@ img{max-width:100%;margin:.5em 0}figure{margin:1em 0}
 .case{border-top:1px solid #cdd2d9;padding:.5em 0}"""
 
 
-def write_report(
+def write_feasibility_report(
     path: Path,
     setups: Mapping[str, WorkCell],
     moves: Rows,
-    noise: Rows,
-    reach: Mapping[str, Mapping[str, Any]],
+    pose_errors: Rows,
+    reachability_maps: Mapping[str, Mapping[str, Any]],
     bases: Rows,
     targets: Rows,
     summary: Mapping[str, Any],
-    scene_of: Callable[[str], Scene],
-    world: ClutterConfig,
+    load_scene: Callable[[str], Scene],
+    config: ClutterConfig,
 ) -> None:
     """Writes the page; see `commands/feasibility.py` for what it is given."""
     plt.rcParams.update(_STYLE)
@@ -82,38 +82,41 @@ def write_report(
         )
     if moves:
         parts += [
-            _figure("Results of all moves", _reasons(moves, list(setups))),
+            _figure("Results of all moves", _plot_results(moves, list(setups))),
             _figure(
-                "Planned, of all legal moves of a kind (bars: 95 %)", _kinds(moves, list(setups))
+                "Planned, of all legal moves of a kind (bars: 95 %)",
+                _plot_by_object(moves, list(setups)),
             ),
             _figure(
-                "Planned, of the moves that pick there (number of moves)", _over_tray(moves, setups)
+                "Planned, of the moves that pick there (number of moves)",
+                _plot_by_pick_position(moves, setups),
             ),
         ]
-    for setup, found in reach.items():
+    for setup, reachability_map in reachability_maps.items():
         parts.append(
             _figure(
-                f"{setup}: where a cup that points down can go, in the empty cell", _reach(found)
+                f"{setup}: where a cup that points down can go, in the empty cell",
+                _plot_reachability(reachability_map),
             )
         )
     parts.append(
         _figure(
             "Places of the base, as high and turned as the first setup's",
-            _bases(bases, next(iter(setups.values()))),
+            _plot_base_positions(bases, next(iter(setups.values()))),
         )
     )
-    if noise:
+    if pose_errors:
         parts.append(
             _figure(
                 "Plans made from wrong poses that hold where the objects really are (bars: 95 %)",
-                _noise(noise),
+                _plot_pose_errors(pose_errors),
             )
         )
     if targets:
         parts.append(_targets_table(targets))
     if moves:
         parts.append("<h2>Worst cases</h2>")
-        parts += _worst(moves, setups, scene_of, world)
+        parts += _worst_cases_html(moves, setups, load_scene, config)
     page = "<!doctype html><html lang=en><meta charset=utf-8><title>Feasibility</title>"
     page += f"<style>{_CSS}</style><body>{''.join(parts)}"
     write_text(path, page + "</body></html>")
@@ -122,14 +125,18 @@ def write_report(
 def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) -> str:
     rows = ""
     for name, cell in setups.items():
-        found = summary["setups"][name]
-        low, high = found["planned_ci95"]
+        statistics = summary["setups"][name]
+        low, high = statistics["planned_ci95"]
         share = (
             "-"
-            if found["planned_share"] is None
-            else f"{found['planned_share']:.3f} ({low:.3f} to {high:.3f})"
+            if statistics["planned_share"] is None
+            else f"{statistics['planned_share']:.3f} ({low:.3f} to {high:.3f})"
         )
-        motion = "-" if found["motion_s_median"] is None else f"{found['motion_s_median']:.2f} s"
+        motion = (
+            "-"
+            if statistics["motion_s_median"] is None
+            else f"{statistics['motion_s_median']:.2f} s"
+        )
         base = ", ".join(
             f"{v:g}" for v in (*cell.robot.base.translation, cell.robot.base.rpy_deg[2])
         )
@@ -138,10 +145,10 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
             base,
             f"{1000 * cell.gripper.cup_diameter:g} mm, {1000 * cell.gripper.extension:g} mm",
             f"{cell.robot.payload:g} kg",
-            f"{found['planned']} of {found['moves']}",
+            f"{statistics['planned']} of {statistics['moves']}",
             share,
             motion,
-            f"{1000 * found['planning_s']['p50']:.0f} / {1000 * found['planning_s']['p95']:.0f} ms (p50 / p95)",
+            f"{1000 * statistics['planning_s']['p50']:.0f} / {1000 * statistics['planning_s']['p95']:.0f} ms (p50 / p95)",
         )
         rows += f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
     heads = (
@@ -167,7 +174,7 @@ def _targets_table(targets: Rows) -> str:
     return f"<h2>Poses asked for</h2><table><tr>{heads}</tr>{rows}</table>"
 
 
-def _embedded(png: bytes, alt: str) -> str:
+def _embedded_image(png: bytes, alt: str) -> str:
     return f'<img alt="{escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
@@ -175,10 +182,10 @@ def _figure(title: str, figure: Figure) -> str:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=90)
     plt.close(figure)
-    return f"<h2>{escape(title)}</h2><figure>{_embedded(stream.getvalue(), title)}</figure>"
+    return f"<h2>{escape(title)}</h2><figure>{_embedded_image(stream.getvalue(), title)}</figure>"
 
 
-def _reasons(moves: Rows, setups: Sequence[str]) -> Figure:
+def _plot_results(moves: Rows, setups: Sequence[str]) -> Figure:
     results = [result for result, _ in Counter(row["result"] for row in moves).most_common()]
     results = [PLANNED, *(r for r in results if r != PLANNED)]
     figure, axes = plt.subplots(figsize=(12, 1.6 + 0.55 * len(results) * max(1, len(setups) / 2)))
@@ -199,7 +206,7 @@ def _reasons(moves: Rows, setups: Sequence[str]) -> Figure:
     return figure
 
 
-def _share_bars(
+def _plot_planned_fractions(
     axes: Any,
     moves: Rows,
     setups: Sequence[str],
@@ -230,13 +237,15 @@ def _share_bars(
     axes.set(title=label, ylim=(0, 1))
 
 
-def _kinds(moves: Rows, setups: Sequence[str]) -> Figure:
+def _plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
-    _share_bars(
+    _plot_planned_fractions(
         axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class"
     )
-    _share_bars(axes[1], moves, setups, lambda row: str(row["rest"]), "axis that points up")
-    _share_bars(
+    _plot_planned_fractions(
+        axes[1], moves, setups, lambda row: str(row["rest"]), "axis that points up"
+    )
+    _plot_planned_fractions(
         axes[2],
         moves,
         setups,
@@ -249,14 +258,16 @@ def _kinds(moves: Rows, setups: Sequence[str]) -> Figure:
     return figure
 
 
-def _heat(axes: Any, values: NDArray[np.float64], extent: Sequence[float], top: float) -> Any:
+def _plot_heatmap(
+    axes: Any, values: NDArray[np.float64], extent: Sequence[float], top: float
+) -> Any:
     axes.grid(visible=False)
     return axes.imshow(
         values.T, origin="lower", extent=extent, vmin=0, vmax=top, cmap="viridis", aspect="equal"
     )
 
 
-def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
+def _plot_by_pick_position(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
     picked = np.abs([(row["pick_x"], row["pick_y"]) for row in moves])
     half_x, half_y = np.max(
         [*picked, *(cell.support.half_size for cell in setups.values())], axis=0
@@ -270,7 +281,7 @@ def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
         count, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y))
         planned, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y), weights=good)
         with np.errstate(invalid="ignore"):
-            image = _heat(panel, planned / count, (-half_x, half_x, -half_y, half_y), 1.0)
+            image = _plot_heatmap(panel, planned / count, (-half_x, half_x, -half_y, half_y), 1.0)
         for i, cx in enumerate((edges_x[1:] + edges_x[:-1]) / 2):
             for j, cy in enumerate((edges_y[1:] + edges_y[:-1]) / 2):
                 if count[i, j]:
@@ -288,17 +299,22 @@ def _over_tray(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
     return figure
 
 
-def _reach(found: Mapping[str, Any]) -> Figure:
-    heights = found["heights"]
-    half_x, half_y = (along[-1] + (along[1] - along[0]) / 2 for along in (found["x"], found["y"]))
+def _plot_reachability(reachability_map: Mapping[str, Any]) -> Figure:
+    heights = reachability_map["heights"]
+    half_x, half_y = (
+        along[-1] + (along[1] - along[0]) / 2
+        for along in (reachability_map["x"], reachability_map["y"])
+    )
     extent = (-half_x, half_x, -half_y, half_y)
     figure, axes = plt.subplots(
         2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True
     )
-    best = max(0.01, float(np.max(found["manipulability"])))
+    best = max(0.01, float(np.max(reachability_map["manipulability"])))
     for k, height in enumerate(heights):
-        top = _heat(axes[0][k], np.array(found["share"][k]), extent, 1.0)
-        bottom = _heat(axes[1][k], np.array(found["manipulability"][k]), extent, best)
+        top = _plot_heatmap(axes[0][k], np.array(reachability_map["share"][k]), extent, 1.0)
+        bottom = _plot_heatmap(
+            axes[1][k], np.array(reachability_map["manipulability"][k]), extent, best
+        )
         axes[0][k].set_title(f"{100 * height:g} cm above the floor", fontsize=13)
         axes[1][k].set_xlabel("x of the tray, m")
     for row, name in ((0, "y, m"), (1, "y, m")):
@@ -308,7 +324,7 @@ def _reach(found: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _bases(bases: Rows, cell: WorkCell) -> Figure:
+def _plot_base_positions(bases: Rows, cell: WorkCell) -> Figure:
     x, y = sorted({row["x"] for row in bases}), sorted({row["y"] for row in bases})
     figure, axes = plt.subplots(1, 2, figsize=(13, 6))
     half_x, half_y = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
@@ -318,7 +334,9 @@ def _bases(bases: Rows, cell: WorkCell) -> Figure:
         at = {(row["x"], row["y"]): row[name] for row in bases}
         values = np.array([[at[i, j] for j in y] for i in x])
         figure.colorbar(
-            _heat(panel, values, extent, max(0.01, float(values.max()))), ax=panel, label=label
+            _plot_heatmap(panel, values, extent, max(0.01, float(values.max()))),
+            ax=panel,
+            label=label,
         )
         panel.plot(*cell.robot.base.translation[:2], "r*", markersize=18, label="first setup")
         best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
@@ -335,13 +353,13 @@ def _bases(bases: Rows, cell: WorkCell) -> Figure:
     return figure
 
 
-def _noise(noise: Rows) -> Figure:
+def _plot_pose_errors(pose_errors: Rows) -> Figure:
     figure, axes = plt.subplots(figsize=(10, 5))
-    errors = sorted({row["error"] for row in noise})
-    for setup in dict.fromkeys(row["setup"] for row in noise):
+    errors = sorted({row["error"] for row in pose_errors})
+    for setup in dict.fromkeys(row["setup"] for row in pose_errors):
         found = []
         for error in errors:
-            rows = [row for row in noise if row["setup"] == setup and row["error"] == error]
+            rows = [row for row in pose_errors if row["setup"] == setup and row["error"] == error]
             good = sum(row["result"] == "holds" for row in rows)
             found.append((good / len(rows), *wilson_interval(good, len(rows))))
         share, low, high = np.array(found).T
@@ -356,63 +374,63 @@ def _noise(noise: Rows) -> Figure:
     return figure
 
 
-def _worst(
+def _worst_cases_html(
     moves: Rows,
     setups: Mapping[str, WorkCell],
-    scene_of: Callable[[str], Scene],
+    load_scene: Callable[[str], Scene],
     world: ClutterConfig,
 ) -> list[str]:
     planned = [row for row in moves if row["result"] == PLANNED]
-    closest = sorted(
+    nearest_to_collision = sorted(
         (row for row in planned if row["clearance"] is not None),
         key=lambda row: float(row["clearance"]),
     )
     long = sorted(planned, key=lambda row: -float(row["motion_s"]))
-    chosen = [("nearest to a collision", row) for row in closest[:WORST]] + [
-        ("longest", row) for row in long[:WORST]
+    cases = [("nearest to a collision", row) for row in nearest_to_collision[:CASES_PER_KIND]] + [
+        ("longest", row) for row in long[:CASES_PER_KIND]
     ]
     for reason in dict.fromkeys(
         row["result"] for row in moves if row["result"] not in (PLANNED, "no free spot")
     ):
-        chosen.append((reason, next(row for row in moves if row["result"] == reason)))
-    camera, parts = PictureCamera(), []
-    for kind, row in chosen:
-        scene, cell = scene_of(row["scene"]), setups[row["setup"]]
-        known = row["place_x"] is not None
+        cases.append((reason, next(row for row in moves if row["result"] == reason)))
+    camera, parts = SceneRenderer(), []
+    for kind, row in cases:
+        scene, cell = load_scene(row["scene"]), setups[row["setup"]]
+        has_placement = row["place_x"] is not None
         X_TO = (
             Pose(
                 (row["place_x"], row["place_y"], row["place_z"]), scene[row["pick"]].X_TO.quaternion
             )
-            if known
+            if has_placement
             else None
         )
-        told = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
+        title = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
         if row["result"] == PLANNED:
-            near = row["clearance"]
+            min_distance = row["clearance"]
             distance = (
                 "nothing within 3 cm"
-                if near is None
-                else f"{1000 * near:.1f} mm ({row['between']})"
+                if min_distance is None
+                else f"{1000 * min_distance:.1f} mm ({row['between']})"
             )
-            why = f"{row['motion_s']:.2f} s, {distance}"
+            detail = f"{row['motion_s']:.2f} s, {distance}"
         else:
-            why = ": ".join(filter(None, (row["result"], row["about"])))
-        pictures = [camera.annotated(scene, Marks(moved=row["pick"], X_T_placed=X_TO))]
+            detail = ": ".join(filter(None, (row["result"], row["about"])))
+        pictures = [camera.render_annotated(scene, Annotations(moved=row["pick"], X_T_placed=X_TO))]
         if row["result"] == PLANNED and X_TO is not None:
             planner = PickPlacePlanner(
                 cell.with_support(scene.support), PlannerConfig(optimize=False)
             )
             plan = planner.plan(scene.objects, row["pick"], X_TO)
             if isinstance(plan, PickPlacePlan):
-                pictures.append(strip(scene, _moments(plan, scene, cell), cell))
-        images = "".join(_embedded(_png(picture), told) for picture in pictures)
+                pictures.append(render_filmstrip(scene, _plan_key_frames(plan, scene, cell), cell))
+        images = "".join(_embedded_image(_encode_png(picture), title) for picture in pictures)
         parts.append(
-            f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(told)}: {escape(why)}</p>{images}</div>'
+            f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(title)}: {escape(detail)}</p>{images}</div>'
         )
     return parts
 
 
-def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSample]:
+def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSample]:
     """At the grasp, in the middle of the way, and at the place."""
     carry, frames = plan.segments[1].trajectory, []
     tool = ToolKinematics(cell)
@@ -424,7 +442,7 @@ def _moments(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSa
     return frames
 
 
-def _png(picture: NDArray[np.uint8]) -> bytes:
+def _encode_png(picture: NDArray[np.uint8]) -> bytes:
     stream = io.BytesIO()
     image = Image.fromarray(picture)
     image.thumbnail((1080, 480))

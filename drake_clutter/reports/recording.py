@@ -31,16 +31,16 @@ from drake_clutter.tasks.exploration import Step
 FRAMES_PER_SECOND = 40
 _CARRY_TIME = 0.5
 """s, for each of up, across and down."""
-_PAUSE, _LONG_PAUSE = 0.6, 1.5
+_PAUSE_AFTER_MOVE, _PAUSE_AT_ENDS = 0.6, 1.5
 """s, after each move; before the first and after the last."""
 _CLEARANCE = 0.03
 """m, between what is carried and the highest other object."""
-_SAME_DISTANCE, _SAME_TURN = 1e-4, 1e-3
+_KEY_FRAME_DISTANCE, _KEY_FRAME_ANGLE = 1e-4, 1e-3
 """m, rad; poses that differ by less share a key frame, which makes the file a third as large."""
-_FOREVER = 1_000_000_000
-_EYE, _TARGET, _FOV_Y_DEG = (0.45, -1.35, 1.10), (0.0, 0.0, 0.14), 36.0
+_NUM_REPETITIONS = 1_000_000_000
+_CAMERA_POSITION, _CAMERA_TARGET, _FOV_Y_DEG = (0.45, -1.35, 1.10), (0.0, 0.0, 0.14), 36.0
 """m, for a tray of 0.7 m."""
-_LAMPS: dict[str, dict[str, Any]] = {
+_LIGHTS: dict[str, dict[str, Any]] = {
     "SpotLight": {
         "intensity": 20.0,
         "castShadow": True,
@@ -62,7 +62,7 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[MotionSample]:
     Where a move was made by teleport, in one instant, lifting and carrying are an illustration, and no robot's motion. Moves that
     could not be carried out are left out.
     """
-    poses, time = dict(start.poses), _LONG_PAUSE
+    poses, time = dict(start.poses), _PAUSE_AT_ENDS
     frames = [MotionSample(0.0, dict(poses))]
     scene = start
     for step in steps:
@@ -70,7 +70,7 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[MotionSample]:
             continue
         pick, motion = step.move.pick, step.outcome.motion
         if not (motion and motion[0].arm):
-            for X_TO in _carried(
+            for X_TO in _illustrate_carry(
                 scene, pick, step.outcome.X_TO_released or step.outcome.scene[pick].X_TO
             ):
                 poses[pick] = X_TO
@@ -81,22 +81,22 @@ def episode_frames(start: Scene, steps: Sequence[Step]) -> list[MotionSample]:
             frames.append(MotionSample(time + frame.time, dict(poses), frame.arm))
         scene = step.outcome.scene
         poses = dict(scene.poses)
-        time = frames[-1].time + _PAUSE
+        time = frames[-1].time + _PAUSE_AFTER_MOVE
         frames.append(MotionSample(time, dict(poses)))
-    frames.append(MotionSample(frames[-1].time + _LONG_PAUSE, dict(poses)))
+    frames.append(MotionSample(frames[-1].time + _PAUSE_AT_ENDS, dict(poses)))
     return frames
 
 
-def joined(motions: Sequence[Sequence[MotionSample]]) -> list[MotionSample]:
+def concatenate_motions(motions: Sequence[Sequence[MotionSample]]) -> list[MotionSample]:
     """Motions one after the other, with pauses."""
     frames, time = list[MotionSample](), 0.0
     for motion in motions:
         frames += [replace(frame, time=time + frame.time) for frame in motion]
-        time = frames[-1].time + _PAUSE
-    return [*frames, replace(frames[-1], time=frames[-1].time + _LONG_PAUSE)]
+        time = frames[-1].time + _PAUSE_AFTER_MOVE
+    return [*frames, replace(frames[-1], time=frames[-1].time + _PAUSE_AT_ENDS)]
 
 
-def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
+def _illustrate_carry(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     """The illustrated way of an object from where it is to its place, at 40 Hz: up, across, down."""
     picked = scene[pick]
     # Its lowest point may lie below its origin by as much as its farthest corner.
@@ -105,17 +105,18 @@ def _carried(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     height = max([picked.X_TO.p[2], X_T_placed.p[2], *(top + reach for top in tops)]) + _CLEARANCE
     start, end = picked.X_TO.p, X_T_placed.p
     corners = np.array([start, [start[0], start[1], height], [end[0], end[1], height], end])
-    turn = Slerp([0.0, 1.0], Rotation.from_matrix([picked.X_TO.rotation, X_T_placed.rotation]))
+    slerp = Slerp([0.0, 1.0], Rotation.from_matrix([picked.X_TO.rotation, X_T_placed.rotation]))
     count = round(_CARRY_TIME * FRAMES_PER_SECOND)
-    share = np.arange(count) / count
-    smooth = share**2 * (3 - 2 * share)
+    time_fraction = np.arange(count) / count
+    smooth = time_fraction**2 * (3 - 2 * time_fraction)
     poses = []
     for leg in range(3):
         for s in smooth:
-            turned = (0.0, s, 1.0)[leg]
+            rotation_fraction = (0.0, s, 1.0)[leg]
             poses.append(
                 Pose.from_rotation(
-                    turn(turned).as_matrix(), corners[leg] + s * (corners[leg + 1] - corners[leg])
+                    slerp(rotation_fraction).as_matrix(),
+                    corners[leg] + s * (corners[leg + 1] - corners[leg]),
                 )
             )
     return poses
@@ -133,41 +134,41 @@ def write_recording(
         cell: whose arm is shown, if the frames know where it was.
     """
     # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
-    write_text(path, _SOURCE_COMMENT.sub("", _animated(scene, frames, cell).StaticHtml()))
+    write_text(path, _SOURCE_COMMENT.sub("", _animate(scene, frames, cell).StaticHtml()))
 
 
-def _animated(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
-    known = [frame.arm.q for frame in frames if frame.arm]
+def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
+    arm_positions = [frame.arm.q for frame in frames if frame.arm]
     # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
     with drake_silent_below(logging.WARNING):
-        meshcat, paths, arm_poses = _shown(scene, cell, arm=bool(known))
+        meshcat, paths, arm_poses = _build_viewer(scene, cell, arm=bool(arm_positions))
     if len(frames) > 1:
         animation = MeshcatAnimation(FRAMES_PER_SECOND)
         animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
-        animation.set_repetitions(_FOREVER)
+        animation.set_repetitions(_NUM_REPETITIONS)
         animation.set_autoplay(True)
         numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
-        all_poses, q = list[dict[str, Pose]](), known[0] if known else ()
+        all_poses, q = list[dict[str, Pose]](), arm_positions[0] if arm_positions else ()
         for frame in frames:
             q = frame.arm.q if frame.arm else q  # it stays where it was
             all_poses.append({**scene.poses, **frame.poses, **arm_poses(q)})
-        for name, shown_at in paths.items():
+        for name, meshcat_path in paths.items():
             for index, pose in _key_frames([poses[name] for poses in all_poses]):
-                animation.SetTransform(numbers[index], shown_at, rigid_transform(pose))
+                animation.SetTransform(numbers[index], meshcat_path, rigid_transform(pose))
         meshcat.SetAnimation(animation)
     return meshcat
 
 
-def serve(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
+def serve_recording(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
     """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
-    return _animated(scene, frames, cell)
+    return _animate(scene, frames, cell)
 
 
 ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]
 """X_TL of the arm's links by name, from its joint angles."""
 
 
-def _shown(
+def _build_viewer(
     scene: Scene, cell: WorkCell, *, arm: bool = False
 ) -> tuple[Meshcat, dict[str, str], ArmPoses]:
     """A viewer with the scene in it, with or without the arm; the Meshcat path of each object and link by name; `ArmPoses`."""
@@ -175,9 +176,9 @@ def _shown(
     objects = [(o.name, o.object_class) for o in scene.objects]
     scene_plant = add_scene_plant(builder, objects, scene.support, 0.01, visuals=True)
     plant = scene_plant.plant
-    links, added = {}, None
+    links, work_cell_model = {}, None
     if arm:
-        added = add_work_cell(
+        work_cell_model = add_work_cell(
             plant,
             scene_plant.scene_graph,
             cell.with_support(scene.support),
@@ -186,7 +187,7 @@ def _shown(
         )
         links = {
             f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": body
-            for body in added.bodies
+            for body in work_cell_model.bodies
         }
     plant.Finalize()
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
@@ -204,11 +205,11 @@ def _shown(
 
     scale = max(scene.support.size) / 0.70
     meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=_FOV_Y_DEG))
-    meshcat.SetCameraPose(scale * np.array(_EYE), scale * np.array(_TARGET))
+    meshcat.SetCameraPose(scale * np.array(_CAMERA_POSITION), scale * np.array(_CAMERA_TARGET))
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Lights/SpotLight", "visible", True)
-    for lamp, properties in _LAMPS.items():
+    for lamp, properties in _LIGHTS.items():
         for name, value in properties.items():
             meshcat.SetProperty(f"/Lights/{lamp}/<object>", name, value)
     # Grey, because the background also lights the products from all sides.
@@ -221,8 +222,8 @@ def _shown(
     }
 
     def arm_poses(q: Sequence[float]) -> dict[str, Pose]:
-        if added is not None:
-            set_joint_angles(plant, plant_context, added, q)
+        if work_cell_model is not None:
+            set_joint_angles(plant, plant_context, work_cell_model, q)
         return {name: pose_of(body.EvalPoseInWorld(plant_context)) for name, body in links.items()}
 
     paths = {
@@ -236,7 +237,7 @@ def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
     keys = [(0, poses[0])]
     for index, pose in enumerate(poses[1:], start=1):
         last, held = keys[-1]
-        if _same(held, pose):
+        if _nearly_equal(held, pose):
             continue
         if last < index - 1:
             keys.append((index - 1, held))
@@ -245,10 +246,10 @@ def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
     return keys if last == len(poses) - 1 else [*keys, (len(poses) - 1, held)]
 
 
-def _same(a: Pose, b: Pose) -> bool:
+def _nearly_equal(a: Pose, b: Pose) -> bool:
     # A turn by a small angle moves the unit quaternion by half of it; q and -q are one rotation.
     turn = 2 * min(
         np.linalg.norm(np.subtract(a.quaternion, b.quaternion)),
         np.linalg.norm(np.add(a.quaternion, b.quaternion)),
     )
-    return bool(np.linalg.norm(a.p - b.p) < _SAME_DISTANCE and turn < _SAME_TURN)
+    return bool(np.linalg.norm(a.p - b.p) < _KEY_FRAME_DISTANCE and turn < _KEY_FRAME_ANGLE)

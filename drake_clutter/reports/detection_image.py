@@ -6,33 +6,33 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from drake_clutter.cell.camera import pixel_grid
-from drake_clutter.reports.drawing import Canvas, Label, middle
-from drake_clutter.reports.pictures import humanised
+from drake_clutter.reports.canvas import Canvas, TextLabel, innermost_point
+from drake_clutter.reports.scene_images import display_name
 from drake_clutter.scenes.interfaces import Observation
 
-SIDE = 720
+IMAGE_SIDE = 720
 _OVERSAMPLING = 2
-_HIGHEST = 0.45
+_MAX_HEIGHT = 0.45
 """m, drawn brightest."""
-_TALL = 0.3
+_RIM_HEIGHT = 0.3
 """m; of what stands so high at the tray's edge all is in the picture."""
-_INK = "#d7263d"
+_OUTLINE_COLOR = "#d7263d"
 
 
-def detections_picture(observation: Observation) -> NDArray[np.uint8]:
+def draw_detections(observation: Observation) -> NDArray[np.uint8]:
     """(720, 720, 3) the part of the image with the tray, the brighter, the higher above it.
 
     What was recognised is outlined.
     """
     camera, depth = observation.camera, observation.depth
     size_px = np.array([camera.width, camera.height])
-    middle_px, wanted = camera.support_bounds(observation.support, _TALL) or (
+    center_px, support_side = camera.support_bounds(observation.support, _RIM_HEIGHT) or (
         np.array(camera.principal_point),
         np.inf,
     )
-    side = int(min(np.round(wanted), *size_px))
+    side = int(min(np.round(support_side), *size_px))
     left, top = np.clip(
-        np.floor(middle_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side
+        np.floor(center_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side
     ).tolist()
     rows, columns = slice(top, top + side), slice(left, left + side)
     pixels = pixel_grid(depth.shape)[rows, columns]
@@ -42,20 +42,28 @@ def detections_picture(observation: Observation) -> NDArray[np.uint8]:
         camera.backproject(pixels, np.where(measured, depth, 1.0)[rows, columns])[..., 2],
         0.0,
     )
-    shades = matplotlib.colormaps["viridis"](np.clip(height / _HIGHEST, 0, 1))[..., :3]
-    size = (_OVERSAMPLING * SIDE, _OVERSAMPLING * SIDE)
+    shades = matplotlib.colormaps["viridis"](np.clip(height / _MAX_HEIGHT, 0, 1))[..., :3]
+    size = (_OVERSAMPLING * IMAGE_SIDE, _OVERSAMPLING * IMAGE_SIDE)
     canvas = Canvas(
         Image.fromarray((255 * shades).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
     )
     labels = []
     for detection in observation.detections:
-        small = Image.fromarray(detection.mask[rows, columns])
-        mask = np.asarray(small.resize(size, Image.Resampling.NEAREST))
+        cropped_mask = Image.fromarray(detection.mask[rows, columns])
+        mask = np.asarray(cropped_mask.resize(size, Image.Resampling.NEAREST))
         if not mask.any():
             continue
-        canvas.outline(mask, (0, 0), _INK, 4)
+        canvas.draw_outline(mask, (0, 0), _OUTLINE_COLOR, 4)
         ys, xs = np.nonzero(mask)
-        about = (float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max()))
-        labels.append(Label(humanised(detection.object_class.name), middle(mask), about, _INK, 34))
-    canvas.labels(labels)
-    return np.asarray(canvas.image.resize((SIDE, SIDE), Image.Resampling.LANCZOS))
+        bounds = (float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max()))
+        labels.append(
+            TextLabel(
+                display_name(detection.object_class.name),
+                innermost_point(mask),
+                bounds,
+                _OUTLINE_COLOR,
+                34,
+            )
+        )
+    canvas.draw_labels(labels)
+    return np.asarray(canvas.image.resize((IMAGE_SIDE, IMAGE_SIDE), Image.Resampling.LANCZOS))

@@ -16,17 +16,17 @@ CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures"})
 """Fields of the work cell, which settings name without its own name."""
 
 
-def in_world(setting: str) -> str:
+def qualify_setting(setting: str) -> str:
     """Return FIELD=VALUE with the field's full name in the world."""
     return f"cell.{setting}" if setting.split("=")[0].split(".")[0] in CELL_FIELDS else setting
 
 
-def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
+def check_cell_models(cell: "WorkCell", default: "WorkCell", file: Path | None) -> None:
     """Read the models of a cell, before anything is done with it.
 
     Args:
         cell: The cell.
-        before: What it was without options: what the models are then, a command may do without.
+        default: What it was without options: what the models are then, a command may do without.
         file: Which file it is from; None: from --set.
 
     Raises:
@@ -35,7 +35,7 @@ def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
     from drake_clutter.files import InputError
     from drake_clutter.simulation.cell_plant import check_models
 
-    if (cell.robot, cell.fixtures) == (before.robot, before.fixtures):
+    if (cell.robot, cell.fixtures) == (default.robot, default.fixtures):
         return
     try:
         check_models(cell)
@@ -43,14 +43,14 @@ def check_cell(cell: "WorkCell", before: "WorkCell", file: Path | None) -> None:
         raise InputError(f"{file or '--set'}: {error}") from error
 
 
-def refuse_support(settings: Sequence[str] | None) -> None:
+def reject_support_settings(settings: Sequence[str] | None) -> None:
     """Refuse settings of the support, on which the objects of scenes stand already.
 
     Raises:
         InputError: There is one.
     """
     for setting in settings or ():
-        if in_world(setting).startswith(
+        if qualify_setting(setting).startswith(
             ("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")
         ):
             raise input_error(
@@ -59,11 +59,11 @@ def refuse_support(settings: Sequence[str] | None) -> None:
             )
 
 
-def load_world(
+def load_config_from_options(
     config: Path | None,
     cell: Path | None,
     settings: Sequence[str] | None,
-    of_scenes: "WorkCell | None" = None,
+    scene_cell: "WorkCell | None" = None,
 ) -> "ClutterConfig":
     """Return the world: the defaults with the cell, over them the config's fields, and single fields.
 
@@ -71,23 +71,23 @@ def load_world(
         config: File of the config.
         cell: File of the cell.
         settings: Single fields.
-        of_scenes: Stands for the default cell; or None.
+        scene_cell: Stands for the default cell; or None.
     """
     from drake_clutter.cell.work_cell import load_cell
     from drake_clutter.config import ClutterConfig, upgrade
     from drake_clutter.validation import load_config_as
 
-    default = ClutterConfig() if of_scenes is None else ClutterConfig(cell=of_scenes)
+    default = ClutterConfig() if scene_cell is None else ClutterConfig(cell=scene_cell)
     base = default if cell is None else replace(default, cell=load_cell(cell))
-    world = load_config_as(base, config, upgrade=upgrade)
-    world = load_config_as(
-        world, settings=[in_world(setting) for setting in settings or ()], upgrade=upgrade
+    loaded = load_config_as(base, config, upgrade=upgrade)
+    loaded = load_config_as(
+        loaded, settings=[qualify_setting(setting) for setting in settings or ()], upgrade=upgrade
     )
-    check_cell(world.cell, default.cell, cell or config)
-    return world
+    check_cell_models(loaded.cell, default.cell, cell or config)
+    return loaded
 
 
-def load_scene_and_world(
+def load_scene_and_config(
     scene: Path,
     catalog: Path | None,
     config: Path | None,
@@ -106,10 +106,10 @@ def load_scene_and_world(
     from drake_clutter.validation import load_config_as
 
     file = load_scene(scene, load_catalog(catalog))
-    of_scene = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
-    world = load_config_as(replace(ClutterConfig(), cell=of_scene), config, upgrade=upgrade)
-    world = load_config_as(
-        world, settings=[in_world(setting) for setting in settings or ()], upgrade=upgrade
+    scene_cell = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
+    loaded = load_config_as(replace(ClutterConfig(), cell=scene_cell), config, upgrade=upgrade)
+    loaded = load_config_as(
+        loaded, settings=[qualify_setting(setting) for setting in settings or ()], upgrade=upgrade
     )
-    check_cell(world.cell, file.cell, cell or config)
-    return replace(file, scene=replace(file.scene, support=world.cell.support)), world
+    check_cell_models(loaded.cell, file.cell, cell or config)
+    return replace(file, scene=replace(file.scene, support=loaded.cell.support)), loaded

@@ -22,7 +22,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
-from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
@@ -30,12 +30,12 @@ from drake_clutter.tasks.full_knowledge import Solvability
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
-JOB_FILE, PROGRESS_FILE, SCENES = "job.json", "progress.json", "scenes"
-SUMMARY_FILE, SHEET_FILE = "summary.json", "contact_sheet.png"
+JOB_FILE, PROGRESS_FILE, SCENES_FOLDER = "job.json", "progress.json", "scenes"
+SUMMARY_FILE, CONTACT_SHEET_FILE = "summary.json", "contact_sheet.png"
 
 
 @dataclass(frozen=True)
-class _Factory:
+class _GeneratorFactory:
     """Makes a worker; picklable."""
 
     job: GenerationJob
@@ -44,7 +44,7 @@ class _Factory:
         return SceneGenerator(self.job)
 
 
-def generate(
+def generate_scenes(
     job: GenerationJob,
     count: int,
     out: Path,
@@ -78,7 +78,10 @@ def generate(
     for object_class in catalog.object_set(job.objects):
         _ = object_class.corners  # says what is missing before anything is written
     prepare_output_directory(
-        out, allowed_entries=frozenset({JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, SHEET_FILE, SCENES})
+        out,
+        allowed_entries=frozenset(
+            {JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER}
+        ),
     )
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
@@ -89,67 +92,74 @@ def generate(
     else:
         prepare_output_directory(out)
         write_json(out / JOB_FILE, job.fields)
-    (out / SCENES).mkdir(exist_ok=True)
-    paths = [out / SCENES / f"{index:04d}.yaml" for index in range(count)]
+    (out / SCENES_FOLDER).mkdir(exist_ok=True)
+    paths = [out / SCENES_FOLDER / f"{index:04d}.yaml" for index in range(count)]
     # Scenes are written in order, so what is there is a beginning.
-    done = next((index for index, path in enumerate(paths) if not path.exists()), count)
+    num_done = next((index for index, path in enumerate(paths) if not path.exists()), count)
     earlier_run = (
         json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
     )
-    seconds, failures = (
+    seconds, layout_failures = (
         float(earlier_run.get("seconds", 0.0)),
         Counter(earlier_run.get("layout_failures", {})),
     )
-    solvable: list[str | None] = earlier_run.get("solvable", [])[:done]
-    done = len(solvable)  # one less than the scenes, if the run was stopped between the two files
+    solvable: list[str | None] = earlier_run.get("solvable", [])[:num_done]
+    num_done = len(
+        solvable
+    )  # one less than the scenes, if the run was stopped between the two files
 
-    start = time.monotonic()
-    made: Iterable[GeneratedScene] = map_ordered(
-        _Factory(job), range(done, count), workers=workers, ray_address=ray_address
+    start_time = time.monotonic()
+    generated: Iterable[GeneratedScene] = map_ordered(
+        _GeneratorFactory(job), range(num_done, count), workers=workers, ray_address=ray_address
     )
-    for index, result in enumerate(progress(made, done, count), start=done):
-        failures.update(result.layout_failures)
+    for index, result in enumerate(progress(generated, num_done, count), start=num_done):
+        layout_failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, job.config.cell, result.verdict)
         solvable.append(result.solvable.value if result.solvable else None)
-        spent = seconds + time.monotonic() - start
+        total_seconds = seconds + time.monotonic() - start_time
         write_json(
             out / PROGRESS_FILE,
-            {"seconds": spent, "layout_failures": dict(failures), "solvable": solvable},
+            {
+                "seconds": total_seconds,
+                "layout_failures": dict(layout_failures),
+                "solvable": solvable,
+            },
         )
     seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
 
     files = [load_scene(path, catalog) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
-    answers = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
-    summary = summarise(job, judged, answers)
+    solvabilities = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
+    summary = summarise(job, judged, solvabilities)
     summary |= {
-        "layout_failures": dict(failures),
+        "layout_failures": dict(layout_failures),
         "seconds": round(seconds, 2),
         "workers": workers,
         "config": to_plain(job.config),
     }
     write_json(out / SUMMARY_FILE, summary)
     write_contact_sheet(
-        out / SHEET_FILE, [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])]
+        out / CONTACT_SHEET_FILE,
+        [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])],
     )
     return summary
 
 
-_camera: PictureCamera | None = None
+_renderer: SceneRenderer | None = None
 
 
 def _thumbnail(index: int, scene: Scene, verdict: Verdict) -> tuple[NDArray[np.uint8], str, bool]:
     """Picture, caption, and whether it is stable. An unstable scene is shown as it was laid out."""
-    global _camera
-    _camera = _camera or PictureCamera()
+    global _renderer
+    _renderer = _renderer or SceneRenderer()
     if verdict.instability is None:
         return (
-            _camera.overhead(scene.with_poses(verdict.settled)),
+            _renderer.render_overhead(scene.with_poses(verdict.settled)),
             f"{index:04d}  hidden {len(verdict.hidden)}",
             True,
         )
     return (
-        _camera.overhead(scene),
+        _renderer.render_overhead(scene),
         f"{index:04d}  {verdict.instability.reason.value}: {verdict.instability.object}",
         False,
     )

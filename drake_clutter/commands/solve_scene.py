@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.commands.explore import Report, carry_out, write_episode
+from drake_clutter.commands.explore_scene import TransitionCallback, execute_moves, write_episode
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json, write_text
 from drake_clutter.scenes.scene import Scene
@@ -12,25 +12,25 @@ from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
 from drake_clutter.yaml_io import to_yaml
 
 
-def solve(
+def solve_scene(
     scene: Scene,
-    name: str,
+    scene_name: str,
     out: Path,
     seed: int,
     budget: int,
     config: ClutterConfig,
-    report: Report,
+    on_transition: TransitionCallback,
 ) -> dict[str, Any]:
     """Searches, carries a plan out at fidelity `settle`, and writes `solution.json`; with a plan also `moves.yaml` and a page.
 
     Args:
         scene: at rest.
-        name: of the scene, for the page's title.
+        scene_name: of the scene, for the page's title.
         out: the folder.
         seed: of the places that are equally good, and of Drake's random offsets.
         budget: moves that the search may try.
         config: the world.
-        report: called after each move that is carried out.
+        on_transition: called after each move that is carried out.
 
     Returns:
         What `solution.json` holds.
@@ -54,10 +54,16 @@ def solve(
     if solution.plan:
         moves = [{"pick": move.pick, "place": move.place} for move in solution.plan]
         write_text(out / "moves.yaml", to_yaml(moves))
-        task = carry_out(scene, solution.plan, seed, config, report)
+        task = execute_moves(scene, solution.plan, seed, config, on_transition)
         fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
         write_episode(
-            out, task, f"The fewest moves for {name}", "full knowledge", "settle", seed, config
+            out,
+            task,
+            f"The fewest moves for {scene_name}",
+            "full knowledge",
+            "settle",
+            seed,
+            config,
         )
     write_json(out / "solution.json", fields)
     return fields

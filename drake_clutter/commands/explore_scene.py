@@ -31,10 +31,10 @@ from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
-Report = Callable[[Step], None]
+TransitionCallback = Callable[[Step], None]
 
 
-def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
+def settle_scene(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     """The scene as it settles.
 
     Raises:
@@ -48,14 +48,14 @@ def at_rest(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     return scene.with_poses(verdict.settled)
 
 
-def explore(
+def explore_scene(
     scene: Scene,
     agent_name: str,
     fidelity: str,
     max_moves: int,
     seed: int,
     config: ClutterConfig,
-    report: Report,
+    on_transition: TransitionCallback,
 ) -> ExplorationTask:
     """Plays an episode on a scene at rest.
 
@@ -66,36 +66,36 @@ def explore(
         max_moves: after which it ends.
         seed: of the agent's and the world's chances.
         config: the world.
-        report: called after each move.
+        on_transition: called after each move.
     """
     backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
     policy = make_explorers(agent_name, config)(backend)
-    return run_episode(backend, policy, max_moves=max_moves, report=report)
+    return run_episode(backend, policy, max_moves=max_moves, report=on_transition)
 
 
-def _check_names(moves: Sequence[Move], number: int, in_view: Sequence[str], scene: Scene) -> None:
-    move = moves[number]
+def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene: Scene) -> None:
+    move = moves[index]
     for role, name, allowed in (
-        ("pick", move.pick, in_view),
-        ("place", move.place, [TRAY, *in_view]),
+        ("pick", move.pick, visible),
+        ("place", move.place, [TRAY, *visible]),
     ):
         if name not in allowed or (role == "place" and name == move.pick):
-            known = (
+            problem = (
                 "is not in view, or the object itself"
                 if name in (*scene.names, TRAY)
                 else "is not in the scene"
             )
             raise InputError(
-                f"move {number + 1}, {role}: {name!r} {known}; allowed are {', '.join(allowed)}"
+                f"move {index + 1}, {role}: {name!r} {problem}; allowed are {', '.join(allowed)}"
             )
 
 
-def carry_out(
+def execute_moves(
     scene: Scene,
     moves: Sequence[Move],
     seed: int,
     config: ClutterConfig,
-    report: Report,
+    on_transition: TransitionCallback,
     fidelity: str = "settle",
 ) -> ExplorationTask:
     """Carries a list of moves out, on a scene at rest, until one makes it collapse.
@@ -105,7 +105,7 @@ def carry_out(
     """
     backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
 
-    def next_of_list(
+    def next_move(
         belief: Belief,
         observation: Observation,
         rng: np.random.Generator,
@@ -113,19 +113,19 @@ def carry_out(
         number = len(belief.history)
         if number == len(moves):
             return Decision(None)
-        _check_names(moves, number, [d.name for d in observation.detections], backend.scene)
+        _check_move(moves, number, [d.name for d in observation.detections], backend.scene)
         return Decision(moves[number])
 
     return run_episode(
         backend,
-        next_of_list,
+        next_move,
         max_moves=len(moves),
-        report=report,
+        report=on_transition,
         until_all_found=False,
     )
 
 
-def plan_only(
+def plan_moves(
     scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path
 ) -> list[dict[str, Any]]:
     """Plans how the arm would carry out each move in a scene at rest, as it is; writes `plan.json`, and returns what it holds.
@@ -133,16 +133,16 @@ def plan_only(
     Raises:
         InputError: as `carry_out`.
     """
-    look, rng, executor = (
+    perception, rng, executor = (
         LabelDetector(config.cell.camera).perceive(scene),
         item_rng(seed),
         ArmExecutor(config),
     )
     plans = list[dict[str, Any]]()
     for number, move in enumerate(moves):
-        _check_names(moves, number, [d.name for d in look.observation.detections], scene)
-        command = resolve_placement(move, look.observation, config.exploration, rng)
-        found = (
+        _check_move(moves, number, [d.name for d in perception.observation.detections], scene)
+        command = resolve_placement(move, perception.observation, config.exploration, rng)
+        plan = (
             PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, move.place)
             if command is None
             else executor.plan(
@@ -150,7 +150,7 @@ def plan_only(
                 command,
             )
         )
-        plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(found)})
+        plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(plan)})
     write_json(
         out / "plan.json",
         {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans},
@@ -176,7 +176,7 @@ def read_moves(path: Path) -> list[Move]:
     return [Move(entry.pick, entry.place) for entry in entries]
 
 
-def episode_fields(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
+def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
     """The document of `episode.json`."""
     end = task.end or EpisodeEnd.GAVE_UP
     moves = []
@@ -219,13 +219,13 @@ def write_episode(
     seed: int,
     config: ClutterConfig,
     *,
-    more: Mapping[str, Any] | None = None,
+    extra_fields: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
 
-    At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `more` is put over what is known of the episode.
+    At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `extra_fields` replace fields of the episode.
     """
-    fields = {**episode_fields(task, agent, fidelity, seed), **(more or {})}
+    fields = {**episode_to_dict(task, agent, fidelity, seed), **(extra_fields or {})}
     cell = config.cell.with_support(task.start.support)
     save_scene(out / "after.yaml", task.scene, cell)
     write_episode_page(out, title, task.start, task.first_look, task.steps, fields, cell)

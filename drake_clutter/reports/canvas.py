@@ -22,7 +22,7 @@ Rectangle = tuple[float, float, float, float]
 
 
 @lru_cache
-def font(size: int) -> ImageFont.FreeTypeFont:
+def load_font(size: int) -> ImageFont.FreeTypeFont:
     """A bold sans-serif font of a height in pixels."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
@@ -30,24 +30,24 @@ def font(size: int) -> ImageFont.FreeTypeFont:
 
 
 @dataclass(frozen=True)
-class Label:
+class TextLabel:
     """A few words that belong to a place in a picture.
 
     Attributes:
         text: the words.
         anchor: (x, y), what the label is about.
-        about: (left, top, right, bottom) of what it is about; it should stay recognisable.
-        colour: of its box, or of its words if it is faint.
+        target: (left, top, right, bottom) of what it is about; it should stay recognisable.
+        color: of its box, or of its words if it is faint.
         size: height of the font.
-        faint: dark words on a pale box, without a line to the anchor.
+        subtle: dark words on a pale box, without a line to the anchor.
     """
 
     text: str
     anchor: tuple[float, float]
-    about: Rectangle
-    colour: str
+    target: Rectangle
+    color: str
     size: int
-    faint: bool = False
+    subtle: bool = False
 
 
 @dataclass
@@ -56,46 +56,46 @@ class Canvas:
 
     Attributes:
         image: RGB.
-        taken: rectangles (left, top, right, bottom) that labels keep clear of.
+        occupied: rectangles (left, top, right, bottom) that labels keep clear of.
     """
 
     image: Image.Image
-    taken: list[Rectangle] = field(default_factory=list)
+    occupied: list[Rectangle] = field(default_factory=list)
 
     @property
     def _draw(self) -> ImageDraw.ImageDraw:
         return ImageDraw.Draw(self.image, "RGBA")
 
-    def outline(
-        self, mask: NDArray[np.bool_], corner: tuple[int, int], colour: str, width: int
+    def draw_outline(
+        self, mask: NDArray[np.bool_], corner: tuple[int, int], color: str, width: int
     ) -> None:
         """The inner edge of a region (height, width) whose left upper corner lies at `corner`."""
         edge = mask & ~binary_erosion(mask, iterations=width)
-        self.image.paste(Image.new("RGB", edge.shape[::-1], colour), corner, Image.fromarray(edge))
+        self.image.paste(Image.new("RGB", edge.shape[::-1], color), corner, Image.fromarray(edge))
 
-    def dashed(self, corners: NDArray[np.float64], colour: str, width: int) -> None:
+    def draw_dashed_hull(self, points: NDArray[np.float64], color: str, width: int) -> None:
         """The convex hull of points (N, 2), as a dashed line on a pale one."""
-        hull = corners[ConvexHull(corners).vertices]
-        ring = [(float(x), float(y)) for x, y in (*hull, hull[0])]
-        self._draw.line(ring, fill=_HALO + "a0", width=width + 4, joint="curve")
-        dash, left, on = 5.0 * width, 5.0 * width, True
-        for (x0, y0), (x1, y1) in itertools.pairwise(ring):
+        hull = points[ConvexHull(points).vertices]
+        outline = [(float(x), float(y)) for x, y in (*hull, hull[0])]
+        self._draw.line(outline, fill=_HALO + "a0", width=width + 4, joint="curve")
+        dash, remaining, drawing = 5.0 * width, 5.0 * width, True
+        for (x0, y0), (x1, y1) in itertools.pairwise(outline):
             length, done = math.hypot(x1 - x0, y1 - y0), 0.0
             while done < length:
-                step = min(left, length - done)
+                step = min(remaining, length - done)
                 a, b = done / length, (done + step) / length
-                if on:
+                if drawing:
                     ends = [
                         (x0 + a * (x1 - x0), y0 + a * (y1 - y0)),
                         (x0 + b * (x1 - x0), y0 + b * (y1 - y0)),
                     ]
-                    self._draw.line(ends, fill=colour, width=width)
-                done, left = done + step, left - step
-                if left <= 0:
-                    left, on = (0.6 * dash, False) if on else (dash, True)
+                    self._draw.line(ends, fill=color, width=width)
+                done, remaining = done + step, remaining - step
+                if remaining <= 0:
+                    remaining, drawing = (0.6 * dash, False) if drawing else (dash, True)
 
-    def arrow(
-        self, start: tuple[float, float], end: tuple[float, float], colour: str, width: int
+    def draw_arrow(
+        self, start: tuple[float, float], end: tuple[float, float], color: str, width: int
     ) -> None:
         """A slightly bent arrow; nothing if it would be shorter than its head."""
         a, b = np.asarray(start), np.asarray(end)
@@ -109,53 +109,53 @@ class Canvas:
         direction = (b - bend) / np.hypot(*(b - bend))
         across = np.array([-direction[1], direction[0]])
         shaft = [(float(x), float(y)) for x, y in curve if np.hypot(*(b - [x, y])) > 0.8 * head]
-        for fill, margin in ((_HALO, 4), (colour, 0)):
+        for fill, margin in ((_HALO, 4), (color, 0)):
             tip, back = b + 1.5 * margin * direction, b - (head + margin) * direction
             wings = [back + side * (0.55 * head + 1.3 * margin) * across for side in (-1, 1)]
             self._draw.line(shaft, fill=fill, width=width + 2 * margin, joint="curve")
             self._draw.polygon([(float(x), float(y)) for x, y in (tip, *wings)], fill=fill)
-        self.taken += [(x - width, y - width, x + width, y + width) for x, y in shaft]
+        self.occupied += [(x - width, y - width, x + width, y + width) for x, y in shaft]
 
-    def labels(self, labels: Sequence[Label]) -> None:
+    def draw_labels(self, labels: Sequence[TextLabel]) -> None:
         """Labels, each as near to its anchor as there is room; the first ones choose first."""
-        placed = []
+        placed_labels = []
         for label in labels:
-            box = self._room(label)
-            self.taken.append(box)
-            placed.append((label, box))
-        for label, (left, top, right, bottom) in placed:
+            box = self._place_label(label)
+            self.occupied.append(box)
+            placed_labels.append((label, box))
+        for label, (left, top, right, bottom) in placed_labels:
             x, y = label.anchor
-            if not label.faint and not (left <= x <= right and top <= y <= bottom):
+            if not label.subtle and not (left <= x <= right and top <= y <= bottom):
                 end = (min(max(x, left), right), min(max(y, top), bottom))
                 self._draw.line([label.anchor, end], fill=_HALO, width=8)
-                self._draw.line([label.anchor, end], fill=label.colour, width=4)
+                self._draw.line([label.anchor, end], fill=label.color, width=4)
                 self._draw.ellipse(
-                    (x - 7, y - 7, x + 7, y + 7), fill=label.colour, outline=_HALO, width=2
+                    (x - 7, y - 7, x + 7, y + 7), fill=label.color, outline=_HALO, width=2
                 )
-        for label, box in placed:
-            fill, ink = ("#ffffffd8", label.colour) if label.faint else (label.colour, "#ffffff")
+        for label, box in placed_labels:
+            fill, ink = ("#ffffffd8", label.color) if label.subtle else (label.color, "#ffffff")
             self._draw.rounded_rectangle(
-                box, label.size * 0.35, fill=fill, outline=None if label.faint else _HALO, width=2
+                box, label.size * 0.35, fill=fill, outline=None if label.subtle else _HALO, width=2
             )
             self._draw.text(
                 ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2),
                 label.text,
                 ink,
-                font(label.size),
+                load_font(label.size),
                 anchor="mm",
             )
 
-    def _room(self, label: Label) -> Rectangle:
-        width = font(label.size).getlength(label.text) + 0.7 * label.size
+    def _place_label(self, label: TextLabel) -> Rectangle:
+        width = load_font(label.size).getlength(label.text) + 0.7 * label.size
         height = 1.4 * label.size
-        own = max(1.0, _overlap(label.about, label.about))
-        hiding = 0.0 if label.faint else 16 * height / own
-        best, least = (0.0, 0.0, width, height), math.inf
+        target_area = max(1.0, _intersection_area(label.target, label.target))
+        occlusion_weight = 0.0 if label.subtle else 16 * height / target_area
+        best, best_cost = (0.0, 0.0, width, height), math.inf
         for radius, angle in itertools.product(
             np.arange(0, 12) * 0.8 * height, np.arange(12) * (math.pi / 6)
         ):
-            away = 0.02 * height * radius
-            if away >= least:
+            distance_cost = 0.02 * height * radius
+            if distance_cost >= best_cost:
                 break
             x = label.anchor[0] + radius * math.cos(angle) * 1.5
             y = label.anchor[1] - radius * math.sin(angle)
@@ -163,16 +163,16 @@ class Canvas:
             y = min(max(y, height / 2 + 4), self.image.height - height / 2 - 4)
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
             cost = (
-                away
-                + hiding * _overlap(box, label.about)
-                + sum(_overlap(box, other) for other in self.taken)
+                distance_cost
+                + occlusion_weight * _intersection_area(box, label.target)
+                + sum(_intersection_area(box, other) for other in self.occupied)
             )
-            if cost < least:
-                best, least = box, cost
+            if cost < best_cost:
+                best, best_cost = box, cost
         return best
 
 
-def middle(mask: NDArray[np.bool_]) -> tuple[float, float]:
+def innermost_point(mask: NDArray[np.bool_]) -> tuple[float, float]:
     """The point (x, y) of a region (height, width) that lies farthest from its edge."""
     row, column = np.unravel_index(
         int(np.argmax(distance_transform_edt(np.pad(mask, 1)))), np.add(mask.shape, 2)
@@ -180,6 +180,6 @@ def middle(mask: NDArray[np.bool_]) -> tuple[float, float]:
     return float(column - 1), float(row - 1)
 
 
-def _overlap(a: Rectangle, b: Rectangle) -> float:
+def _intersection_area(a: Rectangle, b: Rectangle) -> float:
     """Common area, px^2."""
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 
-def in_words(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]:
+def evaluation_table_rows(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]:
     """Return a row of `summarise_episodes` as lines of a table, one for each limit of moves.
 
     A line has its cells by column.
@@ -24,9 +24,9 @@ def in_words(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]
     return lines
 
 
-def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def describe_plans(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what of `plan.json` fits on a screen, by move."""
-    words = {}
+    descriptions = {}
     for plan in plans:
         move = f"{plan['move']['pick']} to {plan['move']['place']}"
         if plan["planned"]:
@@ -37,10 +37,12 @@ def plans_in_words(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 (s["min_distance"] for s in plan["segments"] if s["min_distance"] is not None),
                 default=None,
             )
-            clear = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
-            words[move] = f"{', '.join(parts)}; {clear}; planned in {plan['planning_time']:.2f} s"
+            distance_text = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
+            descriptions[move] = (
+                f"{', '.join(parts)}; {distance_text}; planned in {plan['planning_time']:.2f} s"
+            )
         else:
-            words[move] = (
+            descriptions[move] = (
                 f"no plan: {plan['reason']}{': ' + plan['detail'] if plan['detail'] else ''}"
             )
-    return words
+    return descriptions

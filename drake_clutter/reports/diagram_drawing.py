@@ -1,6 +1,6 @@
 """A picture of a Diagram: its systems along their longest loop, and what runs between them.
 
-python -m drake_clutter.reports.diagram_picture docs/images/closed_loop.svg
+python -m drake_clutter.reports.diagram_drawing docs/images/closed_loop.svg
 """
 
 import sys
@@ -21,66 +21,69 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.closed_loop import ClosedLoop
 
-_WIDTH, _HEIGHT = 4.3, 1.0
+_BOX_WIDTH, _BOX_HEIGHT = 4.3, 1.0
 """Of a system's box, in the units of the picture."""
-_AWAY = 0.13
+_ARROW_OFFSET = 0.13
 """By which the arrow of one direction keeps away from that of the other."""
 
 
-def connections(diagram: Diagram) -> nx.DiGraph:
+def connection_graph(diagram: Diagram) -> nx.DiGraph:
     """Systems by name; on an edge `ports`, what runs along it: the output ports' names, and the inputs' if they have others."""
-    found = defaultdict[tuple[str, str], list[str]](list)
+    port_labels = defaultdict[tuple[str, str], list[str]](list)
     for (reader, to), (writer, of) in diagram.connection_map().items():
         output, input_ = writer.get_output_port(of).get_name(), reader.get_input_port(to).get_name()
-        found[writer.get_name(), reader.get_name()].append(
+        port_labels[writer.get_name(), reader.get_name()].append(
             output if output == input_ else f"{output} → {input_}"
         )
     graph = nx.DiGraph()
     graph.add_nodes_from(system.get_name() for system in diagram.GetSystems())
     graph.add_edges_from(
-        (a, b, {"ports": sorted(ports)}) for (a, b), ports in sorted(found.items())
+        (a, b, {"ports": sorted(ports)}) for (a, b), ports in sorted(port_labels.items())
     )
     return graph
 
 
 def draw_diagram(diagram: Diagram, path: Path) -> None:
     """Draws a diagram to a file of a kind that Matplotlib knows."""
-    graph = connections(diagram)
-    loop = max(nx.simple_cycles(graph), key=len)
-    first = loop.index(min(loop))
-    loop = loop[first:] + loop[:first]
-    order = [*loop, *(name for name in graph if name not in loop)]
+    graph = connection_graph(diagram)
+    cycle = max(nx.simple_cycles(graph), key=len)
+    first = cycle.index(min(cycle))
+    cycle = cycle[first:] + cycle[:first]
+    order = [*cycle, *(name for name in graph if name not in cycle)]
     angles = np.pi / 2 - 2 * np.pi * np.arange(len(order)) / len(order)
-    at = {
+    centers = {
         name: np.array([6.2 * np.cos(a), 3.6 * np.sin(a)])
         for name, a in zip(order, angles, strict=True)
     }
     plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "drake_clutter", "font.size": 15})
     figure, axes = plt.subplots(figsize=(15, 9), layout="constrained")
-    kinds = {system.get_name(): type(system).__name__ for system in diagram.GetSystems()}
-    for name, (x, y) in at.items():
-        corner = (x - _WIDTH / 2, y - _HEIGHT / 2)
+    type_names = {system.get_name(): type(system).__name__ for system in diagram.GetSystems()}
+    for name, (x, y) in centers.items():
+        corner = (x - _BOX_WIDTH / 2, y - _BOX_HEIGHT / 2)
         axes.add_patch(
             Rectangle(
                 corner,
-                _WIDTH,
-                _HEIGHT,
+                _BOX_WIDTH,
+                _BOX_HEIGHT,
                 facecolor="#e8eef7",
                 edgecolor="#30507a",
                 linewidth=2,
                 zorder=2,
             )
         )
-        axes.text(x, y + 0.17, kinds[name], ha="center", va="center", weight="bold", zorder=3)
+        axes.text(x, y + 0.17, type_names[name], ha="center", va="center", weight="bold", zorder=3)
         axes.text(x, y - 0.22, name, ha="center", va="center", size=12, color="#444444", zorder=3)
     for a, b, ports in graph.edges(data="ports"):
-        way = at[b] - at[a]
-        aside = (
-            _AWAY * np.array([way[1], -way[0]]) / np.linalg.norm(way)
+        direction = centers[b] - centers[a]
+        offset = (
+            _ARROW_OFFSET * np.array([direction[1], -direction[0]]) / np.linalg.norm(direction)
             if graph.has_edge(b, a)
             else np.zeros(2)
         )
-        start, end = _at_box(at[a], way, aside), _at_box(at[b], -way, aside)
+        start, end = (
+            _box_intersection(centers[a], direction, offset),
+            _box_intersection(centers[b], -direction, offset),
+        )
         arrow = {
             "arrowstyle": "-|>",
             "linewidth": 2,
@@ -90,11 +93,11 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
             "shrinkB": 0,
         }
         axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=arrow, zorder=1)
-        middle = (start + end) / 2 + 2.2 * aside
+        label_position = (start + end) / 2 + 2.2 * offset
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
         axes.text(
-            middle[0],
-            middle[1],
+            label_position[0],
+            label_position[1],
             "\n".join(ports),
             ha="center",
             va="center",
@@ -108,11 +111,13 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     plt.close(figure)
 
 
-def _at_box(middle: np.ndarray, way: np.ndarray, aside: np.ndarray) -> np.ndarray:
+def _box_intersection(center: np.ndarray, direction: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Where a line that goes past the middle of a box, so far aside of it, leaves the box."""
     with np.errstate(divide="ignore"):
-        scale = np.min((np.copysign(np.array([_WIDTH, _HEIGHT]) / 2, way) - aside) / way)
-    return np.asarray(middle + aside + scale * way)
+        scale = np.min(
+            (np.copysign(np.array([_BOX_WIDTH, _BOX_HEIGHT]) / 2, direction) - offset) / direction
+        )
+    return np.asarray(center + offset + scale * direction)
 
 
 if __name__ == "__main__":

@@ -23,79 +23,80 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
-_READ_AT = 10
+PAPER_MOVE_LIMIT = 10
 """Moves at which a longer search is read, too (SPEC section 6)."""
 
 
-def limits(max_moves: int) -> list[int]:
+def move_limits(max_moves: int) -> list[int]:
     """Numbers of moves for which there are figures."""
-    return sorted({min(_READ_AT, max_moves), max_moves})
+    return sorted({min(PAPER_MOVE_LIMIT, max_moves), max_moves})
 
 
 @dataclass(frozen=True)
-class PlayableScene:
+class EvaluationScene:
     """A scene at rest that hides something.
 
     Attributes:
         file: a scene file, or a set.
-        number: in the set; None for a scene file.
+        index: in the set; None for a scene file.
         classes: names of those that its objects may have.
         cell: that it was made with.
     """
 
     file: Path
-    number: int | None
+    index: int | None
     classes: frozenset[str]
     cell: WorkCell
 
 
-def playable(named: str, catalog_folder: Path | None) -> list[PlayableScene]:
+def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[EvaluationScene]:
     """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set with each number.
 
     Args:
-        named: a folder, a set's file, or the name of a set that is shipped.
+        source: a folder, a set's file, or the name of a set that is shipped.
         catalog_folder: with object classes of one's own.
 
     Raises:
         InputError: nothing of that name, no scene files, one that is broken, or none that can be played.
     """
-    catalog, scenes = load_catalog(catalog_folder), Path(named)
+    catalog, scenes = load_catalog(catalog_folder), Path(source)
     if not scenes.exists():
         sets = {
             path.stem: path
             for path in resource_path("training/scenes").glob("*.json")
             if not path.stem.startswith("train_")
         }
-        if named not in sets:
+        if source not in sets:
             raise InputError(
-                f"--scenes {named}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}"
+                f"--scenes {source}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}"
             )
-        scenes = sets[named]
+        scenes = sets[source]
     if scenes.is_file():
-        held = load_scene_dataset(scenes, catalog)
-        classes = frozenset(c.name for c in held.classes)
+        scene_set = load_scene_dataset(scenes, catalog)
+        classes = frozenset(c.name for c in scene_set.classes)
         return [
-            PlayableScene(scenes, number, classes, held.cell) for number in range(len(held.scenes))
+            EvaluationScene(scenes, number, classes, scene_set.cell)
+            for number in range(len(scene_set.scenes))
         ]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
             f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote, or a set of scenes"
         )
-    found = []
+    evaluation_scenes = []
     for path in paths:
         file = load_scene(path, catalog)
         if file.verdict is not None and file.verdict.hidden:
             names = frozenset(o.object_class.name for o in file.scene.objects)
-            found.append(PlayableScene(path, None, names, file.cell))
-    if not found:
+            evaluation_scenes.append(EvaluationScene(path, None, names, file.cell))
+    if not evaluation_scenes:
         raise InputError(
             f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes"
         )
-    return found
+    return evaluation_scenes
 
 
-def cell_of(scenes: Sequence[PlayableScene]) -> WorkCell:
+def common_cell(scenes: Sequence[EvaluationScene]) -> WorkCell:
     """Return the cell in which all of the scenes were made; its support is the first one's.
 
     Raises:
@@ -109,8 +110,8 @@ def cell_of(scenes: Sequence[PlayableScene]) -> WorkCell:
     return first.cell
 
 
-def evaluate(
-    scenes: Sequence[PlayableScene],
+def evaluate_explorers(
+    scenes: Sequence[EvaluationScene],
     agents: Sequence[str],
     max_moves: int,
     fidelity: str,
@@ -140,13 +141,13 @@ def evaluate(
     for agent in agents:
         make_explorers(agent, config, classes)  # says what is wrong before anything is played
     episodes = [
-        Episode(scene.file, scene.number, agent, index)
+        Episode(scene.file, scene.index, agent, index)
         for agent in agents
         for index, scene in enumerate(scenes)
     ]
-    make_player = partial(EpisodePlayer, config, catalog_folder, max_moves, seed, fidelity)
-    played = map_ordered(make_player, episodes, workers=workers, ray_address=ray_address)
-    results = [result for result in progress(played, len(episodes)) if result.hidden]
+    make_worker = partial(EpisodePlayer, config, catalog_folder, max_moves, seed, fidelity)
+    results_in_order = map_ordered(make_worker, episodes, workers=workers, ray_address=ray_address)
+    results = [result for result in progress(results_in_order, len(episodes)) if result.hidden]
     if not results:
         raise InputError(
             f"--scenes: none of {len(scenes)} hides anything from the camera of --config; give scenes that do"
@@ -154,13 +155,13 @@ def evaluate(
     rows = [
         {"agent": agent}
         | summarise_episodes(
-            [result for result in results if result.agent == agent], limits(max_moves)
+            [result for result in results if result.agent == agent], move_limits(max_moves)
         )
         for agent in agents
     ]
     if out is None:
         return rows
-    files = sorted({scene.file for scene in scenes})
+    scene_paths = sorted({scene.file for scene in scenes})
     fields = {
         "max_moves": max_moves,
         "seed": seed,
@@ -168,6 +169,9 @@ def evaluate(
         "config": to_plain(config),
         "rows": rows,
     }
-    fields |= {"commit": git_commit(), "scenes": {str(file): file_sha256(file) for file in files}}
+    fields |= {
+        "commit": git_commit(),
+        "scenes": {str(file): file_sha256(file) for file in scene_paths},
+    }
     write_json(out, fields | {"episodes": [asdict(result) for result in results]})
     return rows

@@ -8,7 +8,7 @@ from PIL import Image
 from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
-from drake_clutter.reports.pictures import PictureCamera
+from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera import OverheadCamera
 
@@ -25,26 +25,26 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
         The visible share of each object, of the camera that an explorer sees through.
     """
     cameras = config.cell.cameras
-    shares = [
-        _render(scene, camera, out, f"{name}_" if len(cameras) > 1 else "")
+    visible_fractions = [
+        _write_camera_images(scene, camera, out, f"{name}_" if len(cameras) > 1 else "")
         for name, camera in cameras.items()
     ]
-    Image.fromarray(PictureCamera().oblique(scene)).save(out / "picture.png")
-    return shares[0]
+    Image.fromarray(SceneRenderer().render_oblique(scene)).save(out / "picture.png")
+    return visible_fractions[0]
 
 
-def _render(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
+def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
     """Writes what one camera sees; returns the visible share of each object."""
     camera = OverheadCamera(config)
-    images, shares = camera.render(scene), camera.visible_shares(scene)
+    images, visible_fractions = camera.render(scene), camera.visible_shares(scene)
     depth = np.rint(images.depth / DEPTH_UNIT)
     depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
     Image.fromarray(images.color).save(out / f"{prefix}color.png")
     Image.fromarray(depth.astype(np.uint16)).save(out / f"{prefix}depth.png")
     Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
-    hidden = list(camera.hidden(shares))
+    hidden = list(camera.hidden(visible_fractions))
     write_json(
         out / f"{prefix}visible.json",
-        {"visible_share": shares, "hidden": hidden, "names": list(scene.names)},
+        {"visible_share": visible_fractions, "hidden": hidden, "names": list(scene.names)},
     )
-    return shares
+    return visible_fractions

@@ -7,7 +7,7 @@ from typing import Any
 
 from drake_clutter.agents.generation import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.explore import Report, at_rest, write_episode
+from drake_clutter.commands.explore_scene import TransitionCallback, settle_scene, write_episode
 from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
@@ -18,16 +18,16 @@ from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
 from drake_clutter.validation import config_yaml
 
-DEMO_TRIES = 5
+MAX_DEMO_SCENES = 5
 """Scenes that the demo explores at most."""
-SCENE_TRIES = 50
+MAX_GENERATED_SCENES = 50
 """Scenes that a generator may make until one is stable and hides something."""
 
 
-def scene_of(
-    scenario: Scenario, first: int = 0, suits: Callable[[Scene], bool] = lambda _: True
+def load_or_generate_scene(
+    scenario: Scenario, first_index: int = 0, is_suitable: Callable[[Scene], bool] = lambda _: True
 ) -> tuple[Scene, int]:
-    """The scenario's scene at rest, and the index under which the generator made it; from `first` on, the first that suits.
+    """The scenario's scene at rest, and the index under which the generator made it; from `first_index` on, the first that suits.
 
     Raises:
         InputError: a scene file that cannot be used, or a generator that makes no such scene that is stable and hides something.
@@ -37,7 +37,9 @@ def scene_of(
         file = load_scene(Path(scenario.scene), load_catalog(catalog))
         judged = file.verdict is not None and file.verdict.stable
         return (
-            file.settled_scene if judged else at_rest(file.scene, scenario.world, scenario.seed)
+            file.settled_scene
+            if judged
+            else settle_scene(file.scene, scenario.world, scenario.seed)
         ), 0
     job = GenerationJob(
         scenario.generator,
@@ -47,48 +49,59 @@ def scene_of(
         scenario.seed,
         scenario.world,
     )
-    generate = SceneGenerator(job)
-    for index in range(first, first + SCENE_TRIES):
-        made = generate(index)
-        if made.verdict.hidden and suits(scene := made.scene.with_poses(made.verdict.settled)):
+    generator = SceneGenerator(job)
+    for index in range(first_index, first_index + MAX_GENERATED_SCENES):
+        generated = generator(index)
+        if generated.verdict.hidden and is_suitable(
+            scene := generated.scene.with_poses(generated.verdict.settled)
+        ):
             return scene, index
     raise InputError(
-        f"generator: none of {SCENE_TRIES} scenes by {scenario.generator} is stable, hides something and suits"
+        f"generator: none of {MAX_GENERATED_SCENES} scenes by {scenario.generator} is stable, hides something and suits"
     )
 
 
-def play(scenario: Scenario, scene: Scene, report: Report) -> tuple[ExplorationTask, Timing]:
+def run_closed_loop(
+    scenario: Scenario, scene: Scene, on_transition: TransitionCallback
+) -> tuple[ExplorationTask, Timing]:
     """Plays a scenario on a scene at rest."""
     policy = policy_of(scenario.agent, scenario.world)
     perceive = perception_of(scenario, scene.support)
-    loop = ClosedLoop(
+    closed_loop = ClosedLoop(
         scene,
         perceive=perceive,
         seed=scenario.seed,
         world=scenario.world,
         record=True,
     )
-    task = run_episode(loop, policy, max_moves=scenario.max_moves, report=report)
-    return task, loop.timing
+    task = run_episode(closed_loop, policy, max_moves=scenario.max_moves, report=on_transition)
+    return task, closed_loop.timing
 
 
-def write(
-    out: Path, scenario: Scenario, task: ExplorationTask, timing: Timing, title: str, **more: int
+def write_scenario_results(
+    out: Path,
+    scenario: Scenario,
+    task: ExplorationTask,
+    timing: Timing,
+    title: str,
+    **extra_fields: int,
 ) -> dict[str, Any]:
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.start, scenario.world.cell)
-    told: dict[str, Any] = {"timing": asdict(timing), **more}
+    told: dict[str, Any] = {"timing": asdict(timing), **extra_fields}
     return write_episode(
-        out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, more=told
+        out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, extra_fields=told
     )
 
 
-def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
+def run_scenario(
+    scenario: Scenario, out: Path, on_transition: TransitionCallback
+) -> dict[str, Any]:
     """Plays a scenario; see `write`."""
-    scene, _ = scene_of(scenario)
-    task, timing = play(scenario, scene, report)
-    return write(
+    scene, _ = load_or_generate_scene(scenario)
+    task, timing = run_closed_loop(scenario, scene, on_transition)
+    return write_scenario_results(
         out,
         scenario,
         task,
@@ -97,22 +110,24 @@ def run(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
     )
 
 
-def demo(scenario: Scenario, out: Path, report: Report) -> dict[str, Any]:
+def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -> dict[str, Any]:
     """SG* makes scenes, and the arm searches them by depth images alone, until everything is found in one; see `write`.
 
     Scenes in which no arm finds everything are passed over.
     """
-    ceiling, index = ArmCeiling(scenario.world), -1
-    for tried in range(1, DEMO_TRIES + 1):  # noqa: B007, the last one is told
-        scene, index = scene_of(scenario, index + 1, lambda scene: not ceiling.never_found(scene))
-        task, timing = play(scenario, scene, report)
+    arm_bound, index = ArmCeiling(scenario.world), -1
+    for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, the last one is told
+        scene, index = load_or_generate_scene(
+            scenario, index + 1, lambda scene: not arm_bound.never_found(scene)
+        )
+        task, timing = run_closed_loop(scenario, scene, on_transition)
         if task.end is EpisodeEnd.ALL_FOUND:
             break
-    return write(
+    return write_scenario_results(
         out,
         scenario,
         task,
         timing,
         f"SG* hides, the arm searches: seed {scenario.seed}, scene {index}",
-        scenes_tried=tried,
+        scenes_tried=num_scenes,
     )
