@@ -11,9 +11,9 @@ from functools import cache
 
 import numpy as np
 
-from drake_clutter.agents.backends import backends
-from drake_clutter.agents.exploration import PolicyMaker, make_explorers
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.backend_factory import make_backend_factory
+from drake_clutter.agents.explorers import PolicyFactory, make_policy_factory
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
@@ -27,7 +27,7 @@ from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
 from drake_clutter.tasks.episode import BackendFactory, run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
 
 WORLD, MAX_MOVES, OBJECTS = ClutterConfig(), 10, "ycb7"
 NODES = 25
@@ -95,13 +95,13 @@ def _scene(case: Case) -> Scene:
 
 
 @cache
-def _explorers(agent: str) -> PolicyMaker:
-    return make_explorers(agent, WORLD)
+def _explorers(agent: str) -> PolicyFactory:
+    return make_policy_factory(agent, WORLD)
 
 
 @cache
 def _backends(fidelity: str) -> BackendFactory:
-    return backends(fidelity, WORLD, follow_falls=True)
+    return make_backend_factory(fidelity, WORLD, follow_falls=True)
 
 
 def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
@@ -209,7 +209,7 @@ def _verdict(judge: str, verdict: Verdict | InconclusiveVerdict) -> Line:
 def _episode(
     task: ExplorationTask,
     known: Sequence[SceneObject] = (),
-    end: str = EpisodeEnd.GAVE_UP.value,
+    end: str = TerminationReason.GAVE_UP.value,
 ) -> list[Line]:
     """An episode.
 
@@ -218,17 +218,17 @@ def _episode(
         known: K_t at the end, of an agent that keeps it.
         end: why the agent ended by itself, as it is recorded.
     """
-    ended = task.end.value if task.end else end
+    ended = task.termination.value if task.termination else end
     belief: dict[str, Part] = {}
     if known:
         names = "\n".join(f"{o.name} {o.object_class.name}" for o in known)
         belief = {"known": names, "at": _numbers(o.X_TO for o in known)}
-    poses = _numbers(task.start.poses.values())
-    start = Line(f"hidden {_named(task.hidden_at_start)}", {"poses": poses})
-    return [start, *(_move(step) for step in task.steps), Line(ended, belief)]
+    poses = _numbers(task.initial_scene.poses.values())
+    start = Line(f"hidden {_named(task.initially_hidden)}", {"poses": poses})
+    return [start, *(_move(step) for step in task.transitions), Line(ended, belief)]
 
 
-def _move(step: Step) -> Line:
+def _move(step: Transition) -> Line:
     outcome = step.outcome
     texts = [outcome.result.value, outcome.detail, outcome.instability, outcome.inconclusive]
     words = f"{step.move}: {'; '.join(str(text) for text in texts if text)}"

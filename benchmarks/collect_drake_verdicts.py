@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.records import resume_jsonl

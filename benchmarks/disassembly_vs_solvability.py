@@ -23,7 +23,7 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.statistics import wilson_interval
-from drake_clutter.tasks.full_knowledge import Solvability
+from drake_clutter.tasks.oracle_search import Solvability
 
 OUT = Path(__file__).parent / "results" / "come_apart.json"
 

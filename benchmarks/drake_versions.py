@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.explore_scene import explore_scene
 from drake_clutter.config import ClutterConfig
@@ -91,7 +91,11 @@ def measure(
             _frozen(number, config), EPISODES[2], "arm", 20, number, config, lambda _: None
         )
         episodes.append(
-            {"scene": number, "moves": len(task.steps), "seconds": time.perf_counter() - start}
+            {
+                "scene": number,
+                "moves": len(task.transitions),
+                "seconds": time.perf_counter() - start,
+            }
         )
     write_json(
         out,

@@ -15,20 +15,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.agents.soft_q import PARTS, Replay, SoftQConfig, SoftQLearner
+from drake_clutter.agents.message_passing import limit_operations_to_one_thread
+from drake_clutter.agents.soft_q import NUM_GRADIENT_SHARDS, ReplayBuffer, SoftQConfig, SoftQLearner
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 
 TIMED: dict[str, tuple[type, str]] = {
     "environments": (ClutterGeneration, "step"),
     "new episodes": (ClutterGeneration, "reset"),
-    "remembering": (Replay, "add"),
+    "remembering": (ReplayBuffer, "add"),
     "updates": (SoftQLearner, "_update"),
-    "of updates: drawing from memory": (Replay, "draw"),
+    "of updates: drawing from memory": (ReplayBuffer, "draw"),
     "of updates: losses and gradients": (SoftQLearner, "_loss"),
 }
 """What is timed. Gradients are summed over the threads, all else is of the wall clock."""
@@ -52,7 +52,7 @@ def measured(threads: int, steps: int) -> dict[str, Any]:
     classes = load_catalog().object_set("ycb7")
     learning = SoftQConfig(temperature=0.25)
     learner = SoftQLearner(
-        lambda: ClutterGeneration(classes, GenerationTask(), ClutterConfig()),
+        lambda: ClutterGeneration(classes, GenerationTaskConfig(), ClutterConfig()),
         learning,
         0,
         torch.device("cpu"),
@@ -62,11 +62,11 @@ def measured(threads: int, steps: int) -> dict[str, Any]:
     def run() -> float:
         until, start = learner.step + steps, time.perf_counter()
         while learner.step < until:
-            learner.advance()
+            learner.train_iteration()
         return time.perf_counter() - start
 
-    while learner.step < learning.warm_up + steps:
-        learner.advance()
+    while learner.step < learning.learning_starts + steps:
+        learner.train_iteration()
     whole = run()
     seconds: dict[str, float] = defaultdict(float)
     originals = {name: getattr(owner, method) for name, (owner, method) in TIMED.items()}
@@ -92,8 +92,8 @@ def main(
     ] = 8000,
 ) -> None:
     """Measures and prints; with nothing else running."""
-    one_thread_per_operation()
-    rows = [measured(threads, steps) for threads in range(1, PARTS + 1)]
+    limit_operations_to_one_thread()
+    rows = [measured(threads, steps) for threads in range(1, NUM_GRADIENT_SHARDS + 1)]
     table = Table(
         "part, share of the time",
         *[f"{row['threads']} thread(s), {row['steps_per_s']:.0f} steps/s" for row in rows],

@@ -32,7 +32,7 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.pybullet_world import label_image, load, poses
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.files import write_json
@@ -44,7 +44,7 @@ from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.stability.visibility import RayCaster
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
+from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.validation import config_yaml
 
 CONFIG = ClutterConfig()
@@ -295,7 +295,7 @@ def measure(
 def searched(cases: Sequence[Case]) -> dict[str, Row]:
     """The search on the scenes that are stable and hide something, as laid out, by how much they hide."""
     judge = FastJudge(CONFIG)
-    search = FullKnowledgeSearch(CONFIG, judge)
+    search = OracleSearch(CONFIG, judge)
     parts: dict[str, list[Case]] = {name: [] for name in HIDDEN}
     for case in cases:
         if judge.stability(case.scene) is None:
@@ -316,10 +316,10 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
             )
             rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
             rows[name]["median_moves_tried"] = float(
-                np.median([solution.moves_tried for solution in solutions])
+                np.median([solution.moves_evaluated for solution in solutions])
             )
             rows[name] |= {
-                answer.value: float(np.mean([s.answer is answer for s in solutions]))
+                answer.value: float(np.mean([s.solvability is answer for s in solutions]))
                 for answer in Solvability
             }
     return rows

@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig

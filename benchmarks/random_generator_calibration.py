@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator, summarise
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator, summarize_scenes
 from drake_clutter.config import load_config
 from drake_clutter.files import InputError, write_json
 from drake_clutter.resources import git_commit
@@ -75,7 +75,7 @@ def main(
         start = time.monotonic()
         scenes = map_ordered(_Size(job), range(count), workers=workers)
         made = list(track(scenes, f"{size} nodes", total=count, console=Console(stderr=True)))
-        row = summarise(job, [(m.scene, m.verdict) for m in made])
+        row = summarize_scenes(job, [(m.scene, m.verdict) for m in made])
         shares = [m.verdict.visible_fractions.values() for m in made if m.verdict.stable]
         row["hidden_by_threshold"] = {
             str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import RandomGenerator
+from drake_clutter.agents.generators import RandomGenerator
 from drake_clutter.catalog import Rest, Shape, load_catalog
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json

@@ -40,14 +40,14 @@ from .simulation.judge import DrakeJudge as DrakeJudge
 from .stability.judge import FastJudge as FastJudge
 
 # Scene generation.
-from .agents.generation import (
+from .agents.generators import (
     GenerationAgent as GenerationAgent,
     SceneGenerator as SceneGenerator,
     make_generation_agent as make_generation_agent,
 )
-from .tasks.generation import (
+from .tasks.generation_task import (
     ClutterGeneration as ClutterGeneration,
-    GenerationTask as GenerationTask,
+    GenerationTaskConfig as GenerationTaskConfig,
 )
 
 # Exploration.
@@ -62,11 +62,11 @@ from .scenes.interfaces import (
 from .scenes.placement import resolve_placement as resolve_placement
 from .tasks.belief import Belief as Belief, Decision as Decision, Policy as Policy
 from .tasks.episode import Backend as Backend, run_episode as run_episode
-from .tasks.exploration import ExplorationTask as ExplorationTask
+from .tasks.exploration_task import ExplorationTask as ExplorationTask
 from .tasks.clutter_exploration import ClutterExploration as ClutterExploration
-from .tasks.full_knowledge import FullKnowledgeSearch as FullKnowledgeSearch
-from .agents.backends import backends as backends
-from .agents.exploration import make_explorers as make_explorers
+from .tasks.oracle_search import OracleSearch as OracleSearch
+from .agents.backend_factory import make_backend_factory as make_backend_factory
+from .agents.explorers import make_policy_factory as make_policy_factory
 
 # The arm: plans and their simulation.
 from .planning.pick_place_plan import (
@@ -82,7 +82,7 @@ from .station.trajectory_file import (
     read_trajectories as read_trajectories,
     write_trajectories as write_trajectories,
 )
-from .tasks.feasibility import FeasibilityStudy as FeasibilityStudy
+from .tasks.feasibility_study import FeasibilityStudy as FeasibilityStudy
 
 # The closed loop.
 from .systems.closed_loop import ClosedLoop as ClosedLoop

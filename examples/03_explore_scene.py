@@ -6,10 +6,10 @@ import numpy as np
 
 from drake_clutter import (
     ClutterConfig,
-    backends,
     load_catalog,
     load_scene_dataset,
-    make_explorers,
+    make_backend_factory,
+    make_policy_factory,
     run_episode,
 )
 from drake_clutter.resources import resource_path
@@ -20,14 +20,16 @@ def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
     scenes = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), load_catalog())
     scene = scenes.settled_scene(index, scenes.grammar, config)
 
-    backend = backends(fidelity, config)(scene, np.random.default_rng(0))
-    policy = make_explorers(agent, config)(backend)
+    backend = make_backend_factory(fidelity, config)(scene, np.random.default_rng(0))
+    policy = make_policy_factory(agent, config)(backend)
     task = run_episode(backend, policy, max_moves=max_moves)
 
-    print(f"{len(scene.objects)} objects, hidden at the start: {list(task.hidden_at_start)}")
-    for step in task.steps:
-        print(f"{step.move}: {step.outcome.result.value}, found {list(step.newly_found)}")
-    print(f"ended: {task.end.value if task.end else 'no move left'}")
+    print(f"{len(scene.objects)} objects, hidden at the start: {list(task.initially_hidden)}")
+    for transition in task.transitions:
+        print(
+            f"{transition.move}: {transition.outcome.result.value}, found {list(transition.newly_found)}"
+        )
+    print(f"ended: {task.termination.value if task.termination else 'no move left'}")
 
 
 if __name__ == "__main__":

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drake_clutter import ClutterConfig, ClutterGeneration, GenerationTask, load_catalog
-from drake_clutter.agents.learned_generator import about_values
-from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner, play
+from drake_clutter import ClutterConfig, ClutterGeneration, GenerationTaskConfig, load_catalog
+from drake_clutter.agents.learned_generator import rule_network_metadata
+from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner, sample_episodes
 from drake_clutter.learning.checkpoint import save_checkpoint
 
 
 def evaluate(learner: SoftQLearner, make: Callable[[], ClutterGeneration], count: int) -> str:
     """Return the mean score of sampled scenes and the fraction of stable ones."""
-    episodes = play(learner.network, make, count, temperature=0.25, seed=1)
+    episodes = sample_episodes(learner.network, make, count, temperature=0.25, seed=1)
     stable = np.mean(["scene" in episode.info for episode in episodes])
-    score = np.mean([episode.score for episode in episodes])
+    score = np.mean([episode.episodic_return for episode in episodes])
     return f"step {learner.step}: score {score:.2f}, stable {stable:.2f}"
 
 
@@ -25,18 +25,18 @@ def main(steps: int, scenes: int, out: Path) -> None:
     classes = load_catalog().object_set("ycb7")
 
     def make_environment() -> ClutterGeneration:
-        return ClutterGeneration(classes, GenerationTask(nodes=15), ClutterConfig())
+        return ClutterGeneration(classes, GenerationTaskConfig(nodes=15), ClutterConfig())
 
-    config = SoftQConfig(steps=steps, warm_up=min(2000, steps // 4))
+    config = SoftQConfig(total_timesteps=steps, learning_starts=min(2000, steps // 4))
     learner = SoftQLearner(make_environment, config, 0, torch.device("cpu"), 2)
     print(evaluate(learner, make_environment, scenes))
     for round_end in np.linspace(0, steps, 5)[1:]:
         while learner.step < round_end:
-            learner.advance()
+            learner.train_iteration()
         print(evaluate(learner, make_environment, scenes))
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    network = about_values(make_environment().grammar, config.width)
+    network = rule_network_metadata(make_environment().grammar, config.width)
     about = {"kind": "generator", "network": network, "temperature": config.temperature}
     save_checkpoint(out, learner.network, about)
     print(f"drake-clutter generate --agent {out} --nodes 15 --count 12 --out out/tutorial/mine")

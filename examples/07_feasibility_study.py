@@ -31,7 +31,7 @@ def count_results(base_x: float, index: int) -> Counter[str]:
     scenes = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), load_catalog())
     scene = scenes.settled_scene(index, scenes.grammar, config)
     study = FeasibilityStudy(f"base {base_x}", config, PlannerConfig(optimize=False), 0)
-    return Counter(row.result for row in study.moves(f"{index:04d}", index, scene))
+    return Counter(row.result for row in study.plan_all_moves(f"{index:04d}", index, scene))
 
 
 def main(count: int, workers: int) -> None:

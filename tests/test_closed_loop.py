@@ -10,7 +10,7 @@ from conftest import DEFAULT_CELL, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from drake_clutter.agents.exploration import largest_clear
+from drake_clutter.agents.explorers import largest_clear
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run_scenario import load_or_generate_scene as scenario_scene
 from drake_clutter.commands.run_scenario import run_closed_loop, write_scenario_results
@@ -36,7 +36,7 @@ from drake_clutter.systems.scenario import Scenario, policy_of
 from drake_clutter.systems.station_camera import empty_depth
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.validation import load_config_as
 
 COVERED = scene_of(
@@ -223,14 +223,14 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     loop = ClosedLoop(scene, seed=0, world=config, record=True)
     task = run_episode(loop, marker_first, max_moves=4)
     timing = loop.timing
-    results = [step.outcome.result for step in task.steps]
+    results = [step.outcome.result for step in task.transitions]
     assert results == [MoveResult.NOT_PLANNED, MoveResult.PLACED]
-    assert task.steps[0].outcome.detail == "no seal: large_marker"
-    placed = task.steps[1]
+    assert task.transitions[0].outcome.detail == "no seal: large_marker"
+    placed = task.transitions[1]
     assert (placed.move, placed.newly_found) == (Move("cracker_box"), ("gelatin_box",))
     assert placed.outcome.motion[0].arm is not None
     assert max(frame.time for frame in placed.outcome.motion) > 2
-    assert task.end is EpisodeEnd.ALL_FOUND
+    assert task.termination is TerminationReason.ALL_FOUND
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
     assert 3 < timing.robot < 15
     fields = write_scenario_results(
@@ -251,8 +251,11 @@ def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfi
     cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
     loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record=True)
     task = run_episode(loop, largest_clear, max_moves=1)
-    (step,) = task.steps
-    assert (step.outcome.result, task.end) == (MoveResult.PLACED, EpisodeEnd.ALL_FOUND)
+    (step,) = task.transitions
+    assert (step.outcome.result, task.termination) == (
+        MoveResult.PLACED,
+        TerminationReason.ALL_FOUND,
+    )
     arm = step.outcome.motion[0].arm
     assert arm is not None
     assert len(arm.q) == joints
@@ -261,7 +264,7 @@ def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfi
 
 def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:
     task, _ = run_closed_loop(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
-    assert task.end is EpisodeEnd.ALL_FOUND
+    assert task.termination is TerminationReason.ALL_FOUND
 
 
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
@@ -284,7 +287,7 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
 
 def test_a_random_explorer_plays(config: ClutterConfig) -> None:
     task, timing = run_closed_loop(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
-    assert len(task.steps) == 1
+    assert len(task.transitions) == 1
     assert timing.robot > 0
 
 
@@ -323,7 +326,7 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
     )
     loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
     loop.policy_system.policy = policy
-    observation = loop.look.observation
+    observation = loop.perception.observation
     assert loop.policy_system.decided(PolicyState(), observation).phase is Phase.DONE
     allowed = set(legal_moves(observation)) - set(given[0].invalid_moves)
     assert allowed == {Move(can.name)}

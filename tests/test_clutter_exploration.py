@@ -15,13 +15,13 @@ import torch
 from conftest import CATALOG, DEFAULT_CELL, cell_with, random_scene, training_script
 from gymnasium.utils.env_checker import check_env
 
-from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig, advantage
-from drake_clutter.agents.backends import FIDELITIES, backends
-from drake_clutter.agents.cloning import Cloning, CloningConfig
-from drake_clutter.agents.exploration import make_explorers
-from drake_clutter.agents.exploration_episodes import Played, acting, figures, play_episodes
-from drake_clutter.agents.explorer_network import ExplorerNetwork, log_probability, stacked_graphs
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer
+from drake_clutter.agents.backend_factory import FIDELITIES, make_backend_factory
+from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
+from drake_clutter.agents.explorer_network import ExplorerNetwork, action_log_probs, collate_graphs
+from drake_clutter.agents.explorers import make_policy_factory
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata
+from drake_clutter.agents.ppo import PPOConfig, PPOLearner, compute_gae
+from drake_clutter.agents.rollouts import Rollout, collect_rollouts, episode_metrics, make_policy_fn
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -37,8 +37,8 @@ from drake_clutter.scenes.scene_dataset import (
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.exploration_graph import FEATURES
+from drake_clutter.tasks.exploration_graph import NODE_FEATURES
+from drake_clutter.tasks.exploration_task import TerminationReason
 
 ROOT = Path(__file__).parents[1]
 
@@ -85,14 +85,14 @@ def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) 
     observation, _ = environment.reset(options={"scene": 1})
     picked = 0
     while (
-        environment.task.end is None
+        environment.task.termination is None
         and (moves := np.flatnonzero(observation["allowed"][:, 0])).size
     ):
-        least = observation["feature"][:, FEATURES.index("z")][moves].argmin()
+        least = observation["feature"][:, NODE_FEATURES.index("z")][moves].argmin()
         observation, *_ = environment.step((moves[least], 0))
         picked += 1
         assert environment.observation_space.contains(observation)
-    assert observation["feature"][:, FEATURES.index("times_picked")].max() == 10, picked
+    assert observation["feature"][:, NODE_FEATURES.index("times_picked")].max() == 10, picked
 
 
 @pytest.mark.parametrize("privileged", [False, True])
@@ -105,18 +105,18 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -
     for seed in range(12):
         observation, _ = environment.reset(seed=seed)
         total, known = 0.0, environment.objects
-        while environment.task.end is None:
+        while environment.task.termination is None:
             names = (TRAY, *known)
             moves = [
                 Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()
             ]
-            legal = set(legal_moves(environment.task.look.observation))
+            legal = set(legal_moves(environment.task.perception.observation))
             assert len(moves) == len(set(moves))
             assert set(moves) == legal - set(environment.backend.belief.invalid_moves)
             shown = (
                 environment.task.scene.names
                 if privileged
-                else tuple(sorted(environment.task.known))
+                else tuple(sorted(environment.task.detected))
             )
             assert (known if privileged else tuple(sorted(known))) == shown
             observation, reward, over, out_of_moves, info = environment.step(
@@ -126,8 +126,8 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -
             assert environment.objects[: len(known)] == known
             known = environment.objects
             assert (over or out_of_moves) == ("end" in info)
-        ends.add(environment.task.end)
-        collapsed = environment.task.end is EpisodeEnd.COLLAPSED
+        ends.add(environment.task.termination)
+        collapsed = environment.task.termination is TerminationReason.COLLAPSED
         assert total == len(environment.task.found) - collapsed
     assert len(ends) > 1
 
@@ -145,7 +145,7 @@ def test_what_may_not_be_named_changes_nothing(scenes: SceneDataset) -> None:
         again, reward, over, out_of_moves, _ = environment.step(move)
         assert (reward, over, out_of_moves) == (0.0, False, False)
         assert all(np.array_equal(again[name], observation[name]) for name in observation)
-    assert environment.task.steps == []
+    assert environment.task.transitions == []
 
 
 def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneDataset) -> None:
@@ -156,21 +156,23 @@ def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneDataset) ->
             (0, 0) if number < 3 else random_move(observation, np.random.default_rng(1))
         )
         assert (over, out_of_moves) == (False, number == 3)
-    assert info["end"] is EpisodeEnd.OUT_OF_MOVES
-    assert len(environment.task.steps) == 1
+    assert info["end"] is TerminationReason.OUT_OF_MOVES
+    assert len(environment.task.transitions) == 1
 
 
 @pytest.mark.parametrize("fidelity", FIDELITIES)
 def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
-    environment = ClutterExploration(scenes, fidelity=backends(fidelity, ClutterConfig()))
+    environment = ClutterExploration(
+        scenes, fidelity=make_backend_factory(fidelity, ClutterConfig())
+    )
     before, _ = environment.reset(options={"scene": 2})
-    height = before["feature"][:, FEATURES.index("z")]
+    height = before["feature"][:, NODE_FEATURES.index("z")]
     highest = max(
         np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node])
     )
     after, *_, info = environment.step((highest, 0))
     assert info["step"].outcome.result is MoveResult.PLACED
-    assert after["feature"][highest, FEATURES.index("z")] < height[highest] - 0.05
+    assert after["feature"][highest, NODE_FEATURES.index("z")] < height[highest] - 0.05
     assert after["glob"].tolist() == [pytest.approx(1 / 20)]
 
 
@@ -179,7 +181,7 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDatase
     starts: list[dict[str, Pose]] = []
     for options in (None, None, {"scene": 0}, {"scene": 0}):
         environment.reset(seed=len(starts), options=options)
-        starts.append(environment.task.start.poses)
+        starts.append(environment.task.initial_scene.poses)
     assert starts[0].keys() == starts[1].keys()
     assert starts[0] != starts[1]
     assert starts[2] == starts[3]
@@ -190,9 +192,9 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDatase
 
 def test_too_many_objects_are_refused(scenes: SceneDataset) -> None:
     with pytest.raises(InputError, match="none stands and hides something, with at most 2 objects"):
-        ClutterExploration(scenes, most_objects=2).reset(seed=0)
-    with pytest.raises(InputError, match="most_objects: 2; this scene has 11"):
-        ClutterExploration(scenes, most_objects=2).reset(options={"scene": 0})
+        ClutterExploration(scenes, max_objects=2).reset(seed=0)
+    with pytest.raises(InputError, match="max_objects: 2; this scene has 11"):
+        ClutterExploration(scenes, max_objects=2).reset(options={"scene": 0})
     with pytest.raises(InputError, match="scene: 3; allowed is 0 to 2"):
         ClutterExploration(scenes).reset(options={"scene": 3})
 
@@ -212,21 +214,21 @@ def test_the_environment_needs_no_arm() -> None:
 def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneDataset) -> None:
     """Of four episodes, all moves of two are called good, and all of the others bad."""
     environment = ClutterExploration(scenes, privileged=True, max_moves=4)
-    learner = ActorCritic(
-        environment, ActorCriticConfig(width=8, learning_rate=0.01), 0, torch.device("cpu")
+    learner = PPOLearner(
+        environment, PPOConfig(width=8, learning_rate=0.01), 0, torch.device("cpu")
     )
     rng = np.random.default_rng(0)
-    played = play_episodes(environment, 4, (0,), acting(learner.network, rng))
+    played = collect_rollouts(environment, 4, (0,), make_policy_fn(learner.network, rng))
     for number, episode in enumerate(played):
-        episode.rewards = [1.0 if number < 2 else -1.0] * len(episode.moves)
-        episode.notes = [(chance, 0.0) for chance, _ in episode.notes]
+        episode.rewards = [1.0 if number < 2 else -1.0] * len(episode.actions)
+        episode.policy_extras = [(chance, 0.0) for chance, _ in episode.policy_extras]
 
     def lead() -> float:
         good, bad = likelihood(learner.network, played[:2]), likelihood(learner.network, played[2:])
         return good - bad
 
     before = lead()
-    learner.learn(played, rng)
+    learner.update(played, rng)
     assert lead() > before + 0.05
 
 
@@ -236,81 +238,96 @@ def test_a_clone_does_more_and_more_what_its_teacher_would(
 ) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(3)
-    teacher = ExplorerNetwork(len(environment.numbers), 8)
-    config = CloningConfig(
-        width=8, rounds=3, episodes=4, updates=60, batch=16, learning_rate=0.01, dagger=dagger
+    teacher = ExplorerNetwork(len(environment.node_kind_ids), 8)
+    config = BehaviorCloningConfig(
+        width=8,
+        iterations=3,
+        episodes_per_iteration=4,
+        updates_per_iteration=60,
+        batch_size=16,
+        learning_rate=0.01,
+        dagger=dagger,
     )
     learner, fresh = (
-        Cloning(environment, teacher, config, 0, torch.device("cpu")) for _ in range(2)
+        BehaviorCloningLearner(environment, teacher, config, 0, torch.device("cpu"))
+        for _ in range(2)
     )
-    first, second = learner.advance(), learner.advance()
+    first, second = learner.train_iteration(), learner.train_iteration()
     for played, student_plays in ((first, False), (second, dagger)):
         differs = [
             (move != note).any()
             for episode in played
-            for move, note in zip(episode.moves, episode.notes, strict=True)
+            for move, note in zip(episode.actions, episode.policy_extras, strict=True)
         ]
         assert any(differs) == student_plays
-        wanted = [replace(episode, moves=episode.notes) for episode in played]
+        wanted = [replace(episode, actions=episode.policy_extras) for episode in played]
         assert likelihood(learner.network, wanted) > likelihood(fresh.network, wanted) + 0.5
 
 
-def likelihood(network: ExplorerNetwork, played: Sequence[Played]) -> float:
+def likelihood(network: ExplorerNetwork, played: Sequence[Rollout]) -> float:
     """The mean log-probability of the moves."""
     with torch.no_grad():
         found = network(
-            stacked_graphs(
+            collate_graphs(
                 [observation for episode in played for observation in episode.observations]
             )
         )
-        moves = torch.from_numpy(np.array([move for episode in played for move in episode.moves]))
-        return float(log_probability(found, network.places(found, moves[:, 0]), moves).mean())
+        moves = torch.from_numpy(np.array([move for episode in played for move in episode.actions]))
+        return float(
+            action_log_probs(found, network.place_log_probs(found, moves[:, 0]), moves).mean()
+        )
 
 
 def test_episodes_are_the_same_for_the_same_seed(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(0)
-    network = ExplorerNetwork(len(environment.numbers), 8)
+    network = ExplorerNetwork(len(environment.node_kind_ids), 8)
 
-    def played(side_by_side: int, seed: int) -> list[Played]:
-        return play_episodes(environment, 7, (seed, 1), acting(network, None), side_by_side)
+    def played(side_by_side: int, seed: int) -> list[Rollout]:
+        return collect_rollouts(
+            environment, 7, (seed, 1), make_policy_fn(network, None), side_by_side
+        )
 
     one, other = played(3, 5), played(7, 5)
-    assert [[m.tolist() for m in e.moves] for e in one] == [
-        [m.tolist() for m in e.moves] for e in other
+    assert [[m.tolist() for m in e.actions] for e in one] == [
+        [m.tolist() for m in e.actions] for e in other
     ]
     assert (
         [e.rewards for e in one] == [e.rewards for e in other] != [e.rewards for e in played(7, 6)]
     )
-    told = figures(one)
-    assert told["success"] == sum(e.end is EpisodeEnd.ALL_FOUND for e in one) / 7
+    told = episode_metrics(one)
+    assert told["success"] == sum(e.termination is TerminationReason.ALL_FOUND for e in one) / 7
     assert told["score"] == pytest.approx(np.mean([sum(e.rewards) for e in one]))
 
 
 def test_the_advantage_is_the_weighted_sum_of_what_comes() -> None:
     values, rewards, discount, trace = [1.0, -0.5, 2.0], [0.0, 3.0, -1.0], 0.9, 0.8
-    episode = Played(
-        moves=[np.zeros(2, int)] * 3, rewards=rewards, notes=[(0.0, value) for value in values]
+    episode = Rollout(
+        actions=[np.zeros(2, int)] * 3,
+        rewards=rewards,
+        policy_extras=[(0.0, value) for value in values],
     )
     errors = [rewards[k] + discount * (*values, 0.0)[k + 1] - values[k] for k in range(3)]
     expected = [
         sum((discount * trace) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)
     ]
-    assert advantage(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
+    assert compute_gae(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneDataset) -> None:
     """The same object, by its node in either graph."""
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(1)
-    teacher = ExplorerNetwork(len(environment.numbers), 8)
-    cloning = Cloning(environment, teacher, CloningConfig(width=8), 0, torch.device("cpu"))
+    teacher = ExplorerNetwork(len(environment.node_kind_ids), 8)
+    cloning = BehaviorCloningLearner(
+        environment, teacher, BehaviorCloningConfig(width=8), 0, torch.device("cpu")
+    )
     for seed in range(5):
         environment.reset(seed=seed)
-        ((x, y),) = cloning.wanted([environment]).tolist()
+        ((x, y),) = cloning.expert_actions([environment]).tolist()
         told = ClutterExploration(scenes, privileged=True, max_moves=5)
-        told.begin(environment.task.scene)
-        ((a, b),) = acting(teacher, None)([told], [told.observe()])[0].tolist()
+        told.reset_to_scene(environment.task.scene)
+        ((a, b),) = make_policy_fn(teacher, None)([told], [told.observe()])[0].tolist()
         named = [
             TRAY if node == 0 else names[node - 1]
             for names, node in ((told.objects, a), (told.objects, b))
@@ -319,18 +336,18 @@ def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneDataset) -> No
 
 
 TEACHER_SETTINGS = [
-    "learning.steps=240",
-    "learning.episodes=6",
+    "learning.total_timesteps=240",
+    "learning.episodes_per_iteration=6",
     "learning.width=8",
     "max_moves=4",
     "evaluate_every=40",
 ]
 TEACHER_SETTINGS += ["evaluation_episodes=4"]
 STUDENT_SETTINGS = [
-    "learning.rounds=6",
-    "learning.episodes=5",
+    "learning.iterations=6",
+    "learning.episodes_per_iteration=5",
     "learning.width=8",
-    "learning.updates=4",
+    "learning.updates_per_iteration=4",
     "max_moves=4",
 ]
 STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
@@ -345,12 +362,12 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(
         *(TEACHER_SETTINGS if script == "train_explorer_ppo" else STUDENT_SETTINGS),
     ]
     if script == "train_explorer_dagger":
-        numbers = ClutterExploration(file).numbers
+        numbers = ClutterExploration(file).node_kind_ids
         torch.manual_seed(3)
         save_checkpoint(
             tmp_path / "t.safetensors",
             ExplorerNetwork(len(numbers), 8),
-            {"kind": TEACHER, "network": about_explorer(numbers, 8)},
+            {"kind": TEACHER, "network": explorer_metadata(numbers, 8)},
         )
         settings += [f"teacher={tmp_path / 't.safetensors'}"]
     options = [argument for setting in settings for argument in ("--set", setting)]
@@ -382,32 +399,36 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(
     # What was written plays.
     environment = ClutterExploration(file, max_moves=4)
     environment.reset(options={"scene": 0})
-    make_policy = make_explorers(str(tmp_path / "whole" / "explorer.safetensors"), ClutterConfig())
+    make_policy = make_policy_factory(
+        str(tmp_path / "whole" / "explorer.safetensors"), ClutterConfig()
+    )
     task = run_episode(environment.backend, make_policy(environment.backend), max_moves=4)
-    decision = task.steps[0].decision
-    assert sum(decision.picks.values()) == pytest.approx(1, abs=1e-5)
-    assert set(decision.picks) == {d.name for d in task.first_look.observation.detections}
-    everything = set(environment.task.start.names)
-    assert (set(decision.known) == everything) == (script == "train_explorer_ppo")
+    decision = task.transitions[0].decision
+    assert sum(decision.pick_probabilities.values()) == pytest.approx(1, abs=1e-5)
+    assert set(decision.pick_probabilities) == {
+        d.name for d in task.initial_perception.observation.detections
+    }
+    everything = set(environment.task.initial_scene.names)
+    assert (set(decision.considered) == everything) == (script == "train_explorer_ppo")
 
 
 def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Path) -> None:
     """With no rate of learning it stays as it was; a teacher is no student."""
-    numbers, begun = ClutterExploration(file).numbers, tmp_path / "s.safetensors"
+    numbers, begun = ClutterExploration(file).node_kind_ids, tmp_path / "s.safetensors"
     torch.manual_seed(3)
     cloned = ExplorerNetwork(len(numbers), 8)
-    save_checkpoint(begun, cloned, {"kind": STUDENT, "network": about_explorer(numbers, 8)})
+    save_checkpoint(begun, cloned, {"kind": STUDENT, "network": explorer_metadata(numbers, 8)})
     settings = [
         f"scenes={file}",
         f"warm_start={begun}",
         *TEACHER_SETTINGS,
-        "learning.steps=10",
+        "learning.total_timesteps=10",
         "learning.learning_rate=1.0e-30",
     ]
     train = training_script("train_explorer_ppo")
     train.main(tmp_path / "tuned", settings=[*settings, "privileged=false"])
     tuned = load_checkpoint(tmp_path / "tuned" / "explorer.safetensors")
-    assert tuned.about["kind"] == STUDENT
+    assert tuned.metadata["kind"] == STUDENT
     assert all(
         torch.equal(value, tuned.weights[name]) for name, value in cloned.state_dict().items()
     )
@@ -422,31 +443,31 @@ def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Pa
 
 def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--agent nobody; allowed are random, .*full-knowledge"):
-        make_explorers("nobody", ClutterConfig())
+        make_policy_factory("nobody", ClutterConfig())
     path = tmp_path / "s.safetensors"
-    numbers = ClutterExploration(file).numbers
-    about = {"kind": STUDENT, "network": about_explorer(numbers, 8)}
+    numbers = ClutterExploration(file).node_kind_ids
+    about = {"kind": STUDENT, "network": explorer_metadata(numbers, 8)}
     save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"kind": "generator"})
     with pytest.raises(
         InputError,
         match=r"s\.safetensors: is a checkpoint of a generator; allowed is one of a teacher or student",
     ):
-        make_explorers(str(path), ClutterConfig())
+        make_policy_factory(str(path), ClutterConfig())
     save_checkpoint(
         path,
         ExplorerNetwork(len(numbers), 8),
-        about | {"network": {**about_explorer(numbers, 8), "features": []}},
+        about | {"network": {**explorer_metadata(numbers, 8), "features": []}},
     )
     with pytest.raises(InputError, match="was trained on other features"):
-        make_explorers(str(path), ClutterConfig())
+        make_policy_factory(str(path), ClutterConfig())
     save_checkpoint(
         path,
         ExplorerNetwork(2, 8),
-        {"kind": STUDENT, "network": about_explorer({TRAY: 1, "sugar_box": 2}, 8)},
+        {"kind": STUDENT, "network": explorer_metadata({TRAY: 1, "sugar_box": 2}, 8)},
     )
     environment = ClutterExploration(file)
     environment.reset(options={"scene": 0})
-    agent = make_explorers(str(path), ClutterConfig())(environment.backend)
+    agent = make_policy_factory(str(path), ClutterConfig())(environment.backend)
     with pytest.raises(InputError, match="was not trained with"):
         run_episode(environment.backend, agent, max_moves=1)
 
@@ -454,8 +475,8 @@ def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
 def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig) -> None:
     """Among 39 objects the tray is soon full."""
     scenes = ROOT / "training/scenes/sg_star_40.json"
-    environment = ClutterExploration(scenes, config=config, max_moves=20, most_objects=39)
-    explorers = make_explorers("student", config)
+    environment = ClutterExploration(scenes, config=config, max_moves=20, max_objects=39)
+    explorers = make_policy_factory("student", config)
     on_the_tray = set()
     for number in range(3):
         environment.reset(options={"scene": number})
@@ -464,7 +485,7 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
         def checked(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
             decision = agent(belief, observation, rng)  # noqa: B023, called in this round
             move = decision.move
-            likelihood = sum(decision.picks.values())
+            likelihood = sum(decision.pick_probabilities.values())
             assert likelihood in (0, pytest.approx(1)), "as the network had it, with room or not"
             legal = legal_moves(observation)
             room = {m for m in legal if find_free_placements(observation, m, config.exploration)}
@@ -483,11 +504,11 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
 def test_full_knowledge_finds_everything(scenes: SceneDataset, config: ClutterConfig) -> None:
     environment = ClutterExploration(scenes, max_moves=20)
     environment.reset(options={"scene": 1})
-    policy = make_explorers("full-knowledge", config)(environment.backend)
+    policy = make_policy_factory("full-knowledge", config)(environment.backend)
     task = run_episode(environment.backend, policy, max_moves=20)
-    assert task.hidden_at_start
-    assert task.end is EpisodeEnd.ALL_FOUND
-    assert task.steps[-1].newly_found
+    assert task.initially_hidden
+    assert task.termination is TerminationReason.ALL_FOUND
+    assert task.transitions[-1].newly_found
 
 
 def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) -> None:
@@ -500,6 +521,6 @@ def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) ->
     )
     environment = ClutterExploration(tmp_path / "tilted.json")
     environment.reset(options={"scene": 0})
-    observation = environment.backend.look.observation
+    observation = environment.backend.perception.observation
     assert observation.camera == environment.scenes.cell.camera
     assert observation.support.size == (0.75, 0.75)

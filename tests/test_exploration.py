@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting, rng, scene_of
 
-from drake_clutter.agents.exploration import (
-    BASELINES,
+from drake_clutter.agents.explorers import (
+    BASELINE_POLICIES,
     largest_clear,
     largest_first,
     random_explorer,
@@ -29,8 +29,13 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
-from drake_clutter.tasks.episode import SteppedBackend, run_episode, teleport_backends
-from drake_clutter.tasks.exploration import Attempt, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.episode import SteppedBackend, make_teleport_backend_factory, run_episode
+from drake_clutter.tasks.exploration_task import (
+    ExplorationTask,
+    MoveAttempt,
+    TerminationReason,
+    Transition,
+)
 
 # Two covers, one with two objects below it, one with one; and a marker in the open.
 HIDING = scene_of(
@@ -80,12 +85,12 @@ class Episode:
         max_moves: int = 10,
     ) -> None:
         self.backend = SteppedBackend(executor, detector, REWARDS, HIDING, rng())
-        self.task = ExplorationTask(HIDING, self.backend.look, REWARDS, max_moves)
+        self.task = ExplorationTask(HIDING, self.backend.perception, REWARDS, max_moves)
 
-    def step(self, move: Move) -> Step:
+    def step(self, move: Move) -> Transition:
         outcome = self.backend.step(move)
         self.backend.update_belief()
-        return self.task.note(Attempt(Decision(move), outcome, self.backend.look))
+        return self.task.record(MoveAttempt(Decision(move), outcome, self.backend.perception))
 
 
 def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) -> Episode:
@@ -95,31 +100,31 @@ def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) 
 def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_PLACEMENT, MoveResult.PLACED)
     task = game.task
-    at_first = task.known
+    at_first = task.detected
     assert at_first == ("cover 1", "cover 2", "marker")
-    assert task.hidden_at_start == ("g1", "g2", "p")
-    assert (task.found, task.end) == ((), None)
+    assert task.initially_hidden == ("g1", "g2", "p")
+    assert (task.found, task.termination) == ((), None)
 
     first = game.step(Move("cover 1"))
     assert (first.newly_found, first.reward) == (("g1", "g2"), 4.0)
-    assert task.known == (*at_first, "g1", "g2")
-    assert (task.found, task.end) == (("g1", "g2"), None)
+    assert task.detected == (*at_first, "g1", "g2")
+    assert (task.found, task.termination) == (("g1", "g2"), None)
 
-    look = task.look
+    look = task.perception
     second = game.step(Move("cover 2"))
     assert (second.newly_found, second.reward) == ((), 0.0)
-    assert task.look is look
-    assert task.end is None
+    assert task.perception is look
+    assert task.termination is None
 
     third = game.step(Move("cover 2"))
     assert (third.newly_found, third.reward) == (("p",), 2.0)
-    assert task.end is EpisodeEnd.ALL_FOUND
-    assert task.found == task.hidden_at_start
-    assert task.steps == [first, second, third]
-    assert sum(step.reward for step in task.steps) == REWARDS.detection_reward * len(
-        task.hidden_at_start
+    assert task.termination is TerminationReason.ALL_FOUND
+    assert task.found == task.initially_hidden
+    assert task.transitions == [first, second, third]
+    assert sum(step.reward for step in task.transitions) == REWARDS.detection_reward * len(
+        task.initially_hidden
     )
-    assert task.start is HIDING
+    assert task.initial_scene is HIDING
     assert task.scene is third.outcome.scene
 
 
@@ -127,24 +132,24 @@ def test_what_a_collapse_uncovers_does_not_count(detector: LabelDetector) -> Non
     game = episode(detector, MoveResult.PLACED, MoveResult.COLLAPSED)
     task = game.task
     game.step(Move("cover 2"))
-    known = task.known
+    known = task.detected
     step = game.step(Move("cover 1"))
-    assert {"g1", "g2"} <= {d.name for d in step.look.observation.detections}
+    assert {"g1", "g2"} <= {d.name for d in step.next_perception.observation.detections}
     assert (step.newly_found, step.reward) == ((), -5.0)
-    assert task.known == known
+    assert task.detected == known
     assert task.found == ("p",)
-    assert task.end is EpisodeEnd.COLLAPSED
+    assert task.termination is TerminationReason.COLLAPSED
     with pytest.raises(ValueError, match="collapsed"):
-        task.note(Attempt(Decision(Move("marker")), step.outcome, step.look))
+        task.record(MoveAttempt(Decision(Move("marker")), step.outcome, step.next_perception))
 
 
 def test_out_of_moves_counts_moves_that_could_not_be_carried_out(detector: LabelDetector) -> None:
     game = episode(detector, *[MoveResult.NO_FREE_PLACEMENT] * 2, max_moves=2)
     task = game.task
     for _ in range(2):
-        assert task.end is None
+        assert task.termination is None
         game.step(Move("cover 1"))
-    assert task.end is EpisodeEnd.OUT_OF_MOVES
+    assert task.termination is TerminationReason.OUT_OF_MOVES
 
 
 def test_all_found_on_the_last_move_is_a_success(detector: LabelDetector) -> None:
@@ -152,7 +157,7 @@ def test_all_found_on_the_last_move_is_a_success(detector: LabelDetector) -> Non
     task = game.task
     game.step(Move("cover 1"))
     game.step(Move("cover 2"))
-    assert task.end is EpisodeEnd.ALL_FOUND
+    assert task.termination is TerminationReason.ALL_FOUND
 
 
 def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
@@ -160,28 +165,32 @@ def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.PLACED, MoveResult.PLACED)
     task = game.task
     game.step(Move("cover 1"))
-    known = task.known
+    known = task.detected
     back = ASIDE | {"cover 1": (-0.2, 0.0)}
     game.backend.scene = HIDING.with_poses(
         {"cover 2": resting("cracker_box", xy=back["cover 2"]).X_TO}
     )
     step = game.step(Move("cover 2"))
-    assert "g1" not in {d.name for d in step.look.observation.detections}
-    assert task.known == (*known, "p")
+    assert "g1" not in {d.name for d in step.next_perception.observation.detections}
+    assert task.detected == (*known, "p")
     assert step.newly_found == ("p",)
 
 
 def test_nothing_hidden_is_found_at_once(detector: LabelDetector) -> None:
     scene = scene_of(resting("large_marker", name="marker"))
     task = ExplorationTask(scene, detector.perceive(scene), REWARDS, 10)
-    assert (task.end, task.hidden_at_start, task.found) == (EpisodeEnd.ALL_FOUND, (), ())
+    assert (task.termination, task.initially_hidden, task.found) == (
+        TerminationReason.ALL_FOUND,
+        (),
+        (),
+    )
 
 
 def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
     game = episode(detector)
     with pytest.raises(ValueError, match="allowed is to put an object on another one or on tray"):
         game.step(Move("marker", "marker"))
-    assert game.task.steps == []
+    assert game.task.transitions == []
     assert game.backend.belief.history == ()
 
 
@@ -198,7 +207,10 @@ def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> N
 
 def test_a_real_episode(config: ClutterConfig) -> None:
     """Largest-clear takes both covers away, the one nearer to the camera first. Drake settles."""
-    backend, seen = teleport_backends("settle", config)(HIDING, rng(1)), list[tuple[str, ...]]()
+    backend, seen = (
+        make_teleport_backend_factory("settle", config)(HIDING, rng(1)),
+        list[tuple[str, ...]](),
+    )
 
     def policy(
         belief: Belief,
@@ -208,16 +220,16 @@ def test_a_real_episode(config: ClutterConfig) -> None:
         seen.append(tuple(o.name for o in belief.objects))
         return largest_clear(belief, observation, generator)
 
-    reported = list[Step]()
-    task = run_episode(backend, policy, max_moves=4, report=reported.append)
-    assert task.end is EpisodeEnd.ALL_FOUND
-    assert [step.move.pick for step in task.steps] == ["cover 2", "cover 1"]
-    assert sum(step.reward for step in task.steps) == 3.0
-    assert reported == task.steps
+    reported = list[Transition]()
+    task = run_episode(backend, policy, max_moves=4, on_transition=reported.append)
+    assert task.termination is TerminationReason.ALL_FOUND
+    assert [step.move.pick for step in task.transitions] == ["cover 2", "cover 1"]
+    assert sum(step.reward for step in task.transitions) == 3.0
+    assert reported == task.transitions
     seen.append(tuple(o.name for o in backend.belief.objects))
-    assert set(seen[-1]) == set(task.known) == set(HIDING.names)
+    assert set(seen[-1]) == set(task.detected) == set(HIDING.names)
     assert all(after[: len(before)] == before for before, after in pairwise(seen))
-    assert backend.belief.history == tuple(step.move for step in task.steps)
+    assert backend.belief.history == tuple(step.move for step in task.transitions)
 
 
 def scripted(*moves: Move) -> Policy:
@@ -228,7 +240,7 @@ def scripted(*moves: Move) -> Policy:
 def test_an_episode_ends_when_the_policy_has_no_move(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.NOT_PLANNED)
     task = run_episode(game.backend, scripted(Move("cover 1")), max_moves=5)
-    assert ([step.move for step in task.steps], task.end) == ([Move("cover 1")], None)
+    assert ([step.move for step in task.transitions], task.termination) == ([Move("cover 1")], None)
     assert game.backend.belief.invalid_moves == (Move("cover 1"),)
 
 
@@ -243,9 +255,9 @@ def test_chosen_moves_go_on_when_all_is_found_but_not_after_a_collapse(
             game.backend,
             scripted(*moves),
             max_moves=4,
-            until_all_found=until_all_found,
+            stop_when_all_found=until_all_found,
         )
-        assert len(task.steps) == made
+        assert len(task.transitions) == made
 
 
 # --- Belief ---
@@ -285,7 +297,7 @@ def test_nothing_is_said_of_what_is_lost(detector: LabelDetector) -> None:
     belief = Belief().update(detector.perceive(HIDING).observation)
     for move in (Move("marker"), Move("cover 1", "marker"), Move("cover 1")):
         belief = belief.record(move, MoveResult.NOT_PLANNED)
-    left = belief.forget(["marker"])
+    left = belief.remove(["marker"])
     assert {o.name for o in left.objects} == {"cover 1", "cover 2"}
     assert left.invalid_moves == (Move("cover 1"),)
     assert left.history == belief.history
@@ -387,12 +399,12 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
     )  # chi-squared, 8 degrees of freedom, 0.1 %
 
 
-@pytest.mark.parametrize("name", sorted(BASELINES))
+@pytest.mark.parametrize("name", sorted(BASELINE_POLICIES))
 def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
     observation = detector.perceive(HIDING).observation
 
     def choices(seed: int) -> tuple[Move, ...]:
-        policy, generator = BASELINES[name], rng(seed)
+        policy, generator = BASELINE_POLICIES[name], rng(seed)
         tried: tuple[Move, ...] = ()
         for _ in range(8):
             move = policy(Belief(history=tried), observation, generator).move
@@ -403,4 +415,4 @@ def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDe
 
     assert choices(3) == choices(3)
     nothing = replace(observation, detections=())
-    assert BASELINES[name](Belief(), nothing, rng()).move is None
+    assert BASELINE_POLICIES[name](Belief(), nothing, rng()).move is None

@@ -9,9 +9,9 @@ from conftest import CLASSES, random_scene, resting, rng, scene_of
 
 from drake_clutter.agents.explorer_network import (
     ExplorerNetwork,
-    decide,
-    log_probability,
-    stacked_graphs,
+    action_log_probs,
+    collate_graphs,
+    sample_actions,
 )
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -21,9 +21,9 @@ from drake_clutter.stability.visibility import RayCaster
 from drake_clutter.tasks.belief import Belief
 from drake_clutter.tasks.exploration_graph import (
     EDGE_KINDS,
-    FEATURES,
-    GraphObservation,
-    exploration_graph,
+    NODE_FEATURES,
+    ExplorationObservation,
+    build_exploration_graph,
 )
 
 NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
@@ -40,15 +40,17 @@ SCENE = scene_of(
 
 def graph_of(
     scene: Scene, tried: Sequence[Move] = (), failed: Sequence[Move] = (), nodes: int = 0
-) -> GraphObservation:
-    return exploration_graph(scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, failed, nodes)
+) -> ExplorationObservation:
+    return build_exploration_graph(
+        scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, failed, nodes
+    )
 
 
-def feature(graph: GraphObservation, node: int, name: str) -> float:
-    return float(graph["feature"][node, FEATURES.index(name)])
+def feature(graph: ExplorationObservation, node: int, name: str) -> float:
+    return float(graph["feature"][node, NODE_FEATURES.index(name)])
 
 
-def edges(graph: GraphObservation, names: tuple[str, ...]) -> dict[tuple[str, str], str]:
+def edges(graph: ExplorationObservation, names: tuple[str, ...]) -> dict[tuple[str, str], str]:
     """Kinds by lower and upper."""
     named = (TRAY, *names)
     joined = zip(graph["edge"].tolist(), graph["edge_kind"].tolist(), strict=True)
@@ -120,7 +122,9 @@ def test_what_has_failed_is_not_tried_again() -> None:
     free[4, 0], free[5] = 0, 0
     assert np.array_equal(graph["allowed"], free)
     torch.manual_seed(0)
-    moves, _, _, picks = decide(ExplorerNetwork(len(NUMBERS)), stacked_graphs([graph] * 500), rng())
+    moves, _, _, picks = sample_actions(
+        ExplorerNetwork(len(NUMBERS)), collate_graphs([graph] * 500), rng()
+    )
     assert picks[0, 5] == 0
     assert (free[moves[:, 0], moves[:, 1]] == 1).all()
 
@@ -130,7 +134,7 @@ def test_something_must_carry_a_box_that_floats() -> None:
     observation = RAYS.observe(SCENE)[0]
     known = Belief().update(observation).objects
     assert [o.name for o in known] == ["cracker_box", "tomato_soup_can", "close", "far"]
-    graph = exploration_graph(known, observation, (), NUMBERS)
+    graph = build_exploration_graph(known, observation, (), NUMBERS)
     heights = [feature(graph, k, "unexplained_height") for k in range(1, 5)]
     assert heights == pytest.approx([(0.018 - 0.006) / 0.35, 0, 0, 0], abs=1e-6)
 
@@ -141,7 +145,7 @@ def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
     known = belief.objects
     assert known[0].name == "large_marker"
     assert {o.name: o.X_TO for o in known}["large_marker"] == covered["large_marker"].X_TO
-    graph = exploration_graph(known, RAYS.observe(SCENE)[0], (), NUMBERS)
+    graph = build_exploration_graph(known, RAYS.observe(SCENE)[0], (), NUMBERS)
     assert graph["allowed"].any(axis=1).tolist() == [False, False, True, True, True, True]
 
 
@@ -152,15 +156,15 @@ def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
     shuffled = Scene(tuple(scene.objects[k] for k in order), scene.support)
     torch.manual_seed(seed)
     network = ExplorerNetwork(len(NUMBERS)).double()
-    one, other = (network(stacked_graphs([graph_of(s)])) for s in (scene, shuffled))
+    one, other = (network(collate_graphs([graph_of(s)])) for s in (scene, shuffled))
     assert torch.allclose(one.value, other.value)
     nodes = torch.from_numpy(np.concatenate([[0], order + 1]))
-    assert torch.allclose(one.pick[:, nodes], other.pick)
-    picked = int(one.pick.argmax())
+    assert torch.allclose(one.pick_log_probs[:, nodes], other.pick_log_probs)
+    picked = int(one.pick_log_probs.argmax())
     there = int((nodes == picked).nonzero())
     places = (
-        network.places(one, torch.tensor([picked])),
-        network.places(other, torch.tensor([there])),
+        network.place_log_probs(one, torch.tensor([picked])),
+        network.place_log_probs(other, torch.tensor([there])),
     )
     assert torch.allclose(places[0][:, nodes], places[1])
 
@@ -170,30 +174,34 @@ def test_a_batch_is_each_graph_by_itself() -> None:
     graphs = [graph_of(random_scene(seed, 8, 25)) for seed in range(6)]
     torch.manual_seed(0)
     network = ExplorerNetwork(len(NUMBERS)).double()
-    together = network(stacked_graphs(graphs))
-    picked = together.pick.argmax(dim=1)
-    places = network.places(together, picked)
+    together = network(collate_graphs(graphs))
+    picked = together.pick_log_probs.argmax(dim=1)
+    places = network.place_log_probs(together, picked)
     for k, graph in enumerate(graphs):
-        alone, count = network(stacked_graphs([graph])), len(graph["node_kind"])
-        assert torch.allclose(alone.pick[0], together.pick[k, :count])
+        alone, count = network(collate_graphs([graph])), len(graph["node_kind"])
+        assert torch.allclose(alone.pick_log_probs[0], together.pick_log_probs[k, :count])
         assert torch.allclose(alone.value[0], together.value[k])
-        assert torch.allclose(network.places(alone, picked[k : k + 1])[0], places[k, :count])
-        assert (together.pick[k, count:] == -torch.inf).all()
+        assert torch.allclose(
+            network.place_log_probs(alone, picked[k : k + 1])[0], places[k, :count]
+        )
+        assert (together.pick_log_probs[k, count:] == -torch.inf).all()
 
 
 def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
     torch.manual_seed(1)
     network, graph = ExplorerNetwork(len(NUMBERS)), graph_of(SCENE)
     count = 4000
-    moves, chance, _, picks = decide(network, stacked_graphs([graph] * count), rng())
+    moves, chance, _, picks = sample_actions(network, collate_graphs([graph] * count), rng())
     assert picks[0].sum() == pytest.approx(1, abs=1e-5)
     assert (graph["allowed"][moves[:, 0], moves[:, 1]] == 1).all()
     drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
     assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
-    found = network(stacked_graphs([graph] * 50))
-    again = log_probability(
-        found, network.places(found, torch.from_numpy(moves[:50, 0])), torch.from_numpy(moves[:50])
+    found = network(collate_graphs([graph] * 50))
+    again = action_log_probs(
+        found,
+        network.place_log_probs(found, torch.from_numpy(moves[:50, 0])),
+        torch.from_numpy(moves[:50]),
     )
     assert again.detach().numpy() == pytest.approx(chance[:50], abs=1e-5)
-    (likeliest,) = decide(network, stacked_graphs([graph]), None)[0].tolist()
+    (likeliest,) = sample_actions(network, collate_graphs([graph]), None)[0].tolist()
     assert likeliest[0] == picks[0].argmax()

@@ -34,8 +34,14 @@ from drake_clutter.robots.ur_kinematics import jacobian, manipulability
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.tasks import feasibility as tasks_feasibility
-from drake_clutter.tasks.feasibility import MOVE_COLUMNS, PLANNED, FeasibilityStudy, below, rest_of
+from drake_clutter.tasks import feasibility_study
+from drake_clutter.tasks.feasibility_study import (
+    MOVE_RECORD_FIELDS,
+    PLANNED,
+    FeasibilityStudy,
+    objects_below,
+    resting_side,
+)
 
 SCENE = scene_of(
     resting("pudding_box"),
@@ -58,7 +64,7 @@ def test_manipulability_in_closed_form() -> None:
 
 
 def test_every_legal_move_has_a_row() -> None:
-    rows = study().moves("scene", 0, SCENE)
+    rows = study().plan_all_moves("scene", 0, SCENE)
     by_pick: dict[str, list[str]] = {}
     for row in rows:
         by_pick.setdefault(row.pick, []).append(row.result)
@@ -70,19 +76,19 @@ def test_every_legal_move_has_a_row() -> None:
         assert math.isfinite(row.motion_s) == (row.result == PLANNED)
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
         assert row.below == (1 if row.pick == "gelatin_box" else 0)
-    again = study().moves("scene", 0, SCENE)
+    again = study().plan_all_moves("scene", 0, SCENE)
     assert [str(replace(row, planning_s=0.0)) for row in rows] == [
         str(replace(row, planning_s=0.0)) for row in again
     ]
 
 
 def test_what_points_up_and_what_lies_below() -> None:
-    assert rest_of(resting("sugar_box", Orientation.UPRIGHT_0)) == "upright"
-    assert rest_of(resting("sugar_box", Orientation.SIDE_0)) == "side"
-    assert rest_of(resting("sugar_box", Orientation.FLAT_0)) == "flat"
-    assert rest_of(resting("tomato_soup_can")) == "upright"
-    assert below(SCENE["gelatin_box"], SCENE.objects) == ["pudding_box"]
-    assert below(SCENE["tomato_soup_can"], SCENE.objects) == []
+    assert resting_side(resting("sugar_box", Orientation.UPRIGHT_0)) == "upright"
+    assert resting_side(resting("sugar_box", Orientation.SIDE_0)) == "side"
+    assert resting_side(resting("sugar_box", Orientation.FLAT_0)) == "flat"
+    assert resting_side(resting("tomato_soup_can")) == "upright"
+    assert objects_below(SCENE["gelatin_box"], SCENE.objects) == ["pudding_box"]
+    assert objects_below(SCENE["tomato_soup_can"], SCENE.objects) == []
 
 
 def test_what_no_arm_can_do_is_a_reason() -> None:
@@ -113,8 +119,8 @@ def test_what_no_arm_can_do_is_a_reason() -> None:
 
 def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
     it = study()
-    rows = it.moves("scene", 0, SCENE)
-    found = it.noise("scene", 0, SCENE, rows)
+    rows = it.plan_all_moves("scene", 0, SCENE)
+    found = it.test_pose_errors("scene", 0, SCENE, rows)
     planned = sum(row.result == PLANNED for row in rows)
     assert len(found) == 5 * min(6, planned)
     holds = [
@@ -210,7 +216,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "MAP_SPACING", 0.3)
     monkeypatch.setattr(command, "MAP_HEIGHTS", (0.05, 0.3))
     monkeypatch.setattr(feasibility_report, "CASES_PER_KIND", 1)
-    monkeypatch.setattr(tasks_feasibility, "NOISY_MOVES", 1)
+    monkeypatch.setattr(feasibility_study, "MAX_NOISY_MOVES", 1)
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -242,7 +248,7 @@ def test_a_study_from_the_command_line(
     assert summary["unstable_scenes"] == ["falls"]
     assert list(summary["setups"]) == ["small_cup", "base -0.7, 0, 0.3, 0", "tray 0.65, 0, -0.3, 0"]
     moves = table(out / "moves.csv")
-    assert tuple(moves[0]) == MOVE_COLUMNS
+    assert tuple(moves[0]) == MOVE_RECORD_FIELDS
     for name, found in summary["setups"].items():
         rows = [row for row in moves if row["setup"] == name]
         assert found["moves"] == len(rows) > 0

@@ -53,7 +53,7 @@ def imported_rooms(source: str) -> Iterator[tuple[int, str]]:
 
 def test_the_reader_of_imports() -> None:
     source = """
-import numpy, drake_clutter.tasks.generation
+import numpy, drake_clutter.tasks.generation_task
 from drake_clutter import files
 def late():
     from drake_clutter.scenes.layout import lay_out

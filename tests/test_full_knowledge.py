@@ -15,13 +15,13 @@ from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.belief import Decision, legal_moves
-from drake_clutter.tasks.episode import run_episode, teleport_backends
-from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solution, Solvability
+from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episode
+from drake_clutter.tasks.exploration_task import TerminationReason
+from drake_clutter.tasks.oracle_search import OracleSearch, SearchResult, Solvability
 
 CONFIG = ClutterConfig()
 JUDGE = FastJudge(CONFIG)
-SEARCH = FullKnowledgeSearch(CONFIG, JUDGE)
+SEARCH = OracleSearch(CONFIG, JUDGE)
 EXECUTOR = FastExecutor(CONFIG, JUDGE)
 
 
@@ -98,19 +98,24 @@ def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[
     scene = scene_of(*objects)
     assert JUDGE.stability(scene) is None
     solution = SEARCH.solve(scene)
-    assert solution.answer is Solvability.SOLVABLE
-    assert (len(solution.plan), solution.at_least, solution.fewest, solution.never_found) == (
+    assert solution.solvability is Solvability.SOLVABLE
+    assert (
+        len(solution.plan),
+        solution.lower_bound,
+        solution.is_optimal,
+        solution.unrevealable,
+    ) == (
         moves,
         moves,
         True,
         (),
     )
     assert {move.pick for move in solution.plan} == picked
-    assert solution.moves_tried >= moves
+    assert solution.moves_evaluated >= moves
     assert replayed(scene, solution, 0) == set(scene.names)
 
 
-def replayed(scene: Scene, solution: Solution, seed: int) -> set[str]:
+def replayed(scene: Scene, solution: SearchResult, seed: int) -> set[str]:
     """What has been in view when the plan is done; no move of it fails."""
     generator = item_rng(seed)
     known = {d.name for d in JUDGE.rays.observe(scene)[0].detections}
@@ -126,7 +131,7 @@ def replayed(scene: Scene, solution: Solution, seed: int) -> set[str]:
 
 def test_no_plan_for_nothing_costs_nothing() -> None:
     solution = SEARCH.solve(scene_of(IN_VIEW), budget=0)
-    assert solution == Solution(Solvability.SOLVABLE, (), 0, (), 0)
+    assert solution == SearchResult(Solvability.SOLVABLE, (), 0, (), 0)
 
 
 # --- Unsolvable ---
@@ -142,27 +147,27 @@ BELOW_IT = resting("gelatin_box", xy=(0.055, 0.0), name="below it")
 
 def test_what_lies_under_what_never_moves_is_never_found() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, IN_VIEW))
-    assert solution.answer is Solvability.UNSOLVABLE
-    assert solution.never_found == ("foot", "held", "below it")
-    assert (solution.plan, solution.fewest, solution.moves_tried) == ((), False, 0)
+    assert solution.solvability is Solvability.UNSOLVABLE
+    assert solution.unrevealable == ("foot", "held", "below it")
+    assert (solution.plan, solution.is_optimal, solution.moves_evaluated) == ((), False, 0)
 
 
 def test_what_is_hidden_elsewhere_is_not_named() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, *covered(0.2, 0.25)))
-    assert solution.answer is Solvability.UNSOLVABLE
-    assert solution.never_found == ("foot", "held", "below it")
+    assert solution.solvability is Solvability.UNSOLVABLE
+    assert solution.unrevealable == ("foot", "held", "below it")
 
 
 def test_no_room_for_any_move() -> None:
     """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
     solution = SEARCH.solve(scene_of(*covered(), side=0.26))
-    assert (solution.answer, solution.plan, solution.never_found) == (
+    assert (solution.solvability, solution.plan, solution.unrevealable) == (
         Solvability.UNSOLVABLE,
         (),
         (),
     )
-    assert not solution.fewest
-    assert solution.moves_tried > 0
+    assert not solution.is_optimal
+    assert solution.moves_evaluated > 0
 
 
 def test_a_stack_that_collapses_whatever_is_picked() -> None:
@@ -178,7 +183,7 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
     assert JUDGE.stability(scene) is None
     assert all(JUDGE.losing_support(scene, name) for name in scene.names)
     solution = SEARCH.solve(scene)
-    assert (solution.answer, solution.moves_tried) == (Solvability.UNSOLVABLE, 0)
+    assert (solution.solvability, solution.moves_evaluated) == (Solvability.UNSOLVABLE, 0)
 
 
 # --- The budget ---
@@ -187,8 +192,8 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
 @pytest.mark.parametrize("budget", [0, 1])
 def test_undecided_on_a_small_budget(budget: int) -> None:
     solution = SEARCH.solve(scene_of(*KNOWN["under two boxes"][0]), budget=budget)
-    assert solution == Solution(Solvability.UNDECIDED, (), 2, (), budget)
-    assert not solution.fewest
+    assert solution == SearchResult(Solvability.UNDECIDED, (), 2, (), budget)
+    assert not solution.is_optimal
 
 
 def test_no_more_moves_than_the_budget_are_tried() -> None:
@@ -196,9 +201,9 @@ def test_no_more_moves_than_the_budget_are_tried() -> None:
     answers = []
     for budget in range(12):
         solution = SEARCH.solve(scene, budget=budget)
-        assert solution.moves_tried <= budget
-        assert solution.at_least <= 3
-        answers.append(solution.answer)
+        assert solution.moves_evaluated <= budget
+        assert solution.lower_bound <= 3
+        answers.append(solution.solvability)
     decided = answers.index(Solvability.SOLVABLE)
     assert decided >= 3
     assert set(answers[:decided]) == {Solvability.UNDECIDED}
@@ -220,9 +225,9 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
     ):
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
-    if (solution.answer, solution.moves_tried) != (Solvability.UNDECIDED, 0):
+    if (solution.solvability, solution.moves_evaluated) != (Solvability.UNDECIDED, 0):
         pytest.fail("the fast judge could tell", pytrace=False)
-    assert solution.at_least <= 1
+    assert solution.lower_bound <= 1
 
 
 # --- What the search does not take, or is not to try ---
@@ -231,11 +236,11 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
 def test_no_plan_begins_with_what_has_failed() -> None:
     scene = scene_of(*covered(), IN_VIEW)
     (first,) = SEARCH.solve(scene).plan
-    (other,) = SEARCH.solve(scene, failed=[first]).plan
+    (other,) = SEARCH.solve(scene, invalid_moves=[first]).plan
     assert (first.pick, other.pick) == ("cover", "cover")
     assert other.place != first.place
     nothing_left = [Move(name, place) for name in scene.names for place in (TRAY, *scene.names)]
-    assert SEARCH.solve(scene, failed=nothing_left).plan == ()
+    assert SEARCH.solve(scene, invalid_moves=nothing_left).plan == ()
 
 
 def test_more_objects_than_the_search_takes() -> None:
@@ -285,16 +290,16 @@ def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
     fewest = fewest_by_trying(scene, 2, 2)
     if fewest is None:
         assert seed == 45
-        assert solution.at_least > 2
-        assert len(solution.plan) > 2 or solution.answer is not Solvability.SOLVABLE
+        assert solution.lower_bound > 2
+        assert len(solution.plan) > 2 or solution.solvability is not Solvability.SOLVABLE
         return
     assert fewest == (1 if seed == 2 else 2)
-    assert (solution.answer, solution.at_least, len(solution.plan)) == (
+    assert (solution.solvability, solution.lower_bound, len(solution.plan)) == (
         Solvability.SOLVABLE,
         fewest,
         fewest,
     )
-    assert solution.fewest
+    assert solution.is_optimal
     assert replayed(scene, solution, 2) == set(scene.names)
 
 
@@ -307,24 +312,24 @@ def test_the_same_seed_gives_the_same_solution() -> None:
     solution = SEARCH.solve(scene, seed=5)
     SEARCH.solve(scene_of(*KNOWN["two stacks"][0]), seed=1)
     assert SEARCH.solve(scene, seed=5) == solution
-    assert FullKnowledgeSearch(CONFIG).solve(scene, seed=5) == solution
+    assert OracleSearch(CONFIG).solve(scene, seed=5) == solution
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_plan_holds_for_its_seed(seed: int) -> None:
     for scene in (RANDOM[22], RANDOM[39]):
         solution = SEARCH.solve(scene, seed=seed)
-        assert solution.answer is Solvability.SOLVABLE
+        assert solution.solvability is Solvability.SOLVABLE
         assert replayed(scene, solution, seed) == set(scene.names)
 
 
 def test_drake_confirms_a_plan() -> None:
     scene = scene_of(*covered(), *covered(0.2, 0.25, " 2"))
     solution = SEARCH.solve(scene, seed=4)
-    backend = teleport_backends("settle", CONFIG)(scene, item_rng(4))
+    backend = make_teleport_backend_factory("settle", CONFIG)(scene, item_rng(4))
     moves = iter(solution.plan)
     task = run_episode(backend, lambda *_: Decision(next(moves)), max_moves=2)
-    assert task.hidden_at_start == ("small", "small 2")
-    assert [step.outcome.result for step in task.steps] == [MoveResult.PLACED] * 2
-    assert task.end is EpisodeEnd.ALL_FOUND
+    assert task.initially_hidden == ("small", "small 2")
+    assert [step.outcome.result for step in task.transitions] == [MoveResult.PLACED] * 2
+    assert task.termination is TerminationReason.ALL_FOUND
     assert len(solution.plan) == 2

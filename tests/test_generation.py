@@ -8,14 +8,14 @@ import pytest
 import yaml
 from conftest import CLASSES, DEFAULT_CELL, GRAMMARS, rng, world_with
 
-from drake_clutter.agents.generation import (
+from drake_clutter.agents.generators import (
     GenerationAgent,
     GenerationJob,
     HillClimber,
     RandomGenerator,
     SceneGenerator,
     make_generation_agent,
-    summarise,
+    summarize_scenes,
 )
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
@@ -25,8 +25,8 @@ from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import scene_to_dict
 from drake_clutter.statistics import wilson_interval
-from drake_clutter.tasks.full_knowledge import Solvability
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
+from drake_clutter.tasks.oracle_search import Solvability
 from drake_clutter.workers.parallel_map import map_ordered
 
 
@@ -98,7 +98,7 @@ def test_a_generated_scene_says_whether_it_is_solvable() -> None:
 def test_the_hill_climber_hides_more_than_chance() -> None:
     grammar, config = GRAMMARS["ycb7"], ClutterConfig()
     environment = ClutterGeneration(
-        list(grammar.classes.values()), GenerationTask(nodes=12), config
+        list(grammar.classes.values()), GenerationTaskConfig(nodes=12), config
     )
 
     def worth(agent: GenerationAgent, seed: int) -> float:
@@ -166,7 +166,7 @@ def test_summary_of_a_batch_by_hand() -> None:
         Verdict(None, {}, {}, ("c",)),
     ]
     answers = [Solvability.SOLVABLE, Solvability.UNDECIDED, None, Solvability.SOLVABLE]
-    summary = summarise(job(), list(zip(scenes, verdicts, strict=True)), answers)
+    summary = summarize_scenes(job(), list(zip(scenes, verdicts, strict=True)), answers)
     assert summary.pop("solvable_ci95") == pytest.approx(wilson_interval(2, 3))
     assert summary.pop("largest_stack_share") == pytest.approx((0.5 + 0.5 + 1 + 1) / 4)
     assert summary.pop("class_entropy") == pytest.approx(
@@ -199,7 +199,7 @@ def test_summary_of_a_batch_by_hand() -> None:
 def test_a_batch_without_a_stable_scene_has_no_mean() -> None:
     scene = laid_out("drop_object", "end", "insert_sugar_box", "orient_flat_0")
     toppled = Verdict(Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.0, 1.0), {}, {}, ())
-    summary = summarise(job(), [(scene, toppled)])
+    summary = summarize_scenes(job(), [(scene, toppled)])
     assert (summary["stability_rate"], summary["hidden_mean"], summary["hidden_ci95"]) == (
         0.0,
         None,

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from drake_clutter.grammar import ClutterGraph, NodeBudget, canonical_form
 from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, PRIMITIVE
-from drake_clutter.tasks.generation import (
+from drake_clutter.tasks.generation_task import (
     ClutterGeneration,
-    GenerationTask,
-    GraphObservation,
-    StackFault,
-    most_edges,
+    GenerationObservation,
+    GenerationTaskConfig,
+    StackFailure,
+    max_edges,
 )
 
 
@@ -23,7 +23,7 @@ def random_action(mask: np.ndarray, draw: np.random.Generator) -> int:
     return int(draw.choice(np.flatnonzero(mask)))
 
 
-def graph_of(observation: GraphObservation, environment: ClutterGeneration) -> ClutterGraph:
+def graph_of(observation: GenerationObservation, environment: ClutterGeneration) -> ClutterGraph:
     """The graph that an observation describes."""
     kinds, edge_kinds = environment.vocabulary.node_kinds, environment.vocabulary.edge_kinds
     nodes = {k: kinds[kind - 1] for k, kind in enumerate(observation["node_kind"].tolist()) if kind}
@@ -63,7 +63,7 @@ def test_what_is_observed_is_the_graph(objects: str) -> None:
     """With its finished stacks and where their objects stand."""
     grammar = GRAMMARS[objects]
     environment, draw = (
-        ClutterGeneration(list(grammar.classes.values()), GenerationTask(nodes=14)),
+        ClutterGeneration(list(grammar.classes.values()), GenerationTaskConfig(nodes=14)),
         rng(1),
     )
     stacks_seen = 0
@@ -95,7 +95,7 @@ def test_what_is_observed_is_the_graph(objects: str) -> None:
 
 
 def test_the_marks_show_what_a_rule_rewrites() -> None:
-    environment, draw = ClutterGeneration(task=GenerationTask(nodes=14)), rng(2)
+    environment, draw = ClutterGeneration(task=GenerationTaskConfig(nodes=14)), rng(2)
     grammar, changed_kinds = environment.grammar, 0
     for episode in range(15):
         observation, info = environment.reset(seed=episode)
@@ -131,7 +131,9 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
 
 
 def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
-    task = GenerationTask(nodes=14, hidden_reward=0.5, balance_reward=0.25, instability_reward=-1.0)
+    task = GenerationTaskConfig(
+        nodes=14, hidden_reward=0.5, balance_reward=0.25, instability_reward=-1.0
+    )
     environment, draw = ClutterGeneration(task=task), rng(3)
     stable = unstable = 0
     balanced = set()
@@ -162,7 +164,7 @@ def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
 
 
 def test_an_infeasible_rule_changes_nothing() -> None:
-    environment = ClutterGeneration(task=GenerationTask(nodes=8))
+    environment = ClutterGeneration(task=GenerationTaskConfig(nodes=8))
     before, info = environment.reset(seed=0)
     infeasible = int(np.flatnonzero(info["action_mask"] == 0)[0])
     after, reward, over, _, later = environment.step(infeasible)
@@ -188,7 +190,7 @@ def derived(
 
 def test_a_tower_that_falls_ends_the_episode() -> None:
     """A cracker box flat on a marker that lies."""
-    environment = ClutterGeneration(task=GenerationTask(nodes=10))
+    environment = ClutterGeneration(task=GenerationTaskConfig(nodes=10))
     rules = [
         "drop_object",
         "stack_object",
@@ -201,12 +203,12 @@ def test_a_tower_that_falls_ends_the_episode() -> None:
     total, over, info = derived(environment, rules)
     assert over
     assert total == -1.0
-    assert info["fault"] is StackFault.UNSTABLE
+    assert info["fault"] is StackFailure.UNSTABLE
 
 
 def test_a_tower_that_is_too_high_ends_the_episode() -> None:
     """Three cracker boxes on end are 0.69 m."""
-    environment = ClutterGeneration(task=GenerationTask(nodes=10))
+    environment = ClutterGeneration(task=GenerationTaskConfig(nodes=10))
     rules = [
         "drop_object",
         "stack_object",
@@ -216,12 +218,12 @@ def test_a_tower_that_is_too_high_ends_the_episode() -> None:
         *["orient_upright_0"] * 3,
     ]
     total, over, info = derived(environment, rules)
-    assert (total, over, info["fault"]) == (-1.0, True, StackFault.TOO_HIGH)
+    assert (total, over, info["fault"]) == (-1.0, True, StackFailure.TOO_HIGH)
 
 
 def test_a_hidden_object_pays_at_once() -> None:
     """A gelatin box under a cracker box, both flat; then another stack."""
-    environment = ClutterGeneration(task=GenerationTask(nodes=7))
+    environment = ClutterGeneration(task=GenerationTaskConfig(nodes=7))
     rules = [
         "drop_object",
         "stack_object",
@@ -236,7 +238,7 @@ def test_a_hidden_object_pays_at_once() -> None:
 
 
 def test_a_graph_of_hundreds_of_nodes_is_observed() -> None:
-    environment, draw = ClutterGeneration(task=GenerationTask(nodes=300)), rng(0)
+    environment, draw = ClutterGeneration(task=GenerationTaskConfig(nodes=300)), rng(0)
     observation, info = environment.reset(seed=0)
     structure = np.array(
         [
@@ -269,4 +271,4 @@ def test_edges_fit() -> None:
         for _ in range(10):
             graph = grammar.derive(NodeBudget(nodes), choose).graph
             most = max(most, graph.nx.number_of_edges())
-        assert most <= most_edges(nodes)
+        assert most <= max_edges(nodes)

@@ -8,17 +8,22 @@ import torch
 from conftest import rng
 from torch import Tensor
 
-from drake_clutter.agents.graph_network import MessagePassing, RuleValues
-from drake_clutter.agents.message_passing import LayerWeights, Links, composed, message_passing
-from drake_clutter.agents.soft_q import stacked
-from drake_clutter.tasks.generation import ClutterGeneration, GraphObservation
+from drake_clutter.agents.graph_network import MessagePassing, RuleQNetwork
+from drake_clutter.agents.message_passing import (
+    BatchConnectivity,
+    LayerWeights,
+    message_passing,
+    message_passing_reference,
+)
+from drake_clutter.agents.soft_q import collate
+from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationObservation
 
 ENVIRONMENT = ClutterGeneration()
 
 
-def observations(count: int, seed: int = 0) -> list[GraphObservation]:
+def observations(count: int, seed: int = 0) -> list[GenerationObservation]:
     """Of random derivations, from the tray alone to finished graphs."""
-    draw, seen = rng(seed), list[GraphObservation]()
+    draw, seen = rng(seed), list[GenerationObservation]()
     while len(seen) < count:
         observation, info = ENVIRONMENT.reset(seed=seed)
         over = False
@@ -30,10 +35,10 @@ def observations(count: int, seed: int = 0) -> list[GraphObservation]:
     return [seen[k] for k in draw.permutation(len(seen))[:count]]
 
 
-def network(seed: int = 0) -> RuleValues:
+def network(seed: int = 0) -> RuleQNetwork:
     torch.manual_seed(seed)
     vocabulary = ENVIRONMENT.vocabulary
-    return RuleValues(
+    return RuleQNetwork(
         len(vocabulary.node_kinds), len(vocabulary.edge_kinds), len(ENVIRONMENT.grammar.rules)
     ).double()
 
@@ -45,7 +50,7 @@ def fc(*weights_and_inputs: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
     return torch.where(value > 0, value, 0.01 * value)
 
 
-def edges(observation: GraphObservation) -> Iterator[tuple[int, int, int]]:
+def edges(observation: GenerationObservation) -> Iterator[tuple[int, int, int]]:
     """Sender, receiver, and number of the kind, both ways."""
     kinds = len(ENVIRONMENT.vocabulary.edge_kinds)
     for (parent, child), kind in zip(
@@ -56,13 +61,13 @@ def edges(observation: GraphObservation) -> Iterator[tuple[int, int, int]]:
             yield child, parent, kind - 1 + kinds
 
 
-def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
+def by_loops(values: RuleQNetwork, observation: GenerationObservation) -> Tensor:
     """What the network says of one graph, as the paper describes it: node by node and edge by edge."""
 
     def leaky(value: Tensor) -> Tensor:
         return torch.where(value > 0, value, 0.01 * value)
 
-    net = values.network
+    net = values.encoder
     count = int(observation["node_mask"].sum())
     node = []
     for k in range(count):
@@ -70,47 +75,58 @@ def by_loops(values: RuleValues, observation: GraphObservation) -> Tensor:
             [*observation["node_flags"][k], *observation["position"][k]], dtype=torch.float64
         )
         node.append(
-            leaky(net.kind.weight[int(observation["node_kind"][k]) - 1] + net.feature(features))
+            leaky(
+                net.node_kind_embedding.weight[int(observation["node_kind"][k]) - 1]
+                + net.node_encoder(features)
+            )
         )
-    glob = leaky(net.glob(torch.tensor(observation["remaining"], dtype=torch.float64)))
+    glob = leaky(net.global_encoder(torch.tensor(observation["remaining"], dtype=torch.float64)))
     for layer in map(LayerWeights._make, zip(*net.layers.weights, strict=True)):
         most: list[Tensor | None] = [None] * count
         for sender, receiver, kind in edges(observation):
-            sent, edge = (layer.sender, node[sender]), (layer.edge, leaky(net.edge.weight[kind]))
+            sent, edge = (
+                (layer.sender, node[sender]),
+                (layer.edge, leaky(net.edge_kind_embedding.weight[kind])),
+            )
             message = fc(sent, edge, bias=layer.sender_bias)
             so_far = most[receiver]
             most[receiver] = message if so_far is None else torch.maximum(so_far, message)
         heard = [torch.zeros_like(node[0]) if m is None else m for m in most]
         node = [
             own
-            + fc((layer.node, own), (layer.maximum, m), (layer.glob, glob), bias=layer.node_bias)
+            + fc(
+                (layer.node, own),
+                (layer.max_message, m),
+                (layer.global_to_node, glob),
+                bias=layer.node_bias,
+            )
             for own, m in zip(node, heard, strict=True)
         ]
         weight = torch.cat([layer.attention @ own + layer.attention_bias for own in node]).softmax(
             dim=0
         )
         pooled = sum((w * own for w, own in zip(weight, node, strict=True)), torch.zeros_like(glob))
-        glob = glob + fc((layer.pooled, pooled), (layer.old, glob), bias=layer.pooled_bias)
+        glob = glob + fc((layer.pooled, pooled), (layer.global_self, glob), bias=layer.pooled_bias)
     marked = []
     for mark in range(3):
         (at,) = np.flatnonzero(observation["node_flags"][:, 1 + mark]).tolist() or (None,)
         marked.append(torch.zeros_like(glob) if at is None else node[at])
-    return torch.as_tensor(values.value(leaky(values.joined(torch.cat([glob, *marked])))))
+    return torch.as_tensor(values.q_head(leaky(values.hidden_layer(torch.cat([glob, *marked])))))
 
 
 def test_the_same_as_with_loops() -> None:
     values, seen = network(), observations(30)
-    together = values(stacked(seen))
+    together = values(collate(seen))
     for k, observation in enumerate(seen):
         torch.testing.assert_close(together[k], by_loops(values, observation), rtol=1e-9, atol=1e-9)
 
 
 def test_a_graph_does_not_feel_its_neighbours_in_the_batch() -> None:
     values, seen = network(1), observations(20, seed=1)
-    together = values(stacked(seen))
+    together = values(collate(seen))
     for k, observation in enumerate(seen):
         torch.testing.assert_close(
-            values(stacked([observation]))[0], together[k], rtol=1e-9, atol=1e-9
+            values(collate([observation]))[0], together[k], rtol=1e-9, atol=1e-9
         )
 
 
@@ -125,18 +141,18 @@ def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
         other["edge"][:linked] = np.argsort(order)[observation["edge"][:linked]][edge_order]
         other["edge_kind"][:linked] = observation["edge_kind"][:linked][edge_order]
         torch.testing.assert_close(
-            values(stacked([other])), values(stacked([observation])), rtol=1e-9, atol=1e-9
+            values(collate([other])), values(collate([observation])), rtol=1e-9, atol=1e-9
         )
 
 
 def test_what_is_known_of_a_graph_matters() -> None:
     """Every feature reaches the values."""
     values, (observation,) = network(3), observations(1, seed=5)
-    before = values(stacked([observation]))
+    before = values(collate([observation]))
     for name in ("node_kind", "node_flags", "position", "edge_kind", "remaining"):
         other = {key: array.copy() for key, array in observation.items()}
         other[name].reshape(-1)[0] += 1
-        assert not torch.allclose(values(stacked([other])), before), name
+        assert not torch.allclose(values(collate([other])), before), name
 
 
 @pytest.mark.parametrize("width", [1, 5])
@@ -145,7 +161,9 @@ def test_what_is_compiled_is_what_is_composed(width: int) -> None:
     draw = torch.Generator().manual_seed(width)
     sender, receiver, kind = (torch.randint(0, most, (40,), generator=draw) for most in (12, 12, 4))
     receiver[receiver == 7] = 6
-    links = Links(torch.tensor([0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 3, 3]), sender, receiver, kind)
+    links = BatchConnectivity(
+        torch.tensor([0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 3, 3]), sender, receiver, kind
+    )
     weights = MessagePassing(width, 3, layers=2).double().weights
 
     def drawn(*shape: int) -> Tensor:
@@ -157,7 +175,7 @@ def test_what_is_compiled_is_what_is_composed(width: int) -> None:
         torch.randn(4, width, generator=draw).double(),
     )
     found = []
-    for layer_of in (message_passing, composed):
+    for layer_of in (message_passing, message_passing_reference):
         out, out_glob = layer_of(*inputs, links, weights)
         found.append(
             (
@@ -176,7 +194,10 @@ def test_a_lone_node_has_no_messages() -> None:
     layers = MessagePassing(4, 3, layers=1)
     none, zero = torch.zeros(0, dtype=torch.long), torch.zeros(1, dtype=torch.long)
     node, glob = layers(
-        torch.ones(1, 4), torch.ones(1, 4), torch.ones(2, 3), Links(zero, none, none, none)
+        torch.ones(1, 4),
+        torch.ones(1, 4),
+        torch.ones(2, 3),
+        BatchConnectivity(zero, none, none, none),
     )
     assert torch.isfinite(node).all()
     assert torch.isfinite(glob).all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import resting, scene_of, training_script
 
-from drake_clutter.agents.exploration import largest_clear
+from drake_clutter.agents.explorers import largest_clear
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.perception.label_detector import LabelDetector
@@ -17,10 +17,10 @@ from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.tracking import recognised
-from drake_clutter.tasks.arm_ceiling import ArmCeiling
+from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration_task import TerminationReason
 
 COVERED = scene_of(
     resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028)
@@ -49,9 +49,9 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
     backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
     task = run_episode(backend, policy, max_moves=3)
     known = backend.belief.objects
-    (step,) = task.steps
+    (step,) = task.transitions
     assert names == ["cracker_box_1"], "a name of its own"
-    assert (step.move.pick, task.end) == ("cracker_box", EpisodeEnd.ALL_FOUND)
+    assert (step.move.pick, task.termination) == ("cracker_box", TerminationReason.ALL_FOUND)
     assert step.outcome.X_TO_released is not None
     off = task.scene["cracker_box"].X_TO.p - step.outcome.X_TO_released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
@@ -64,7 +64,7 @@ def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
     sees = seen_but_shifted(COVERED, config, 0.0)
     backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
     task = run_episode(backend, lambda *_: Decision(None), max_moves=3)
-    assert (task.steps, task.end) == ([], None)
+    assert (task.transitions, task.termination) == ([], None)
 
 
 def test_rows_of_the_results() -> None:
@@ -137,15 +137,15 @@ def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_what_the_arm_can() -> None:
     """A marker that lies on a box keeps what is below it hidden for ever: no cup holds it."""
-    ceiling = ArmCeiling(ClutterConfig())
+    ceiling = ArmReachabilityBound(ClutterConfig())
     on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
-    assert ceiling.never_found(COVERED) == ()
+    assert ceiling.find_unrevealable(COVERED) == ()
     above = replace(
         on_top,
         X_TO=on_top.X_TO.translated(
             (0.0, 0.0, COVERED["cracker_box"].top_height - on_top.bounds_T[0][2])
         ),
     )
-    assert ceiling.never_found(replace(COVERED, objects=(*COVERED.objects, above))) == (
+    assert ceiling.find_unrevealable(replace(COVERED, objects=(*COVERED.objects, above))) == (
         "gelatin_box",
     )

@@ -8,10 +8,14 @@ import pytest
 import torch
 from conftest import GRAMMARS, rng
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator, make_generation_agent
-from drake_clutter.agents.graph_network import RuleValues
-from drake_clutter.agents.learned_generator import LearnedGenerator, about_values, load_values
-from drake_clutter.agents.soft_q import SoftQConfig, stacked
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator, make_generation_agent
+from drake_clutter.agents.graph_network import RuleQNetwork
+from drake_clutter.agents.learned_generator import (
+    LearnedGenerator,
+    load_rule_network,
+    rule_network_metadata,
+)
+from drake_clutter.agents.soft_q import SoftQConfig, collate
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, canonical_form
@@ -19,7 +23,11 @@ from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask, GraphVocabulary
+from drake_clutter.tasks.generation_task import (
+    ClutterGeneration,
+    GenerationTaskConfig,
+    GraphVocabulary,
+)
 
 WIDTH = 8
 
@@ -29,13 +37,13 @@ def checkpoint(tmp_path: Path) -> Path:
     """An untrained network for the seven objects."""
     grammar = GRAMMARS["ycb7"]
     torch.manual_seed(0)
-    words = GraphVocabulary.of(grammar)
-    network = RuleValues(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
-    config = {"task": asdict(GenerationTask()), "learning": asdict(SoftQConfig())}
+    words = GraphVocabulary.from_grammar(grammar)
+    network = RuleQNetwork(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
+    config = {"task": asdict(GenerationTaskConfig()), "learning": asdict(SoftQConfig())}
     path = tmp_path / "untrained.safetensors"
     about = {
         "kind": "generator",
-        "network": about_values(grammar, WIDTH),
+        "network": rule_network_metadata(grammar, WIDTH),
         "temperature": 0.3,
         "config": config,
     }
@@ -78,7 +86,7 @@ def test_what_it_was_not_trained_with_is_named(checkpoint: Path) -> None:
 
 
 def test_what_is_no_generator_is_refused(checkpoint: Path) -> None:
-    about = load_checkpoint(checkpoint).about
+    about = load_checkpoint(checkpoint).metadata
     save_checkpoint(checkpoint, torch.nn.Linear(1, 1), about | {"kind": "explorer"})
     with pytest.raises(InputError, match="another kind"):
         LearnedGenerator(checkpoint, ClutterConfig())
@@ -91,9 +99,9 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
     """For graphs of the old objects, the values of the old rules are the same in the larger grammar."""
     small, large = GRAMMARS["ycb7"], GRAMMARS["pantry14"]
     loaded = load_checkpoint(checkpoint)
-    old, new = (load_values(loaded, grammar) for grammar in (small, large))
+    old, new = (load_rule_network(loaded, grammar) for grammar in (small, large))
     environments = [
-        ClutterGeneration(list(g.classes.values()), GenerationTask(nodes=12))
+        ClutterGeneration(list(g.classes.values()), GenerationTaskConfig(nodes=12))
         for g in (small, large)
     ]
     both = [large.index[rule.name] for rule in small.rules]
@@ -102,7 +110,7 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
         (one, info), (other, _) = (environment.reset(seed=episode) for environment in environments)
         over = False
         while not over:
-            torch.testing.assert_close(new(stacked([other]))[:, both], old(stacked([one])))
+            torch.testing.assert_close(new(collate([other]))[:, both], old(collate([one])))
             action = int(draw.choice(np.flatnonzero(info["action_mask"])))
             one, _, over, _, info = environments[0].step(action)
             other, *_ = environments[1].step(both[action])

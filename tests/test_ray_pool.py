@@ -25,7 +25,7 @@ from ray.cluster_utils import Cluster
 from test_cli import ABOVE, BELOW, broken, run, scenes_of
 from test_workers import broken_factory, failing_worker
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene_file import save_scene

@@ -30,8 +30,8 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.belief import Decision
-from drake_clutter.tasks.episode import run_episode, teleport_backends
-from drake_clutter.tasks.exploration import ExplorationTask, Step
+from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episode
+from drake_clutter.tasks.exploration_task import ExplorationTask, Transition
 
 GELATIN = resting("gelatin_box", xy=(-0.15, 0.1), name="gelatin_box_1")
 SCENE = scene_of(
@@ -68,7 +68,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def task(config: ClutterConfig) -> ExplorationTask:
     """An episode of one real move, which uncovers the gelatin box."""
-    backend = teleport_backends("settle", config, follow_falls=True)(SCENE, rng())
+    backend = make_teleport_backend_factory("settle", config, follow_falls=True)(SCENE, rng())
     task = run_episode(backend, lambda *_: Decision(UNCOVER), max_moves=1)
     assert task.found == ("gelatin_box_1",)
     return task
@@ -78,20 +78,24 @@ def task(config: ClutterConfig) -> ExplorationTask:
 def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The episode's page; after the real move come one that found no spot and one that made the sugar box fall."""
     out = tmp_path_factory.mktemp("page")
-    step = task.steps[0]
+    step = task.transitions[0]
     onto_gelatin = Decision(Move("sugar_box_3", "gelatin_box_1"))
-    stuck = Step(
-        onto_gelatin, Outcome(MoveResult.NO_FREE_PLACEMENT, task.scene), step.look, (), 0.0
+    stuck = Transition(
+        onto_gelatin,
+        Outcome(MoveResult.NO_FREE_PLACEMENT, task.scene),
+        step.next_perception,
+        (),
+        0.0,
     )
     fallen = Instability(InstabilityReason.TOPPLED, "sugar_box_3", 0.1, 1.5)
     outcome = Outcome(MoveResult.COLLAPSED, task.scene, fallen)
-    collapse = Step(Decision(Move("cracker_box_2")), outcome, step.look, (), -1.0)
+    collapse = Transition(Decision(Move("cracker_box_2")), outcome, step.next_perception, (), -1.0)
     summary = {"agent": HOSTILE, "seed": 3, "success": True, "moves": [{"move": HOSTILE}]}
     write_episode_page(
         out,
         f"Episode {HOSTILE}",
-        task.start,
-        task.first_look,
+        task.initial_scene,
+        task.initial_perception,
         [step, stuck, collapse],
         summary,
         DEFAULT_CELL,
@@ -179,11 +183,11 @@ def _commands(source: str, kind: str) -> int:
 
 
 def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
-    frames = episode_frames(task.start, task.steps)
+    frames = episode_frames(task.initial_scene, task.transitions)
     times = [frame.time for frame in frames]
     assert times == sorted(times)
     assert len(set(np.rint(np.multiply(times, FRAMES_PER_SECOND)))) >= 0.9 * len(times)
-    assert frames[0].poses == task.start.poses
+    assert frames[0].poses == task.initial_scene.poses
     assert frames[-1].poses == task.scene.poses
     path = np.array([frame.poses["cracker_box_2"].p for frame in frames])
     assert path[:, 2].max() > max(o.top_height for o in SCENE.objects)
@@ -192,7 +196,7 @@ def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
 
 
 def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) -> None:
-    step = replace(task.steps[0], outcome=Outcome(MoveResult.NO_FREE_PLACEMENT, SCENE))
+    step = replace(task.transitions[0], outcome=Outcome(MoveResult.NO_FREE_PLACEMENT, SCENE))
     assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {
         SCENE["cracker_box_2"].X_TO
     }
@@ -209,14 +213,14 @@ def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
 
 
 def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
-    (step,) = task.steps
-    other = next(name for name in task.known if name != step.move.pick)
+    (step,) = task.transitions
+    other = next(name for name in task.detected if name != step.move.pick)
     decision = Decision(step.move, {other: 0.6, step.move.pick: 0.4}, (other, step.move.pick))
     write_episode_page(
         tmp_path,
         "Believed",
-        task.start,
-        task.first_look,
+        task.initial_scene,
+        task.initial_perception,
         [replace(step, decision=decision)],
         {},
         DEFAULT_CELL,
@@ -229,10 +233,12 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
 
 
 def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
-    (step,) = task.steps
-    seen = task.first_look.observation
+    (step,) = task.transitions
+    seen = task.initial_perception.observation
     shown = replace(step, decision=Decision(step.move, observation=seen))
-    write_episode_page(tmp_path, "Seen", task.start, task.first_look, [shown], {}, DEFAULT_CELL)
+    write_episode_page(
+        tmp_path, "Seen", task.initial_scene, task.initial_perception, [shown], {}, DEFAULT_CELL
+    )
     picture = np.asarray(Image.open(tmp_path / "images/move_01_seen.png"))
     assert picture.shape == (720, 720, 3)
     assert "recognised in it: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()

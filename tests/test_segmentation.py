@@ -229,9 +229,9 @@ def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path
 def test_shipped_checkpoints_load_under_their_earlier_names(name: str, use_color: bool) -> None:
     path = resource_path(DETECTORS[name])
     stored = load_checkpoint(path)
-    assert stored.about["looks_at_color"] is use_color
+    assert stored.metadata["looks_at_color"] is use_color
     network = SegmentationNetwork.load(path)
-    assert (network.classes, network.use_color) == (tuple(stored.about["classes"]), use_color)
+    assert (network.classes, network.use_color) == (tuple(stored.metadata["classes"]), use_color)
     assert torch.equal(network.stem[1][0].weight, stored.weights["into.1.0.weight"])  # type: ignore[index]
 
 

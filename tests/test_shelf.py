@@ -7,7 +7,7 @@ import pytest
 from conftest import DEFAULT_CELL, resting, rng
 from test_docs import ROOT, blocks
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig, load_config
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason

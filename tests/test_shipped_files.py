@@ -59,7 +59,7 @@ def test_training_configs(path: Path) -> None:
 
 @pytest.mark.parametrize("path", CHECKPOINTS, ids=name_of)
 def test_checkpoints_and_their_configs(path: Path) -> None:
-    given = upgrade(load_checkpoint(path).about["config"])
+    given = upgrade(load_checkpoint(path).metadata["config"])
     if "detector" in path.stem:
         del given["layout"]  # of version 0.1; a detector has no use for it
     config = override_config(script_config(path.stem), given, str(path))

@@ -12,16 +12,16 @@ import pytest
 import torch
 from conftest import rng, training_script
 
-from drake_clutter.agents.generation import make_generation_agent
+from drake_clutter.agents.generators import make_generation_agent
 from drake_clutter.agents.soft_q import (
-    Replay,
+    ReplayBuffer,
     SoftQConfig,
     SoftQLearner,
-    aims,
-    chances,
-    play,
+    action_probabilities,
+    retrace_targets,
+    sample_episodes,
+    sample_softmax_actions,
     soft_value,
-    softmax_choice,
 )
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import load_catalog
@@ -29,21 +29,25 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.tasks.generation import ClutterGeneration, GenerationTask
+from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 
 CPU = torch.device("cpu")
-SMALL = SoftQConfig(steps=400, environments=4, batch=16, replay=200, warm_up=60, width=8)
+SMALL = SoftQConfig(
+    total_timesteps=400, num_envs=4, batch_size=16, buffer_size=200, learning_starts=60, width=8
+)
 SCRIPT = Path(__file__).parents[1] / "training" / "train_generator.py"
 
 
 def small_environment() -> ClutterGeneration:
-    return ClutterGeneration(task=GenerationTask(nodes=6))
+    return ClutterGeneration(task=GenerationTaskConfig(nodes=6))
 
 
 def test_actions_follow_the_softmax() -> None:
     values = np.array([0.3, 0.1, 0.7, 9.0], np.float32)
     mask = np.array([True, True, True, False])
-    drawn = softmax_choice(np.tile(values, (40_000, 1)), np.tile(mask, (40_000, 1)), 0.2, rng(0))
+    drawn = sample_softmax_actions(
+        np.tile(values, (40_000, 1)), np.tile(mask, (40_000, 1)), 0.2, rng(0)
+    )
     expected = np.exp(values[:3] / 0.2) / np.exp(values[:3] / 0.2).sum()
     assert np.bincount(drawn, minlength=4)[:3] / 40_000 == pytest.approx(expected, abs=0.01)
     assert (drawn != 3).all()
@@ -74,7 +78,9 @@ def test_aims_by_hand() -> None:
         (1.0, policy, 1.0),
         (1.0, 4 * policy, 0.25),
     ):
-        found = aims(values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace)
+        found = retrace_targets(
+            values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace
+        )
         expected = [[0.1 + v1 + passed_on * (second - 0.0), second], [0.1, second]]
         torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
 
@@ -84,16 +90,16 @@ def test_chances_are_those_of_the_choice() -> None:
         np.array([[0.3, 0.1, 0.7, 9.0]], np.float32),
         np.array([[True, True, True, False]]),
     )
-    given = [chances(values, mask, np.array([action]), 0.2)[0] for action in range(3)]
+    given = [action_probabilities(values, mask, np.array([action]), 0.2)[0] for action in range(3)]
     expected = np.exp(values[0, :3] / 0.2) / np.exp(values[0, :3] / 0.2).sum()
     assert given == pytest.approx(expected.tolist())
 
 
 def test_what_is_drawn_was_added_and_follows_each_other() -> None:
     example, _ = small_environment().reset(seed=0)
-    replay = Replay(capacity=60, environments=4, observation=example, actions=5)
+    replay = ReplayBuffer(capacity=60, environments=4, observation=example, actions=5)
     draw, seen = rng(0), set[int]()
-    assert replay.draw(3, 4, draw) is None
+    assert replay.sample_sequences(3, 4, draw) is None
     for moment in range(40):  # the ring of 15 is filled more than twice
         step = {
             name: np.repeat(array[None], 4, axis=0)
@@ -110,7 +116,7 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
             over=numbers % 3 == 0,
         )
         if moment >= 5:
-            drawn = replay.draw(50, 4, draw)
+            drawn = replay.sample_sequences(50, 4, draw)
             assert drawn is not None
             assert drawn["mask"].shape == (50, 5, 5)
             assert (np.diff(drawn["action"], axis=1) == 10).all()
@@ -125,17 +131,17 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
 def test_a_small_grammar_is_learned() -> None:
     """Graphs of five nodes hold at most three objects in a tower, of which two are hidden."""
     config = SoftQConfig(
-        steps=8_000,
-        environments=16,
-        batch=64,
-        steps_per_update=8,
-        replay=8_000,
-        warm_up=500,
+        total_timesteps=8_000,
+        num_envs=16,
+        batch_size=64,
+        train_frequency=8,
+        buffer_size=8_000,
+        learning_starts=500,
         temperature=0.02,
     )
 
     def environment() -> ClutterGeneration:
-        return ClutterGeneration(task=GenerationTask(nodes=5))
+        return ClutterGeneration(task=GenerationTaskConfig(nodes=5))
 
     learner = SoftQLearner(environment, config, 0, CPU)
 
@@ -143,15 +149,17 @@ def test_a_small_grammar_is_learned() -> None:
         return float(
             np.mean(
                 [
-                    episode.score
-                    for episode in play(learner.network, environment, 100, temperature, 7)
+                    episode.episodic_return
+                    for episode in sample_episodes(
+                        learner.network, environment, 100, temperature, 7
+                    )
                 ]
             )
         )
 
     by_chance = mean_score(1e6)
-    while learner.step < config.steps:
-        learner.advance()
+    while learner.step < config.total_timesteps:
+        learner.train_iteration()
     assert by_chance < 0.4
     assert mean_score(config.temperature) > 0.8
 
@@ -165,14 +173,16 @@ def test_a_saved_training_goes_on_as_if_nothing_had_been(at: int, tmp_path: Path
     """Before the first update, in the middle, and after the replay has been filled twice; with any number of threads."""
     through = SoftQLearner(small_environment, SMALL, 3, CPU)
     while through.step < at:
-        through.advance()
+        through.train_iteration()
     through.save(tmp_path / "state.safetensors")
-    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU, threads=1)
+    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU, num_threads=1)
     taken_up.load(tmp_path / "state.safetensors")
     assert taken_up.step == at
     for _ in range(15):
-        ended, ended_too = through.advance(), taken_up.advance()
-        assert [episode.score for episode in ended] == [episode.score for episode in ended_too]
+        ended, ended_too = through.train_iteration(), taken_up.train_iteration()
+        assert [episode.episodic_return for episode in ended] == [
+            episode.episodic_return for episode in ended_too
+        ]
     assert through.losses == taken_up.losses
     for mine, other in zip(state_of(through), state_of(taken_up), strict=True):
         assert torch.equal(mine, other)
@@ -182,7 +192,7 @@ def test_the_seed_decides() -> None:
     def trained(seed: int) -> torch.Tensor:
         learner = SoftQLearner(small_environment, SMALL, seed, CPU)
         while learner.step < 160:
-            learner.advance()
+            learner.train_iteration()
         return torch.cat([value.flatten() for value in state_of(learner)])
 
     assert torch.equal(trained(1), trained(1))
@@ -191,13 +201,13 @@ def test_the_seed_decides() -> None:
 
 SETTINGS = [
     "task.nodes=6",
-    "learning.steps=480",
-    "learning.environments=4",
-    "learning.batch=16",
-    "learning.warm_up=60",
+    "learning.total_timesteps=480",
+    "learning.num_envs=4",
+    "learning.batch_size=16",
+    "learning.learning_starts=60",
 ]
 SETTINGS += [
-    "learning.replay=300",
+    "learning.buffer_size=300",
     "learning.width=8",
     "evaluate_every=160",
     "evaluation_scenes=8",
@@ -230,7 +240,7 @@ def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> 
     ]
     assert [row["step"] for row in histories[0]] == [row["step"] for row in histories[1]]
     assert [row["score"] for row in histories[0]] == [row["score"] for row in histories[1]]
-    assert whole.about["metrics"]["step"] == 480
+    assert whole.metadata["metrics"]["step"] == 480
     with pytest.raises(InputError, match=r"config\.yaml"):
         train.main(tmp_path / "whole", settings=[*SETTINGS, "seed=1"])
 
@@ -241,16 +251,16 @@ REFUSED = [
     "save_every=0",
     "task.nodes=2",
     "warm_start=1",
-    "learning.steps=many",
+    "learning.total_timesteps=many",
 ]
 REFUSED += [
-    "learning.halve_every=0",
-    "learning.segment=0",
+    "learning.lr_halving_steps=0",
+    "learning.sequence_length=0",
     "learning.width=0",
-    "learning.trace=1.5",
-    "learning.target_rate=2",
+    "learning.retrace_lambda=1.5",
+    "learning.tau=2",
 ]
-REFUSED += ["learning.replay=35"]
+REFUSED += ["learning.buffer_size=35"]
 
 
 @pytest.mark.parametrize("setting", REFUSED)
@@ -266,9 +276,9 @@ def test_a_warm_start_of_another_width_is_refused() -> None:
         SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12)
     )
     with pytest.raises(InputError, match=r"learning\.width: 12"):
-        wide.begin_with(narrow.network)
+        wide.warm_start(narrow.network)
     other = SoftQLearner(small_environment, SMALL, 1, CPU)
-    other.begin_with(narrow.network)
+    other.warm_start(narrow.network)
     assert all(
         torch.equal(mine, theirs)
         for mine, theirs in zip(state_of(other), state_of(narrow), strict=True)

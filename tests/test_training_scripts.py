@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from conftest import CATALOG, training_script
 
-from drake_clutter.agents.evaluation import EpisodeResult
-from drake_clutter.agents.generation import GenerationJob
+from drake_clutter.agents.episode_evaluation import EpisodeResult
+from drake_clutter.agents.generators import GenerationJob
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.records import resume_jsonl

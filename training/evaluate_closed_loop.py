@@ -25,11 +25,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.exploration import TRAINED
+from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import upgrade_head
 from drake_clutter.files import InputError, cli_error_handler, file_sha256, write_json
-from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import MoveResult
@@ -40,9 +40,9 @@ from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
 from drake_clutter.systems.tracking import recognised
-from drake_clutter.tasks.arm_ceiling import ArmCeiling
+from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
@@ -109,7 +109,7 @@ class Player:
             lambda name: load_scene_dataset(HERE / "scenes" / f"{name}.json", self._catalog)
         )
         self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
-        self._ceiling = ArmCeiling(Scenario().world)
+        self._ceiling = ArmReachabilityBound(Scenario().world)
 
     def __call__(self, asked: Asked) -> dict[str, Any]:
         """Plays one, and tells how it went."""
@@ -124,7 +124,7 @@ class Player:
         scene = held.settled_scene(number, held.grammar, scenario.world)
         begun = time.perf_counter()
         told: dict[str, Any] = {"number": number, "solvable": held.scenes[number].solvable}
-        told["arm_can"] = not self._ceiling.never_found(scene)
+        told["arm_can"] = not self._ceiling.find_unrevealable(scene)
         try:
             task, known, robot = self._played(scene, scenario, row.motion)
         except Exception as error:  # whatever it is, it is a result
@@ -132,7 +132,7 @@ class Player:
         else:
             told |= told_of(task, known) | {
                 "robot": robot,
-                "ended": (task.end or EpisodeEnd.GAVE_UP).value,
+                "ended": (task.termination or TerminationReason.GAVE_UP).value,
             }
         return told | {"wall": time.perf_counter() - begun}
 
@@ -162,7 +162,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
         InputError: the file holds episodes of other networks, scenes or settings.
     """
     scenes = load_scene_dataset(HERE / "scenes" / f"{row.scenes}.json", load_catalog())
-    networks = [checkpoint_path(row.agent, TRAINED)]
+    networks = [checkpoint_path(row.agent, PRETRAINED_EXPLORERS)]
     if row.perception != "labels":
         networks.append(checkpoint_path(row.perception, DETECTORS))
     scenario = to_plain(
@@ -186,32 +186,38 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
 
 def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, Any]:
     """What is kept of an episode."""
-    results = Counter(step.outcome.result for step in task.steps)
+    results = Counter(step.outcome.result for step in task.transitions)
     reasons = Counter(
         s.outcome.detail.split(":")[0]
-        for s in task.steps
+        for s in task.transitions
         if s.outcome.result is MoveResult.NOT_PLANNED
     )
-    worst = task.steps[-1].outcome if task.steps and task.end is EpisodeEnd.COLLAPSED else None
+    worst = (
+        task.transitions[-1].outcome
+        if task.transitions and task.termination is TerminationReason.COLLAPSED
+        else None
+    )
     return {
-        "hidden": len(task.hidden_at_start),
+        "hidden": len(task.initially_hidden),
         "found": len(task.found),
         "found_after": np.cumsum(
-            [len(step.newly_found) for step in task.steps], dtype=int
+            [len(step.newly_found) for step in task.transitions], dtype=int
         ).tolist(),
-        "moves": len(task.steps),
+        "moves": len(task.transitions),
         "objects": len(task.scene.objects),
         "known": len(known),
         "recognised": len(recognised(known, task.scene.objects)),
         "results": {result.value: count for result, count in results.items()},
         "not_planned": dict(reasons),
-        "collapse": f"{task.steps[-1].move}: {worst.instability}; {worst.detail}" if worst else "",
+        "collapse": f"{task.transitions[-1].move}: {worst.instability}; {worst.detail}"
+        if worst
+        else "",
     }
 
 
 def stage(episode: dict[str, Any]) -> str:
     """What an episode that did not find everything failed of."""
-    if episode["ended"] in ("exception", EpisodeEnd.COLLAPSED.value):
+    if episode["ended"] in ("exception", TerminationReason.COLLAPSED.value):
         return str(episode["ended"])
     if not episode["arm_can"]:
         return "what is left lies behind what no cup holds"
@@ -223,7 +229,7 @@ def stage(episode: dict[str, Any]) -> str:
 
 def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The figures of a row."""
-    won = [e["ended"] == EpisodeEnd.ALL_FOUND.value for e in episodes]
+    won = [e["ended"] == TerminationReason.ALL_FOUND.value for e in episodes]
     played, able = (
         [e for e in episodes if e["ended"] != "exception"],
         [k for k, e in enumerate(episodes) if e["arm_can"]],
@@ -253,7 +259,7 @@ def row_of(row: Row, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     moves = [e["moves"] for e, success in zip(episodes, won, strict=True) if success]
     told["moves_of_successes"] = float(np.mean(moves)) if moves else None
     # Of the list of objects that the agent has at the end of a success.
-    lists = [e for e in played if e["ended"] == EpisodeEnd.ALL_FOUND.value]
+    lists = [e for e in played if e["ended"] == TerminationReason.ALL_FOUND.value]
     right = sum(e["recognised"] for e in lists)
     told["list_recall"] = right / max(1, sum(e["objects"] for e in lists))
     told["list_precision"] = right / max(1, sum(e["known"] for e in lists))

@@ -189,7 +189,7 @@ def main(
         )
     fields = {
         "detector": detector.name,
-        "trained": load_checkpoint(detector).about["metrics"],
+        "trained": load_checkpoint(detector).metadata["metrics"],
         "commit": git_commit(),
         "seed": seed,
         "rows": rows,

@@ -17,31 +17,31 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.backends import FIDELITIES
-from drake_clutter.agents.evaluation import (
-    Episode,
-    EpisodePlayer,
+from drake_clutter.agents.backend_factory import FIDELITIES
+from drake_clutter.agents.episode_evaluation import (
     EpisodeResult,
-    summarise_episodes,
+    EpisodeRunner,
+    EpisodeSpec,
+    summarize_episodes,
 )
-from drake_clutter.agents.exploration import FULL_KNOWLEDGE, TRAINED, make_explorers
+from drake_clutter.agents.explorers import ORACLE, PRETRAINED_EXPLORERS, make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade_head
 from drake_clutter.files import InputError, cli_error_handler, write_json
-from drake_clutter.learning.shipped import weights_of
+from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.records import resume_jsonl
 from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import bootstrap_ratio_interval
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
 HERE = Path(__file__).parent
 SCENES, RESULTS = HERE / "scenes", HERE / "results"
 LIMITS = (10, 20)
-COMPARED = {"ceiling": FULL_KNOWLEDGE, "largest_clear": "largest-clear"}
+COMPARED = {"ceiling": ORACLE, "largest_clear": "largest-clear"}
 """Whose moves the others' are compared with, by what the figures call them."""
 SEVEN = (
     "random",
@@ -50,9 +50,9 @@ SEVEN = (
     "student-rg",
     "student-dagger",
     "student",
-    FULL_KNOWLEDGE,
+    ORACLE,
 )
-FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", FULL_KNOWLEDGE)
+FOURTEEN = ("random", "largest-first", "largest-clear", "student-14", ORACLE)
 SETS_OF_SEVEN = (
     "paper_hardness",
     "sg_star_10",
@@ -75,15 +75,15 @@ def played(
         "set": scenes.name,
         "sha256": scenes.sha256,
         "agent": agent,
-        "weights": weights_of(agent, TRAINED),
+        "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
     }
     asked |= {"seed": seed, "fidelity": fidelity, "moves": max(LIMITS), "config": to_plain(config)}
     commit = git_commit()
 
     def play(done: int) -> Iterator[dict[str, Any]]:
-        missing = [Episode(SCENES / scenes.name, k, agent, k) for k in range(done, count)]
+        missing = [EpisodeSpec(SCENES / scenes.name, k, agent, k) for k in range(done, count)]
         results = map_ordered(
-            partial(EpisodePlayer, config, None, max(LIMITS), seed, fidelity),
+            partial(EpisodeRunner, config, None, max(LIMITS), seed, fidelity),
             missing,
             workers=workers,
         )
@@ -105,7 +105,7 @@ def episode_of(record: Mapping[str, Any]) -> EpisodeResult:
 def file_of(folder: Path, name: str, agent: str) -> Path:
     """Of an agent's episodes on a set."""
     told = (
-        f"{Path(agent).stem}_{weights_of(agent, TRAINED)[:8]}"
+        f"{Path(agent).stem}_{checkpoint_sha256(agent, PRETRAINED_EXPLORERS)[:8]}"
         if agent.endswith(".safetensors")
         else agent
     )
@@ -125,13 +125,13 @@ def row_of(
     results: Sequence[EpisodeResult], others: Mapping[str, Sequence[EpisodeResult]]
 ) -> dict[str, Any]:
     """The figures of an agent on scenes; `others`: how those fared on the first of them whose moves its own are compared with."""
-    row = summarise_episodes(results, LIMITS)
+    row = summarize_episodes(results, LIMITS)
     for name, theirs in others.items():
         both = zip(results, theirs, strict=False)
         pairs = [
             (a.moves, b.moves)
             for a, b in both
-            if {a.ended, b.ended} == {EpisodeEnd.ALL_FOUND.value}
+            if {a.ended, b.ended} == {TerminationReason.ALL_FOUND.value}
         ]
         row[f"moves_to_{name}"] = (
             sum(m for m, _ in pairs) / sum(m for _, m in pairs) if pairs else None
@@ -235,7 +235,7 @@ def main(
     for name, scenes in sets.items():  # says what is wrong before anything is played
         rows_there(out or RESULTS / f"{TABLES[name][0]}.json", held)
         for agent in agents or TABLES[name][1]:
-            make_explorers(agent, ClutterConfig(), [c.name for c in scenes.classes])
+            make_policy_factory(agent, ClutterConfig(), [c.name for c in scenes.classes])
     for name, scenes in sets.items():
         table, agents_of_table = TABLES[name]
         number = min(count or len(scenes.scenes), len(scenes.scenes))
@@ -261,7 +261,7 @@ def main(
                 "set": name,
                 "sha256": scenes.sha256,
                 "agent": agent,
-                "weights": weights_of(agent, TRAINED),
+                "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
             }
             row |= row_of(found[agent], others) | {
                 "commits": commits_of(file_of(folder, name, agent), number)

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from drake_clutter.agents.generation import TRAINED, GenerationJob
+from drake_clutter.agents.generators import PRETRAINED_GENERATORS, GenerationJob
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
@@ -137,7 +137,9 @@ def of_temperatures(found: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]
     """The rows of SG* at 25 nodes in the order of their temperatures; Table I's is at that of the checkpoint."""
     rows = [found[row.folder] for row in TRADE if row.folder in found]
     if (as_shipped := found.get(Row("sg-star", 25, 1000).folder)) is not None:
-        about = json.loads(resource_path(TRAINED["sg-star"]).with_suffix(".json").read_text())
+        about = json.loads(
+            resource_path(PRETRAINED_GENERATORS["sg-star"]).with_suffix(".json").read_text()
+        )
         rows.append(as_shipped | {"temperature": about["temperature"]})
     return sorted(rows, key=lambda row: float(row["temperature"]))
 

@@ -21,7 +21,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
@@ -35,7 +35,7 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.generation import GenerationTask
+from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.workers.parallel_map import map_ordered
 
 MOST_DRAWS = 20
@@ -68,7 +68,7 @@ class GraphJudge:
     def __init__(self, job: GenerationJob) -> None:
         self._job, self._generator = job, SceneGenerator(job)
         self._fast, self._drake = (
-            FastJudge(job.config, margin=GenerationTask().margin),
+            FastJudge(job.config, margin=GenerationTaskConfig().contact_margin),
             DrakeJudge(job.config),
         )
         self._classes = load_catalog().classes
@@ -158,7 +158,7 @@ def main(
     if not frozen:
         judged = resume_jsonl(
             work / JUDGED,
-            job.fields,
+            job.to_dict,
             lambda done: map_ordered(
                 partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers
             ),

@@ -34,7 +34,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, cli_error_handler, prepare_output_directory, write_json

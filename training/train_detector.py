@@ -18,7 +18,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade
 from drake_clutter.files import cli_error_handler
-from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.perception.image_dataset import ImageDataset
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, ImageWindow, SegmentationNetwork
 from drake_clutter.perception.segmentation_training import (
@@ -82,7 +82,7 @@ def main(
     """Trains, evaluates as it goes, and writes detector.safetensors."""
     given = load_config_as(CONFIG, config, settings or [], upgrade)
     torch.set_num_threads(threads)
-    chosen, camera, support = device_of(device), given.cell.camera, given.cell.support
+    chosen, camera, support = resolve_device(device), given.cell.camera, given.cell.support
     classes = [
         c.name
         for c in load_catalog(Path(given.catalog) if given.catalog else None).object_set(

@@ -11,19 +11,19 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.agents.cloning import Cloning, CloningConfig
-from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
-from drake_clutter.agents.message_passing import one_thread_per_operation
+from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
+from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
+from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.validation import InRange, config_class, load_config_as
 
 
 @config_class
-class DAggerTrainingConfig(ExplorerTraining):
+class DAggerTrainingConfig(ExplorerTrainingConfig):
     """A training, see `ExplorerTraining`.
 
     Attributes:
@@ -34,7 +34,7 @@ class DAggerTrainingConfig(ExplorerTraining):
 
     teacher: str = "training/checkpoints/teacher.safetensors"
     evaluate_every: Annotated[int, InRange(1)] = 5
-    learning: CloningConfig = field(default_factory=CloningConfig)
+    learning: BehaviorCloningConfig = field(default_factory=BehaviorCloningConfig)
 
 
 CONFIG = DAggerTrainingConfig()
@@ -57,27 +57,32 @@ def main(
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
     given = load_config_as(CONFIG, config, settings or [], upgrade)
-    one_thread_per_operation()
-    chosen = device_of(device)
-    environment = given.environment()
+    limit_operations_to_one_thread()
+    chosen = resolve_device(device)
+    environment = given.make_environment()
     teacher, numbers = load_explorer(
         load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER
     )
-    if numbers != environment.numbers:
+    if numbers != environment.node_kind_ids:
         raise InputError(
             f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}"
         )
-    learner = Cloning(environment, teacher.to(chosen), given.learning, given.seed, chosen)
-    run = TrainingRun(
-        out, given, learner, given.learning.rounds, [Path(given.scenes), Path(given.teacher)]
+    learner = BehaviorCloningLearner(
+        environment, teacher.to(chosen), given.learning, given.seed, chosen
     )
-    while learner.step < given.learning.rounds:
-        learner.advance()
-        if learner.step == given.learning.rounds or learner.step % given.evaluate_every == 0:
-            run.report(given.evaluation(environment, learner.network), learner.losses)
+    run = TrainingRun(
+        out, given, learner, given.learning.iterations, [Path(given.scenes), Path(given.teacher)]
+    )
+    while learner.step < given.learning.iterations:
+        learner.train_iteration()
+        if learner.step == given.learning.iterations or learner.step % given.evaluate_every == 0:
+            run.report(given.evaluate(environment, learner.network), learner.losses)
             run.save()
-    about = {"kind": STUDENT, "network": about_explorer(environment.numbers, given.learning.width)}
-    run.finish(CHECKPOINT, learner.network, about)
+    about = {
+        "kind": STUDENT,
+        "network": explorer_metadata(environment.node_kind_ids, given.learning.width),
+    }
+    run.finish(CHECKPOINT_FILE, learner.network, about)
 
 
 if __name__ == "__main__":

@@ -12,19 +12,19 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.agents.actor_critic import ActorCritic, ActorCriticConfig
-from drake_clutter.agents.explorer_training import CHECKPOINT, ExplorerTraining
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, about_explorer, load_explorer
-from drake_clutter.agents.message_passing import one_thread_per_operation
+from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
+from drake_clutter.agents.message_passing import limit_operations_to_one_thread
+from drake_clutter.agents.ppo import PPOConfig, PPOLearner
 from drake_clutter.config import upgrade
 from drake_clutter.files import InputError, cli_error_handler
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.learning.training_run import TrainingRun, device_of
+from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.validation import Flag, InRange, config_class, load_config_as
 
 
 @config_class
-class PPOTrainingConfig(ExplorerTraining):
+class PPOTrainingConfig(ExplorerTrainingConfig):
     """A training, see `ExplorerTraining`.
 
     Attributes:
@@ -37,7 +37,7 @@ class PPOTrainingConfig(ExplorerTraining):
     privileged: Flag = True
     warm_start: str = ""
     evaluate_every: Annotated[int, InRange(1)] = 15_000
-    learning: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    learning: PPOConfig = field(default_factory=PPOConfig)
 
 
 CONFIG = PPOTrainingConfig()
@@ -60,30 +60,33 @@ def main(
 ) -> None:
     """Trains, evaluates as it goes, and writes explorer.safetensors."""
     given = load_config_as(CONFIG, config, settings or [], upgrade)
-    one_thread_per_operation()
-    environment = given.environment(privileged=given.privileged)
-    learner = ActorCritic(environment, given.learning, given.seed, device_of(device))
+    limit_operations_to_one_thread()
+    environment = given.make_environment(privileged=given.privileged)
+    learner = PPOLearner(environment, given.learning, given.seed, resolve_device(device))
     kind = TEACHER if given.privileged else STUDENT
     if given.warm_start:
         begun, numbers = load_explorer(
             load_checkpoint(Path(given.warm_start)), Path(given.warm_start), kind
         )
-        if (numbers, len(begun.mark)) != (environment.numbers, given.learning.width):
+        if (numbers, len(begun.pick_marker)) != (environment.node_kind_ids, given.learning.width):
             raise InputError(
                 f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same"
             )
         learner.network.load_state_dict(begun.state_dict())
     files = [Path(file) for file in (given.scenes, given.warm_start) if file]
-    run = TrainingRun(out, given, learner, given.learning.steps, files)
-    while learner.step < given.learning.steps:
+    run = TrainingRun(out, given, learner, given.learning.total_timesteps, files)
+    while learner.step < given.learning.total_timesteps:
         before = learner.step
-        learner.advance()
-        over = learner.step >= given.learning.steps
+        learner.train_iteration()
+        over = learner.step >= given.learning.total_timesteps
         if over or learner.step // given.evaluate_every > before // given.evaluate_every:
-            run.report(given.evaluation(environment, learner.network), learner.losses)
+            run.report(given.evaluate(environment, learner.network), learner.losses)
             run.save()
-    about = {"kind": kind, "network": about_explorer(environment.numbers, given.learning.width)}
-    run.finish(CHECKPOINT, learner.network, about)
+    about = {
+        "kind": kind,
+        "network": explorer_metadata(environment.node_kind_ids, given.learning.width),
+    }
+    run.finish(CHECKPOINT_FILE, learner.network, about)
 
 
 if __name__ == "__main__":

@@ -13,16 +13,26 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_clutter.agents.learned_generator import about_values, load_values
-from drake_clutter.agents.message_passing import one_thread_per_operation
-from drake_clutter.agents.soft_q import PARTS, Episode, SoftQConfig, SoftQLearner, play
+from drake_clutter.agents.learned_generator import load_rule_network, rule_network_metadata
+from drake_clutter.agents.message_passing import limit_operations_to_one_thread
+from drake_clutter.agents.soft_q import (
+    NUM_GRADIENT_SHARDS,
+    SampledEpisode,
+    SoftQConfig,
+    SoftQLearner,
+    sample_episodes,
+)
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade
 from drake_clutter.files import cli_error_handler
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.learning.training_run import TrainingRun, device_of
-from drake_clutter.tasks.generation import MOST_IN_A_STACK, ClutterGeneration, GenerationTask
+from drake_clutter.learning.training_run import TrainingRun, resolve_device
+from drake_clutter.tasks.generation_task import (
+    MAX_BALANCED_STACK_FRACTION,
+    ClutterGeneration,
+    GenerationTaskConfig,
+)
 from drake_clutter.validation import (
     InRange,
     NonNegative,
@@ -57,7 +67,7 @@ class GeneratorTrainingConfig:
     evaluation_scenes: Annotated[int, InRange(1)] = 256
     save_every: Annotated[int, InRange(1)] = 64_000
     sampling_temperature: NonNegative = 0.0
-    task: GenerationTask = field(default_factory=GenerationTask)
+    task: GenerationTaskConfig = field(default_factory=GenerationTaskConfig)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
@@ -66,7 +76,7 @@ CONFIG = GeneratorTrainingConfig()
 """Default configuration of the training."""
 
 
-def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float]:
+def figures(episodes: list[SampledEpisode], classes: dict[str, Any]) -> dict[str, float]:
     """What the fast judge says of sampled scenes."""
     made = [episode.info for episode in episodes if "scene" in episode.info]
     hidden = [len(info["verdict"].hidden) for info in made]
@@ -74,13 +84,15 @@ def figures(episodes: list[Episode], classes: dict[str, Any]) -> dict[str, float
     graphs = [info["scene"].graph for info in made]
     forms = {canonical_form(graph, classes) for graph in graphs}
     return {
-        "score": float(np.mean([episode.score for episode in episodes])),
+        "score": float(np.mean([episode.episodic_return for episode in episodes])),
         "stable": len(made) / len(episodes),
         "hidden": float(np.mean(hidden)) if hidden else 0.0,
         "distinct": len(forms) / max(1, len(made)),
         "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if made else 0.0,
         "balanced": float(
-            np.mean([graph.largest_stack_share() <= MOST_IN_A_STACK for graph in graphs])
+            np.mean(
+                [graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION for graph in graphs]
+            )
         )
         if made
         else 0.0,
@@ -103,13 +115,16 @@ def main(
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     threads: Annotated[
-        int, typer.Option(min=1, max=PARTS, help="That work on an update; changes no result.")
-    ] = PARTS,
+        int,
+        typer.Option(
+            min=1, max=NUM_GRADIENT_SHARDS, help="That work on an update; changes no result."
+        ),
+    ] = NUM_GRADIENT_SHARDS,
 ) -> None:
     """Trains, evaluates as it goes, and writes generator.safetensors."""
     given = load_config_as(CONFIG, config, settings or [], upgrade)
-    chosen = device_of(device)
-    one_thread_per_operation()
+    chosen = resolve_device(device)
+    limit_operations_to_one_thread()
     classes = load_catalog(Path(given.catalog) if given.catalog else None).object_set(given.objects)
 
     def make_environment() -> ClutterGeneration:
@@ -118,11 +133,13 @@ def main(
     example, learning = make_environment(), given.learning
     learner = SoftQLearner(make_environment, learning, given.seed, chosen, threads)
     if given.warm_start:
-        learner.begin_with(load_values(load_checkpoint(Path(given.warm_start)), example.grammar))
-    run, losses = TrainingRun(out, given, learner, learning.steps), list[float]()
+        learner.warm_start(
+            load_rule_network(load_checkpoint(Path(given.warm_start)), example.grammar)
+        )
+    run, losses = TrainingRun(out, given, learner, learning.total_timesteps), list[float]()
 
     def evaluate() -> None:
-        episodes = play(
+        episodes = sample_episodes(
             learner.network,
             make_environment,
             given.evaluation_scenes,
@@ -134,9 +151,9 @@ def main(
         )
         losses.clear()
 
-    while learner.step < learning.steps:
+    while learner.step < learning.total_timesteps:
         before = learner.step
-        learner.advance()
+        learner.train_iteration()
         losses += learner.losses
         if learner.step // given.evaluate_every > before // given.evaluate_every:
             evaluate()
@@ -146,7 +163,7 @@ def main(
         evaluate()
     about = {
         "kind": "generator",
-        "network": about_values(example.grammar, learning.width),
+        "network": rule_network_metadata(example.grammar, learning.width),
         "temperature": given.sampling_temperature or learning.temperature,
     }
     run.finish(CHECKPOINT, learner.network, about)

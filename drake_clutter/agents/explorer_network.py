@@ -5,7 +5,7 @@ head of Janisch et al.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -14,20 +14,26 @@ from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
 from drake_clutter.agents.graph_network import GraphBatch, GraphNetwork, MessagePassing
-from drake_clutter.agents.message_passing import Links, pack
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, GLOBALS, GraphObservation
+from drake_clutter.agents.message_passing import BatchConnectivity, pack_graphs
+from drake_clutter.learning.checkpoint import RenamedParameters
+from drake_clutter.tasks.exploration_graph import (
+    EDGE_KINDS,
+    GLOBAL_FEATURES,
+    NODE_FEATURES,
+    ExplorationObservation,
+)
 
 
-def stacked_graphs(observations: Sequence[GraphObservation]) -> GraphObservation:
+def collate_graphs(observations: Sequence[ExplorationObservation]) -> ExplorationObservation:
     """A batch: the arrays of `exploration_graph` with a first axis of graphs, padded to the largest."""
     nodes = max(len(observation["node_kind"]) for observation in observations)
     edges = nodes * (nodes - 1) // 2
     shapes = {
         "node_kind": (nodes,),
-        "feature": (nodes, len(FEATURES)),
+        "feature": (nodes, len(NODE_FEATURES)),
         "edge": (edges, 2),
         "edge_kind": (edges,),
-        "glob": (len(GLOBALS),),
+        "glob": (len(GLOBAL_FEATURES),),
         "allowed": (nodes, nodes),
     }
     batch = {
@@ -41,22 +47,31 @@ def stacked_graphs(observations: Sequence[GraphObservation]) -> GraphObservation
     return batch
 
 
-class Evaluated(NamedTuple):
+class PolicyOutput(NamedTuple):
     """What the network says of a batch of B graphs with up to N nodes.
 
     Attributes:
-        pick: (B, N) log-probability of each node as what is picked; -inf where it cannot be.
+        pick_log_probs: (B, N) log-probability of each node as what is picked; -inf where it cannot be.
         value: (B,) expected sum of rewards.
-        embedded: what the choice of the place goes on from.
+        encoding: what the choice of the place goes on from.
     """
 
-    pick: Tensor
+    pick_log_probs: Tensor
     value: Tensor
-    embedded: tuple[Tensor, Tensor, GraphBatch, Tensor, Tensor]
+    encoding: tuple[Tensor, Tensor, GraphBatch, Tensor, Tensor]
 
 
-class ExplorerNetwork(nn.Module):
+class ExplorerNetwork(RenamedParameters):
     """Policy and value over the arrays of `exploration_graph`."""
+
+    renamed: ClassVar[Mapping[str, str]] = {
+        "network": "encoder",
+        "pick": "pick_head",
+        "mark": "pick_marker",
+        "after_pick": "post_pick_layers",
+        "place": "place_head",
+        "value": "value_head",
+    }
 
     def __init__(self, node_kinds: int, width: int = 32) -> None:
         """Makes a network.
@@ -66,48 +81,58 @@ class ExplorerNetwork(nn.Module):
             width: of the embeddings.
         """
         super().__init__()
-        self.network = GraphNetwork(
-            node_kinds, len(FEATURES), 2 * len(EDGE_KINDS), len(GLOBALS), width
+        self.encoder = GraphNetwork(
+            node_kinds, len(NODE_FEATURES), 2 * len(EDGE_KINDS), len(GLOBAL_FEATURES), width
         )
-        self.pick = nn.Linear(width, 1)
-        self.mark = nn.Parameter(torch.zeros(width))
-        self.after_pick = MessagePassing(width, 3, 2)
-        self.place = nn.Linear(width, 1)
-        self.value = nn.Linear(width, 1)
-        nn.init.normal_(self.mark, std=1.0)
+        self.pick_head = nn.Linear(width, 1)
+        self.pick_marker = nn.Parameter(torch.zeros(width))
+        self.post_pick_layers = MessagePassing(width, 3, 2)
+        self.place_head = nn.Linear(width, 1)
+        self.value_head = nn.Linear(width, 1)
+        nn.init.normal_(self.pick_marker, std=1.0)
 
-    def batch(self, observation: Mapping[str, NDArray[Any]]) -> tuple[GraphBatch, Tensor]:
+    def make_batch(self, observation: Mapping[str, NDArray[Any]]) -> tuple[GraphBatch, Tensor]:
         """The network's input, and the number of each node in its graph."""
-        weight = self.value.weight
-        graph, number, kind, *joined = pack(
+        weight = self.value_head.weight
+        graph, number, kind, *joined = pack_graphs(
             observation["node_kind"], observation["edge"], observation["edge_kind"], len(EDGE_KINDS)
         )
         feature = torch.from_numpy(observation["feature"][graph, number]).to(weight)
-        links = Links(*(torch.from_numpy(array).to(weight.device) for array in (graph, *joined)))
+        links = BatchConnectivity(
+            *(torch.from_numpy(array).to(weight.device) for array in (graph, *joined))
+        )
         glob = torch.from_numpy(observation["glob"]).to(weight)
         return GraphBatch(
             torch.from_numpy(kind).to(weight.device), feature, links, glob
         ), torch.from_numpy(number).to(weight.device)
 
-    def forward(self, observation: Mapping[str, NDArray[Any]]) -> Evaluated:
+    def forward(self, observation: Mapping[str, NDArray[Any]]) -> PolicyOutput:
         """What to pick, and what is to be expected."""
-        batch, number = self.batch(observation)
-        node, glob = self.network(batch)
+        batch, number = self.make_batch(observation)
+        node, glob = self.encoder(batch)
         allowed = torch.from_numpy(observation["allowed"]).to(node.device) > 0
         pick = _log_softmax(
-            self.pick(node).squeeze(1), batch.links.graph, number, allowed.any(dim=2)
+            self.pick_head(node).squeeze(1),
+            batch.connectivity.node_graph,
+            number,
+            allowed.any(dim=2),
         )
-        return Evaluated(pick, self.value(glob).squeeze(1), (node, glob, batch, number, allowed))
+        return PolicyOutput(
+            pick, self.value_head(glob).squeeze(1), (node, glob, batch, number, allowed)
+        )
 
-    def places(self, found: Evaluated, picked: Tensor) -> Tensor:
+    def place_log_probs(self, found: PolicyOutput, picked: Tensor) -> Tensor:
         """(B, N) log-probability of each node as the place, once (B,) nodes are picked; -inf where it cannot be."""
-        node, glob, batch, number, allowed = found.embedded
-        marked = (number == picked[batch.links.graph])[:, None] * self.mark
-        edge = leaky_relu(self.network.edge.weight)
-        node, _ = self.after_pick(node + marked, glob, edge, batch.links)
+        node, glob, batch, number, allowed = found.encoding
+        marked = (number == picked[batch.connectivity.node_graph])[:, None] * self.pick_marker
+        edge = leaky_relu(self.encoder.edge_kind_embedding.weight)
+        node, _ = self.post_pick_layers(node + marked, glob, edge, batch.connectivity)
         rows = torch.arange(len(glob), device=node.device)
         return _log_softmax(
-            self.place(node).squeeze(1), batch.links.graph, number, allowed[rows, picked]
+            self.place_head(node).squeeze(1),
+            batch.connectivity.node_graph,
+            number,
+            allowed[rows, picked],
         )
 
 
@@ -117,7 +142,7 @@ def _log_softmax(score: Tensor, graph: Tensor, number: Tensor, allowed: Tensor) 
     return padded.masked_fill(~allowed, -torch.inf).log_softmax(dim=1)
 
 
-def chosen(
+def sample_categorical(
     log_probabilities: NDArray[np.float32], rng: np.random.Generator | None
 ) -> NDArray[np.int64]:
     """(B,) drawn from (B, N) log-probabilities, or without a generator the most likely."""
@@ -127,7 +152,7 @@ def chosen(
     return np.asarray((log_probabilities + noise).argmax(axis=1))
 
 
-def decide(
+def sample_actions(
     network: ExplorerNetwork,
     observation: Mapping[str, NDArray[Any]],
     rng: np.random.Generator | None,
@@ -139,10 +164,14 @@ def decide(
     """
     with torch.no_grad():
         found = network(observation)
-        picks = found.pick.cpu().numpy()
-        x = chosen(picks, rng)
-        places = network.places(found, torch.from_numpy(x).to(found.pick.device)).cpu().numpy()
-    y = chosen(places, rng)
+        picks = found.pick_log_probs.cpu().numpy()
+        x = sample_categorical(picks, rng)
+        places = (
+            network.place_log_probs(found, torch.from_numpy(x).to(found.pick_log_probs.device))
+            .cpu()
+            .numpy()
+        )
+    y = sample_categorical(places, rng)
     rows = np.arange(len(x))
     return (
         np.column_stack([x, y]),
@@ -152,6 +181,8 @@ def decide(
     )
 
 
-def log_probability(found: Evaluated, places: Tensor, moves: Tensor) -> Tensor:
+def action_log_probs(found: PolicyOutput, places: Tensor, moves: Tensor) -> Tensor:
     """(B,) of moves (B, 2), nodes x and y."""
-    return found.pick.gather(1, moves[:, :1]).squeeze(1) + places.gather(1, moves[:, 1:]).squeeze(1)
+    return found.pick_log_probs.gather(1, moves[:, :1]).squeeze(1) + places.gather(
+        1, moves[:, 1:]
+    ).squeeze(1)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
+from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
@@ -19,16 +19,16 @@ from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import Backend
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, FEATURES, exploration_graph
+from drake_clutter.tasks.exploration_graph import EDGE_KINDS, NODE_FEATURES, build_exploration_graph
 
 TEACHER, STUDENT = "teacher", "student"
 
 
-def about_explorer(numbers: dict[str, int], width: int) -> dict[str, Any]:
+def explorer_metadata(node_kind_ids: dict[str, int], width: int) -> dict[str, Any]:
     """What the inputs of an `ExplorerNetwork` stand for, for its checkpoint."""
     return {
-        "node_kinds": list(numbers),
-        "features": list(FEATURES),
+        "node_kinds": list(node_kind_ids),
+        "features": list(NODE_FEATURES),
         "edge_kinds": list(EDGE_KINDS),
         "width": width,
     }
@@ -42,7 +42,7 @@ def load_explorer(
     Raises:
         InputError: the checkpoint is of something else, or of another version of the observation.
     """
-    about = checkpoint.about
+    about = checkpoint.metadata
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
     if about.get("kind") not in allowed:
         raise InputError(
@@ -54,7 +54,7 @@ def load_explorer(
             f"{path.with_suffix('.json')}: network: lacks node_kinds or width; allowed is the file as it was written"
         )
     numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
-    if network != about_explorer(numbers, network["width"]):
+    if network != explorer_metadata(numbers, network["width"]):
         raise InputError(
             f"{path}: was trained on other features; allowed is a checkpoint of this version"
         )
@@ -68,7 +68,7 @@ def load_explorer(
     return made.eval(), numbers
 
 
-def _refuse_unknown(classes: Collection[str], numbers: Collection[str], path: Path) -> None:
+def _check_classes(classes: Collection[str], numbers: Collection[str], path: Path) -> None:
     unknown = sorted(set(classes) - set(numbers))
     if unknown:
         raise InputError(
@@ -82,7 +82,7 @@ class LearnedExplorer:
     def __init__(
         self,
         network: ExplorerNetwork,
-        numbers: dict[str, int],
+        node_kind_ids: dict[str, int],
         path: Path,
         config: ExplorationConfig,
         backend: Backend | None = None,
@@ -90,11 +90,11 @@ class LearnedExplorer:
         """With a network.
 
         Args:
-            network, numbers: see `load_explorer`; path: of the checkpoint, for errors.
+            network, node_kind_ids: see `load_explorer`; path: of the checkpoint, for errors.
             config: how objects are put down.
             backend: of the episode whose true scene the agent knows; None: it knows K_t.
         """
-        self._network, self._numbers, self._path = network, numbers, path
+        self._network, self._numbers, self._path = network, node_kind_ids, path
         self._config, self._backend = config, backend
 
     def __call__(
@@ -109,8 +109,8 @@ class LearnedExplorer:
             InputError: an object of a class that the agent has not learned.
         """
         shown = belief.objects if self._backend is None else self._backend.scene.objects
-        _refuse_unknown({o.object_class.name for o in shown}, self._numbers, self._path)
-        graph = exploration_graph(
+        _check_classes({o.object_class.name for o in shown}, self._numbers, self._path)
+        graph = build_exploration_graph(
             shown,
             observation,
             belief.history,
@@ -120,7 +120,7 @@ class LearnedExplorer:
         allowed, names = graph["allowed"], tuple(o.name for o in shown)
         chances: dict[str, float] = {}
         while allowed.any():
-            moves, _, _, picks = decide(self._network, stacked_graphs([graph]), None)
+            moves, _, _, picks = sample_actions(self._network, collate_graphs([graph]), None)
             # As the network had it first: what has no room and is passed over stays among them.
             chances = chances or {
                 name: float(picks[0, k])
@@ -139,7 +139,7 @@ class LearnedExplorer:
         return Decision(None)
 
 
-class LearnedExplorers:
+class LearnedExplorerFactory:
     """Makes a `LearnedExplorer` for each episode.
 
     Attributes:
@@ -162,8 +162,8 @@ class LearnedExplorers:
         self._path, self._config = path, config
         checkpoint = load_checkpoint(path)
         self._network, self._numbers = load_explorer(checkpoint, path)
-        _refuse_unknown(classes, self._numbers, path)
-        self.privileged = checkpoint.about["kind"] == TEACHER
+        _check_classes(classes, self._numbers, path)
+        self.privileged = checkpoint.metadata["kind"] == TEACHER
 
     def __call__(self, backend: Backend | None = None) -> LearnedExplorer:
         """Return the policy of an episode; only a privileged one needs its backend."""

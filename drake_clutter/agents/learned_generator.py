@@ -6,19 +6,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from drake_clutter.agents.graph_network import RuleValues
-from drake_clutter.agents.soft_q import softmax_choice, stacked
+from drake_clutter.agents.graph_network import RuleQNetwork
+from drake_clutter.agents.soft_q import collate, sample_softmax_actions
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.generation import GenerationTask, GraphVocabulary, PartialScene
+from drake_clutter.tasks.generation_task import GenerationTaskConfig, GraphVocabulary, PartialScene
+from drake_clutter.validation import validate
 
 
-def about_values(grammar: SceneGrammar, width: int) -> dict[str, Any]:
+def rule_network_metadata(grammar: SceneGrammar, width: int) -> dict[str, Any]:
     """What the inputs and outputs of a `RuleValues` stand for, for its checkpoint."""
-    vocabulary = GraphVocabulary.of(grammar)
+    vocabulary = GraphVocabulary.from_grammar(grammar)
     return {
         "node_kinds": list(vocabulary.node_kinds),
         "edge_kinds": [
@@ -29,40 +30,48 @@ def about_values(grammar: SceneGrammar, width: int) -> dict[str, Any]:
     }
 
 
-def load_values(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleValues:
+def load_rule_network(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleQNetwork:
     """The network of a checkpoint, for a grammar.
 
     What the checkpoint knows by name is taken over: node kinds, edge kinds and rules of another set of objects keep the
     values of a new network. So a training on one set can begin with what was learned on another.
     """
-    about = checkpoint.about["network"]
-    mine = about_values(grammar, about["width"])
-    network = RuleValues(
-        len(mine["node_kinds"]), len(mine["edge_kinds"]), len(mine["rules"]), about["width"]
-    )
-    state, theirs, ours = network.state_dict(), _named_axes(about), _named_axes(mine)
-    for name, weights in checkpoint.weights.items():
-        if name not in ours:
+    trained_metadata = checkpoint.metadata["network"]
+    metadata = rule_network_metadata(grammar, trained_metadata["width"])
+    network, trained = _make_network(metadata), _make_network(trained_metadata)
+    trained.load_state_dict(checkpoint.weights)
+    state = network.state_dict()
+    rows, trained_rows = _named_rows(metadata), _named_rows(trained_metadata)
+    for name, weights in trained.state_dict().items():
+        if name not in rows:
             state[name] = weights
             continue
-        axis, names = ours[name]
-        shared = [kind for kind in names if kind in theirs[name][1]]
-        taken = weights.index_select(
-            axis, torch.tensor([theirs[name][1].index(kind) for kind in shared])
-        )
-        state[name].index_copy_(axis, torch.tensor([names.index(kind) for kind in shared]), taken)
+        shared = [row for row in rows[name] if row in trained_rows[name]]
+        target = torch.tensor([rows[name].index(row) for row in shared])
+        source = torch.tensor([trained_rows[name].index(row) for row in shared])
+        state[name].index_copy_(0, target, weights.index_select(0, source))
     network.load_state_dict(state)
     return network
 
 
-def _named_axes(about: dict[str, Any]) -> dict[str, tuple[int, list[str]]]:
-    """Of each parameter with inputs or outputs that have names: the axis and the names along it."""
-    both_ways = about["edge_kinds"] + [f"{kind} backwards" for kind in about["edge_kinds"]]
+def _make_network(metadata: dict[str, Any]) -> RuleQNetwork:
+    node_kinds, edge_kinds, rules = (
+        len(metadata[name]) for name in ("node_kinds", "edge_kinds", "rules")
+    )
+    return RuleQNetwork(node_kinds, edge_kinds, rules, metadata["width"])
+
+
+def _named_rows(metadata: dict[str, Any]) -> dict[str, list[str]]:
+    """Return what each row stands for, of the parameters whose rows stand for kinds or rules."""
+    edge_kinds = metadata["edge_kinds"]
     return {
-        "network.kind.weight": (0, about["node_kinds"]),
-        "network.edge.weight": (0, both_ways),
-        "value.weight": (0, about["rules"]),
-        "value.bias": (0, about["rules"]),
+        "encoder.node_kind_embedding.weight": metadata["node_kinds"],
+        "encoder.edge_kind_embedding.weight": [
+            *edge_kinds,
+            *(f"{kind} backwards" for kind in edge_kinds),
+        ],
+        "q_head.weight": metadata["rules"],
+        "q_head.bias": metadata["rules"],
     }
 
 
@@ -81,14 +90,15 @@ class LearnedGenerator:
             InputError: the checkpoint cannot be read, or is none of a generator.
         """
         self._path, self._config, self._checkpoint = path, config, load_checkpoint(path)
-        if self._checkpoint.about.get("kind") != "generator":
+        if self._checkpoint.metadata.get("kind") != "generator":
             raise InputError(
                 f"{path}: is a checkpoint of another kind; allowed is one of training/train_generator.py"
             )
-        about = self._checkpoint.about
+        about = self._checkpoint.metadata
         self._temperature = about["temperature"] if temperature is None else temperature
-        self._judge = FastJudge(config, margin=about["config"]["task"]["margin"])
-        self._network: RuleValues | None = None
+        task = validate(GenerationTaskConfig, about["config"]["task"], str(path))
+        self._judge = FastJudge(config, margin=task.contact_margin)
+        self._network: RuleQNetwork | None = None
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
@@ -100,19 +110,23 @@ class LearnedGenerator:
         """
         if self._network is None:
             unknown = sorted(
-                set(grammar.classes) - set(self._checkpoint.about["network"]["node_kinds"])
+                set(grammar.classes) - set(self._checkpoint.metadata["network"]["node_kinds"])
             )
             if unknown:
                 raise InputError(
                     f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects"
                 )
-            self._network = load_values(self._checkpoint, grammar).eval()
-        task = GenerationTask(nodes=budget.nodes, must_come_apart=False)
+            self._network = load_rule_network(self._checkpoint, grammar).eval()
+        task = GenerationTaskConfig(nodes=budget.nodes, require_disassembly=False)
         partial = PartialScene(grammar, task, self._config, self._judge)
         while not partial.finished:
             with torch.no_grad():
-                values = self._network(stacked([partial.observe()])).numpy()
+                values = self._network(collate([partial.observe()])).numpy()
             partial.apply(
-                int(softmax_choice(values, partial.mask[None], self._temperature, rng)[0])
+                int(
+                    sample_softmax_actions(
+                        values, partial.action_mask[None], self._temperature, rng
+                    )[0]
+                )
             )
         return Derivation(partial.graph, tuple(partial.rules))

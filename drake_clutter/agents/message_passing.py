@@ -14,11 +14,11 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.nn.functional import leaky_relu
 
-SLOPE = 0.01
+NEGATIVE_SLOPE = 0.01
 """Of LeakyReLU below 0."""
 
 
-def one_thread_per_operation() -> None:
+def limit_operations_to_one_thread() -> None:
     """For the rest of the process: operations this small lose by being shared out, and more so when threads work side by side."""
     torch.set_num_threads(1)
     threadpool_limits(1)
@@ -29,9 +29,9 @@ class LayerWeights(NamedTuple):
 
     Attributes:
         sender, sender_bias (L, H), edge (L, H, H_edge): of the messages.
-        node, node_bias (L, H), maximum, glob: of the update of the nodes.
+        node, node_bias (L, H), max_message, global_to_node: of the update of the nodes.
         attention: (L, 1, H), attention_bias (L, 1).
-        pooled, pooled_bias (L, H), old: of the update of the global node, from what is pooled and from itself.
+        pooled, pooled_bias (L, H), global_self: of the update of the global node, from what is pooled and from itself.
     """
 
     sender: Any
@@ -39,13 +39,13 @@ class LayerWeights(NamedTuple):
     edge: Any
     node: Any
     node_bias: Any
-    maximum: Any
-    glob: Any
+    max_message: Any
+    global_to_node: Any
     attention: Any
     attention_bias: Any
     pooled: Any
     pooled_bias: Any
-    old: Any
+    global_self: Any
 
 
 class _Kept(NamedTuple):
@@ -65,22 +65,22 @@ class _Kept(NamedTuple):
     update_glob: Any
 
 
-class Links(NamedTuple):
+class BatchConnectivity(NamedTuple):
     """How the nodes of a batch hang together, tensors or arrays.
 
     Attributes:
-        graph: (M,) the graph that a node belongs to.
-        sender, receiver: (Z,) the nodes that an edge joins. kind: (Z,) number of its kind.
+        node_graph: (M,) the graph that a node belongs to.
+        senders, receivers: (Z,) the nodes that an edge joins. kind: (Z,) number of its kind.
     """
 
-    graph: Any
-    sender: Any
-    receiver: Any
-    kind: Any
+    node_graph: Any
+    senders: Any
+    receivers: Any
+    edge_kind: Any
 
 
 def message_passing(
-    node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights
+    node: Tensor, glob: Tensor, edge: Tensor, connectivity: BatchConnectivity, weights: LayerWeights
 ) -> tuple[Tensor, Tensor]:
     """Layer after layer: messages FC(sender, edge), their maximum by receiver, 0 where there is none, update FC(node, global,
     maximum) + skip; then the global node, FC(nodes pooled by attention, global) + skip. FC: a linear layer and LeakyReLU.
@@ -92,45 +92,50 @@ def message_passing(
         (M, H) and (B, H). Of equal messages on the CPU the first gets the gradient.
     """
     if node.device.type == "cpu":
-        found: tuple[Tensor, Tensor] = _MessagePassing.apply(node, glob, edge, *links, *weights)  # type: ignore[no-untyped-call]
+        found: tuple[Tensor, Tensor] = _MessagePassing.apply(
+            node, glob, edge, *connectivity, *weights
+        )  # type: ignore[no-untyped-call]
         return found
-    return composed(node, glob, edge, links, weights)
+    return message_passing_reference(node, glob, edge, connectivity, weights)
 
 
-def composed(
-    node: Tensor, glob: Tensor, edge: Tensor, links: Links, weights: LayerWeights
+def message_passing_reference(
+    node: Tensor, glob: Tensor, edge: Tensor, connectivity: BatchConnectivity, weights: LayerWeights
 ) -> tuple[Tensor, Tensor]:
     """See `message_passing`; equal messages share the gradient."""
     for layer in map(LayerWeights._make, zip(*weights, strict=True)):
         sent = node @ layer.sender.t() + layer.sender_bias
-        message = leaky_relu(sent[links.sender] + (edge @ layer.edge.t())[links.kind], SLOPE)
-        receiver = links.receiver[:, None].expand_as(message)
+        message = leaky_relu(
+            sent[connectivity.senders] + (edge @ layer.edge.t())[connectivity.edge_kind],
+            NEGATIVE_SLOPE,
+        )
+        receiver = connectivity.receivers[:, None].expand_as(message)
         most = torch.zeros_like(sent).scatter_reduce(
             0, receiver, message, "amax", include_self=False
         )
         update = (
             node @ layer.node.t()
             + layer.node_bias
-            + most @ layer.maximum.t()
-            + (glob @ layer.glob.t())[links.graph]
+            + most @ layer.max_message.t()
+            + (glob @ layer.global_to_node.t())[connectivity.node_graph]
         )
-        node = leaky_relu(update, SLOPE) + node
+        node = leaky_relu(update, NEGATIVE_SLOPE) + node
         logit = (node @ layer.attention.t() + layer.attention_bias).squeeze(1)
         largest = logit.new_full((len(glob),), -torch.inf).scatter_reduce(
-            0, links.graph, logit.detach(), "amax"
+            0, connectivity.node_graph, logit.detach(), "amax"
         )
-        share = (logit - largest[links.graph]).exp()[:, None]
-        total = share.new_zeros(len(glob), 1).index_add(0, links.graph, share)
-        pooled = torch.zeros_like(glob).index_add(0, links.graph, share * node) / total
-        update = pooled @ layer.pooled.t() + layer.pooled_bias + glob @ layer.old.t()
-        glob = leaky_relu(update, SLOPE) + glob
+        share = (logit - largest[connectivity.node_graph]).exp()[:, None]
+        total = share.new_zeros(len(glob), 1).index_add(0, connectivity.node_graph, share)
+        pooled = torch.zeros_like(glob).index_add(0, connectivity.node_graph, share * node) / total
+        update = pooled @ layer.pooled.t() + layer.pooled_bias + glob @ layer.global_self.t()
+        glob = leaky_relu(update, NEGATIVE_SLOPE) + glob
     return node, glob
 
 
 @njit(cache=True, nogil=True)
 def _slope(array):  # type: ignore[no-untyped-def]
-    """SLOPE as a number of the array's precision: one of double precision would have loops computed in that."""
-    return np.full(1, SLOPE, array.dtype)[0]
+    """NEGATIVE_SLOPE as a number of the array's precision: one of double precision would have loops computed in that."""
+    return np.full(1, NEGATIVE_SLOPE, array.dtype)[0]
 
 
 @njit(cache=True, nogil=True)
@@ -180,18 +185,18 @@ def _layer(k, node, glob, edge, links, w, kept, out, out_glob):  # type: ignore[
         kept.pooled[k],
     )
     sent, from_edge = np.dot(node, w.sender[k].T) + w.sender_bias[k], np.dot(edge, w.edge[k].T)
-    _maximum(sent, from_edge, links.sender, links.receiver, links.kind, most, kept.winner[k])
+    _maximum(sent, from_edge, links.senders, links.receivers, links.edge_kind, most, kept.winner[k])
     from_node, from_most, from_glob = (
         np.dot(node, w.node[k].T),
-        np.dot(most, w.maximum[k].T),
-        np.dot(glob, w.glob[k].T),
+        np.dot(most, w.max_message[k].T),
+        np.dot(glob, w.global_to_node[k].T),
     )
     bias = w.node_bias[k]
     for m in range(len(node)):
         a, b, c, d, e, f = (
             from_node[m],
             from_most[m],
-            from_glob[links.graph[m]],
+            from_glob[links.node_graph[m]],
             node[m],
             update[m],
             out[m],
@@ -201,8 +206,10 @@ def _layer(k, node, glob, edge, links, w, kept, out, out_glob):  # type: ignore[
             e[h] = value
             f[h] = max(value, value * slope) + d[h]
     logit = np.dot(out, w.attention[k].T)[:, 0] + w.attention_bias[k, 0]
-    _pooled(out, logit, links.graph, pooled, kept.share[k])
-    update_glob[:] = np.dot(pooled, w.pooled[k].T) + w.pooled_bias[k] + np.dot(glob, w.old[k].T)
+    _pooled(out, logit, links.node_graph, pooled, kept.share[k])
+    update_glob[:] = (
+        np.dot(pooled, w.pooled[k].T) + w.pooled_bias[k] + np.dot(glob, w.global_self[k].T)
+    )
     out_glob[:] = np.maximum(update_glob, update_glob * slope) + glob
 
 
@@ -237,7 +244,12 @@ def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, ou
     to_update, from_glob = np.empty_like(node), np.zeros_like(glob)
     of_attention = w.attention[k, 0]
     for m in range(len(node)):
-        share, a, b, c = kept.share[k, m], to_pooled[links.graph[m]], out[m], pooled[links.graph[m]]
+        share, a, b, c = (
+            kept.share[k, m],
+            to_pooled[links.node_graph[m]],
+            out[m],
+            pooled[links.node_graph[m]],
+        )
         to_share = share * 0
         for h in range(width):
             to_share += a[h] * (b[h] - c[h])
@@ -248,7 +260,7 @@ def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, ou
             to_node[m],
             to_update[m],
             kept.update[k, m],
-            from_glob[links.graph[m]],
+            from_glob[links.node_graph[m]],
         )
         for h in range(width):
             value = b[h] + share * a[h] + logit * of_attention[h]
@@ -256,26 +268,30 @@ def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, ou
             value *= 1 if e[h] > 0 else slope
             d[h] = value
             f[h] += value
-    to_most = np.dot(to_update, w.maximum[k])
+    to_most = np.dot(to_update, w.max_message[k])
     to_sent, to_from_edge = np.zeros_like(node), np.zeros((len(edge), width), node.dtype)
     for m in range(len(node)):
         for h in range(width):
             z = winner[m, h]
             if z >= 0:
                 value = to_most[m, h] if most[m, h] > 0 else to_most[m, h] * slope
-                to_sent[links.sender[z], h] += value
-                to_from_edge[links.kind[z], h] += value
+                to_sent[links.senders[z], h] += value
+                to_from_edge[links.edge_kind[z], h] += value
     to_node += np.dot(to_update, w.node[k])
     to_node += np.dot(to_sent, w.sender[k])
-    to_glob = to_out_glob + np.dot(to_update_glob, w.old[k]) + np.dot(from_glob, w.glob[k])
+    to_glob = (
+        to_out_glob
+        + np.dot(to_update_glob, w.global_self[k])
+        + np.dot(from_glob, w.global_to_node[k])
+    )
     to_w.sender[k], to_w.sender_bias[k] = np.dot(to_sent.T, node), _columns(to_sent)
     to_w.edge[k] = np.dot(to_from_edge.T, edge)
     to_w.node[k], to_w.node_bias[k] = np.dot(to_update.T, node), _columns(to_update)
-    to_w.maximum[k] = np.dot(to_update.T, most)
-    to_w.glob[k] = np.dot(from_glob.T, glob)
+    to_w.max_message[k] = np.dot(to_update.T, most)
+    to_w.global_to_node[k] = np.dot(from_glob.T, glob)
     to_w.attention[k], to_w.attention_bias[k] = np.dot(to_logit.T, out), _columns(to_logit)
     to_w.pooled[k], to_w.pooled_bias[k] = np.dot(to_update_glob.T, pooled), _columns(to_update_glob)
-    to_w.old[k] = np.dot(to_update_glob.T, glob)
+    to_w.global_self[k] = np.dot(to_update_glob.T, glob)
     return to_node, to_glob, np.dot(to_from_edge, w.edge[k])
 
 
@@ -299,8 +315,8 @@ class _MessagePassing(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         arrays = [tensor.detach().numpy() for tensor in links_and_weights]
         links, weights = (
-            Links(*arrays[: len(Links._fields)]),
-            LayerWeights(*arrays[len(Links._fields) :]),
+            BatchConnectivity(*arrays[: len(BatchConnectivity._fields)]),
+            LayerWeights(*arrays[len(BatchConnectivity._fields) :]),
         )
         layers, edges = len(weights.sender), edge.detach().numpy()
         of_nodes, of_graphs = (layers, *node.shape), (layers, *glob.shape)
@@ -334,7 +350,7 @@ class _MessagePassing(torch.autograd.Function):
 
 
 @njit(cache=True, nogil=True)
-def pack(node_kind, edge, edge_kind, edge_kinds):  # type: ignore[no-untyped-def]
+def pack_graphs(node_kind, edge, edge_kind, edge_kinds):  # type: ignore[no-untyped-def]
     """Padded graphs, B of them, behind each other in one list of nodes and one of edges, which go both ways.
 
     Args:

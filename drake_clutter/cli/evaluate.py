@@ -67,7 +67,7 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare explorers on scenes that hide something."""
-    from drake_clutter.agents.exploration import BASELINES
+    from drake_clutter.agents.explorers import BASELINE_POLICIES
     from drake_clutter.commands import evaluate_explorers as command
     from drake_clutter.reports.terminal_text import evaluation_table_rows
 
@@ -81,7 +81,7 @@ def evaluate(
     world = load_config_from_options(
         config, cell, settings, None if cell else command.common_cell(evaluation_scenes)
     )
-    names = [name for some in agents or BASELINES for name in some.split(",")]
+    names = [name for some in agents or BASELINE_POLICIES for name in some.split(",")]
     limit = max_moves or world.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:

@@ -45,7 +45,7 @@ def generate(
     as_json: JsonOption = False,
 ) -> None:
     """Generate scenes, settle them in Drake and say which are stable and what they hide. A run that was stopped goes on."""
-    from drake_clutter.agents.generation import GenerationJob
+    from drake_clutter.agents.generators import GenerationJob
     from drake_clutter.commands import generate_scenes as command
 
     job = GenerationJob(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from drake_clutter.cell.work_cell import WorkCell
     from drake_clutter.scenes.interfaces import MotionSample
     from drake_clutter.scenes.scene import Scene
-    from drake_clutter.tasks.exploration import Step
+    from drake_clutter.tasks.exploration_task import Transition
 
 out_console, err_console = Console(), Console(stderr=True)
 
@@ -54,7 +54,7 @@ def print_result(fields: dict[str, Any], as_json: bool, title: str) -> None:
     out_console.print(table)
 
 
-def print_transition(transition: "Step") -> None:
+def print_transition(transition: "Transition") -> None:
     """Print how a move went, on standard error."""
     found = f", found {', '.join(transition.newly_found)}" if transition.newly_found else ""
     reasons = [

@@ -6,13 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.agents.evaluation import (
-    Episode,
-    EpisodePlayer,
+from drake_clutter.agents.episode_evaluation import (
     EpisodeResult,
-    summarise_episodes,
+    EpisodeRunner,
+    EpisodeSpec,
+    summarize_episodes,
 )
-from drake_clutter.agents.exploration import make_explorers
+from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
@@ -139,13 +139,13 @@ def evaluate_explorers(
         frozenset[str]().union(*(scene.classes for scene in scenes)),
     )
     for agent in agents:
-        make_explorers(agent, config, classes)  # says what is wrong before anything is played
+        make_policy_factory(agent, config, classes)  # says what is wrong before anything is played
     episodes = [
-        Episode(scene.file, scene.index, agent, index)
+        EpisodeSpec(scene.file, scene.index, agent, index)
         for agent in agents
         for index, scene in enumerate(scenes)
     ]
-    make_worker = partial(EpisodePlayer, config, catalog_folder, max_moves, seed, fidelity)
+    make_worker = partial(EpisodeRunner, config, catalog_folder, max_moves, seed, fidelity)
     results_in_order = map_ordered(make_worker, episodes, workers=workers, ray_address=ray_address)
     results = [result for result in progress(results_in_order, len(episodes)) if result.hidden]
     if not results:
@@ -154,7 +154,7 @@ def evaluate_explorers(
         )
     rows = [
         {"agent": agent}
-        | summarise_episodes(
+        | summarize_episodes(
             [result for result in results if result.agent == agent], move_limits(max_moves)
         )
         for agent in agents

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.backends import backends
-from drake_clutter.agents.exploration import make_explorers
+from drake_clutter.agents.backend_factory import make_backend_factory
+from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, input_error, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -27,11 +27,11 @@ from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
-TransitionCallback = Callable[[Step], None]
+TransitionCallback = Callable[[Transition], None]
 
 
 def settle_scene(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
@@ -68,9 +68,9 @@ def explore_scene(
         config: the world.
         on_transition: called after each move.
     """
-    backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
-    policy = make_explorers(agent_name, config)(backend)
-    return run_episode(backend, policy, max_moves=max_moves, report=on_transition)
+    backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+    policy = make_policy_factory(agent_name, config)(backend)
+    return run_episode(backend, policy, max_moves=max_moves, on_transition=on_transition)
 
 
 def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene: Scene) -> None:
@@ -103,7 +103,7 @@ def execute_moves(
     Raises:
         InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
     """
-    backend = backends(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+    backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
 
     def next_move(
         belief: Belief,
@@ -120,8 +120,8 @@ def execute_moves(
         backend,
         next_move,
         max_moves=len(moves),
-        report=on_transition,
-        until_all_found=False,
+        on_transition=on_transition,
+        stop_when_all_found=False,
     )
 
 
@@ -178,9 +178,9 @@ def read_moves(path: Path) -> list[Move]:
 
 def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
     """The document of `episode.json`."""
-    end = task.end or EpisodeEnd.GAVE_UP
+    end = task.termination or TerminationReason.GAVE_UP
     moves = []
-    for step in task.steps:
+    for step in task.transitions:
         instability = step.outcome.instability
         moves.append(
             {
@@ -189,9 +189,9 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
                 "instability": str(instability) if instability else None,
                 "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
-                "picks": dict(step.decision.picks),
-                "known": list(step.decision.known),
-                "visible_share": step.look.visible_fractions,
+                "picks": dict(step.decision.pick_probabilities),
+                "known": list(step.decision.considered),
+                "visible_share": step.next_perception.visible_fractions,
                 "reward": step.reward,
             }
         )
@@ -199,13 +199,13 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "agent": agent,
         "seed": seed,
         "fidelity": fidelity,
-        "success": end is EpisodeEnd.ALL_FOUND,
+        "success": end is TerminationReason.ALL_FOUND,
         "ended": end.value,
         "objects": len(task.scene.objects),
-        "hidden_at_start": list(task.hidden_at_start),
+        "hidden_at_start": list(task.initially_hidden),
         "found": list(task.found),
-        "total_reward": sum(step.reward for step in task.steps),
-        "visible_share_at_start": task.first_look.visible_fractions,
+        "total_reward": sum(step.reward for step in task.transitions),
+        "visible_share_at_start": task.initial_perception.visible_fractions,
         "moves": moves,
     }
 
@@ -226,14 +226,16 @@ def write_episode(
     At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `extra_fields` replace fields of the episode.
     """
     fields = {**episode_to_dict(task, agent, fidelity, seed), **(extra_fields or {})}
-    cell = config.cell.with_support(task.start.support)
+    cell = config.cell.with_support(task.initial_scene.support)
     save_scene(out / "after.yaml", task.scene, cell)
-    write_episode_page(out, title, task.start, task.first_look, task.steps, fields, cell)
+    write_episode_page(
+        out, title, task.initial_scene, task.initial_perception, task.transitions, fields, cell
+    )
     if fidelity == "arm":
         write_trajectories(
             out / "trajectory.h5",
-            task.start,
-            [(step.move, step.outcome) for step in task.steps],
+            task.initial_scene,
+            [(step.move, step.outcome) for step in task.transitions],
             cell,
         )
     fields["cell"] = to_plain(cell)

@@ -28,7 +28,12 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.statistics import wilson_interval
-from drake_clutter.tasks.feasibility import PLANNED, FeasibilityStudy, MoveRow, NoiseRow
+from drake_clutter.tasks.feasibility_study import (
+    PLANNED,
+    FeasibilityStudy,
+    MoveRecord,
+    PoseErrorRecord,
+)
 from drake_clutter.validation import (
     Finite,
     NonEmptyText,
@@ -274,8 +279,8 @@ class FeasibilityWorker:
             planner = PlannerConfig(optimize=False, time_limit=PLANNING_TIME_LIMIT)
             self._studies[setup] = FeasibilityStudy(setup, world, planner, self._job.seed)
         study = self._studies[setup]
-        move_rows = study.moves(path.stem, scene_index, scene)
-        pose_error_rows = study.noise(path.stem, scene_index, scene, move_rows)
+        move_rows = study.plan_all_moves(path.stem, scene_index, scene)
+        pose_error_rows = study.test_pose_errors(path.stem, scene_index, scene, move_rows)
         return {
             "scene": path.stem,
             "unstable": False,
@@ -383,8 +388,8 @@ def _write_results(job: FeasibilityJob, out: Path, results: dict[StudyPart, Any]
         for j, y in enumerate(f["y"])
     ]
     tables = {
-        "moves": (moves, MoveRow),
-        "noise": (pose_errors, NoiseRow),
+        "moves": (moves, MoveRecord),
+        "noise": (pose_errors, PoseErrorRecord),
         "reach": (map_rows, None),
         "bases": (bases, None),
     }

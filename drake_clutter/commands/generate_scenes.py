@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.agents.generation import (
+from drake_clutter.agents.generators import (
     GeneratedScene,
     GenerationJob,
     SceneGenerator,
     make_generation_agent,
-    summarise,
+    summarize_scenes,
 )
 from drake_clutter.catalog import load_catalog
 from drake_clutter.files import InputError, prepare_output_directory, write_json
@@ -26,7 +26,7 @@ from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
-from drake_clutter.tasks.full_knowledge import Solvability
+from drake_clutter.tasks.oracle_search import Solvability
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
@@ -85,13 +85,13 @@ def generate_scenes(
     )
     if (out / JOB_FILE).exists():
         earlier = json.loads((out / JOB_FILE).read_text())
-        if json.dumps(earlier) != json.dumps(job.fields):  # the order of cameras counts, too
+        if json.dumps(earlier) != json.dumps(job.to_dict):  # the order of cameras counts, too
             raise InputError(
                 f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
             )
     else:
         prepare_output_directory(out)
-        write_json(out / JOB_FILE, job.fields)
+        write_json(out / JOB_FILE, job.to_dict)
     (out / SCENES_FOLDER).mkdir(exist_ok=True)
     paths = [out / SCENES_FOLDER / f"{index:04d}.yaml" for index in range(count)]
     # Scenes are written in order, so what is there is a beginning.
@@ -130,7 +130,7 @@ def generate_scenes(
     files = [load_scene(path, catalog) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
     solvabilities = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
-    summary = summarise(job, judged, solvabilities)
+    summary = summarize_scenes(job, judged, solvabilities)
     summary |= {
         "layout_failures": dict(layout_failures),
         "seconds": round(seconds, 2),

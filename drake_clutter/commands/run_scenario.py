@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.agents.generation import GenerationJob, SceneGenerator
+from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.explore_scene import TransitionCallback, settle_scene, write_episode
 from drake_clutter.files import InputError, write_text
@@ -13,9 +13,9 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
 from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
-from drake_clutter.tasks.arm_ceiling import ArmCeiling
+from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
 from drake_clutter.validation import config_yaml
 
 MAX_DEMO_SCENES = 5
@@ -74,7 +74,9 @@ def run_closed_loop(
         world=scenario.world,
         record=True,
     )
-    task = run_episode(closed_loop, policy, max_moves=scenario.max_moves, report=on_transition)
+    task = run_episode(
+        closed_loop, policy, max_moves=scenario.max_moves, on_transition=on_transition
+    )
     return task, closed_loop.timing
 
 
@@ -88,7 +90,7 @@ def write_scenario_results(
 ) -> dict[str, Any]:
     """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
     write_text(out / "scenario.yaml", config_yaml(scenario))
-    save_scene(out / "scene.yaml", task.start, scenario.world.cell)
+    save_scene(out / "scene.yaml", task.initial_scene, scenario.world.cell)
     told: dict[str, Any] = {"timing": asdict(timing), **extra_fields}
     return write_episode(
         out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, extra_fields=told
@@ -115,13 +117,13 @@ def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -
 
     Scenes in which no arm finds everything are passed over.
     """
-    arm_bound, index = ArmCeiling(scenario.world), -1
+    arm_bound, index = ArmReachabilityBound(scenario.world), -1
     for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, the last one is told
         scene, index = load_or_generate_scene(
-            scenario, index + 1, lambda scene: not arm_bound.never_found(scene)
+            scenario, index + 1, lambda scene: not arm_bound.find_unrevealable(scene)
         )
         task, timing = run_closed_loop(scenario, scene, on_transition)
-        if task.end is EpisodeEnd.ALL_FOUND:
+        if task.termination is TerminationReason.ALL_FOUND:
             break
     return write_scenario_results(
         out,

@@ -7,8 +7,8 @@ from drake_clutter.commands.explore_scene import TransitionCallback, execute_mov
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json, write_text
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
+from drake_clutter.tasks.exploration_task import TerminationReason
+from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.yaml_io import to_yaml
 
 
@@ -38,15 +38,15 @@ def solve_scene(
     Raises:
         InputError: the scene has more objects than the search takes.
     """
-    solution = FullKnowledgeSearch(config).solve(scene, seed, budget)
+    solution = OracleSearch(config).solve(scene, seed, budget)
     fields: dict[str, Any] = {
-        "answer": solution.answer.value,
-        "moves": len(solution.plan) if solution.answer is Solvability.SOLVABLE else None,
-        "at_least": solution.at_least,
-        "fewest": solution.fewest,
+        "answer": solution.solvability.value,
+        "moves": len(solution.plan) if solution.solvability is Solvability.SOLVABLE else None,
+        "at_least": solution.lower_bound,
+        "fewest": solution.is_optimal,
         "plan": [str(move) for move in solution.plan],
-        "never_found": list(solution.never_found),
-        "moves_tried": solution.moves_tried,
+        "never_found": list(solution.unrevealable),
+        "moves_tried": solution.moves_evaluated,
         "budget": budget,
         "seed": seed,
         "confirmed": None,
@@ -55,7 +55,7 @@ def solve_scene(
         moves = [{"pick": move.pick, "place": move.place} for move in solution.plan]
         write_text(out / "moves.yaml", to_yaml(moves))
         task = execute_moves(scene, solution.plan, seed, config, on_transition)
-        fields["confirmed"] = task.end is EpisodeEnd.ALL_FOUND
+        fields["confirmed"] = task.termination is TerminationReason.ALL_FOUND
         write_episode(
             out,
             task,

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
@@ -14,20 +14,37 @@ from torch.optim import Optimizer
 from drake_clutter.files import InputError, atomic_write, write_json
 
 
+class RenamedParameters(nn.Module):
+    """Base of modules that load weights saved under earlier names of their attributes.
+
+    Attributes:
+        renamed: Current name of a parameter or submodule by its earlier name.
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {}
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        for key in list(state_dict):
+            name, dot, rest = key.removeprefix(prefix).partition(".")
+            if key.startswith(prefix) and name in self.renamed:
+                state_dict[f"{prefix}{self.renamed[name]}{dot}{rest}"] = state_dict.pop(key)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """A trained network.
 
     Attributes:
         weights: by name.
-        about: config, metrics, git commit, and what the network's inputs and outputs stand for.
+        metadata: config, metrics, git commit, and what the network's inputs and outputs stand for.
     """
 
     weights: dict[str, Tensor]
-    about: dict[str, Any]
+    metadata: dict[str, Any]
 
 
-def save_checkpoint(path: Path, network: nn.Module, about: dict[str, Any]) -> None:
+def save_checkpoint(path: Path, network: nn.Module, metadata: dict[str, Any]) -> None:
     """Writes `path` (.safetensors) and a .json beside it."""
     with atomic_write(path) as temporary:
         save_file(
@@ -37,7 +54,7 @@ def save_checkpoint(path: Path, network: nn.Module, about: dict[str, Any]) -> No
             },
             temporary,
         )
-    write_json(path.with_suffix(".json"), about)
+    write_json(path.with_suffix(".json"), metadata)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -72,12 +89,12 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
         return {name: file.get_tensor(name) for name in names}, json.loads(file.metadata()["state"])
 
 
-def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Those that are called `PART.NAME`, by NAME."""
     return {
-        name.removeprefix(f"{part}."): value
+        name.removeprefix(f"{prefix}."): value
         for name, value in tensors.items()
-        if name.startswith(f"{part}.")
+        if name.startswith(f"{prefix}.")
     }
 
 
@@ -96,9 +113,9 @@ def restore_learner(
     network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]
 ) -> None:
     """Gives back what `learner_tensors` took; other names are left alone."""
-    network.load_state_dict(part_of(tensors, "network"))
+    network.load_state_dict(tensors_with_prefix(tensors, "network"))
     moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in part_of(tensors, "optimizer").items():
+    for name, value in tensors_with_prefix(tensors, "optimizer").items():
         number, _, moment = name.partition(".")
         moments.setdefault(int(number), {})[moment] = value
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})

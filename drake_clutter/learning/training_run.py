@@ -20,9 +20,10 @@ from drake_clutter.files import (
 )
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
-from drake_clutter.validation import config_yaml, to_plain
+from drake_clutter.validation import config_yaml, to_plain, validate
+from drake_clutter.yaml_io import read_yaml
 
-CONFIG, STATE, HISTORY, TENSORBOARD = (
+CONFIG_FILE, STATE_FILE, HISTORY_FILE, TENSORBOARD_FOLDER = (
     "config.yaml",
     "state.safetensors",
     "history.json",
@@ -50,36 +51,45 @@ class TrainingRun:
     """
 
     def __init__(
-        self, out: Path, config: Any, learner: Learner, steps: int, files: Sequence[Path] = ()
+        self,
+        folder: Path,
+        config: Any,
+        learner: Learner,
+        total_steps: int,
+        input_files: Sequence[Path] = (),
     ) -> None:
         """Begins a run, or takes up the one that is in the folder.
 
         Args:
-            out: the folder; config: a dataclass; learner: as it begins; steps: at which it ends.
-            files: that the config names and the run learns from; must be the same when it is taken up.
+            folder: the folder; config: a dataclass; learner: as it begins; total_steps: at which it ends.
+            input_files: that the config names and the run learns from; must be the same when it is taken up.
 
         Raises:
             InputError: the folder holds something else, or a run of another config or of other files.
         """
-        self._out, self._config, self._learner, self._steps = out, config, learner, steps
-        self._files = {str(file): file_sha256(file) for file in files}
-        told = config_yaml(config) + "".join(
-            f"# {file}: sha256 {digest}\n" for file, digest in self._files.items()
-        )
-        if not (out / CONFIG).exists():
-            prepare_output_directory(out)
-            write_text(out / CONFIG, told)
-        elif (out / CONFIG).read_text() != told:
+        self._out, self._config, self._learner, self._steps = folder, config, learner, total_steps
+        self._files = {str(file): file_sha256(file) for file in input_files}
+        text = config_yaml(config)
+        hashes = "".join(f"# {file}: sha256 {digest}\n" for file, digest in self._files.items())
+        if not (folder / CONFIG_FILE).exists():
+            prepare_output_directory(folder)
+            write_text(folder / CONFIG_FILE, text + hashes)
+        elif _with_current_names(folder / CONFIG_FILE, type(config)) != text + hashes:
             raise InputError(
-                f"--out {out}: holds a run of another config or other files, see {CONFIG}; give the same ones or another folder"
+                f"--out {folder}: holds a run of another config or other files, see {CONFIG_FILE}; "
+                "give the same ones or another folder"
             )
         self.history: list[dict[str, Any]] = []
-        if (out / STATE).exists():
-            learner.load(out / STATE)
-            rows = json.loads((out / HISTORY).read_text()) if (out / HISTORY).exists() else []
+        if (folder / STATE_FILE).exists():
+            learner.load(folder / STATE_FILE)
+            rows = (
+                json.loads((folder / HISTORY_FILE).read_text())
+                if (folder / HISTORY_FILE).exists()
+                else []
+            )
             self.history = [row for row in rows if row["step"] <= learner.step]
         self._console = Console(stderr=True)
-        self._writer = SummaryWriter(str(out / TENSORBOARD), purge_step=learner.step)
+        self._writer = SummaryWriter(str(folder / TENSORBOARD_FOLDER), purge_step=learner.step)
         self._seconds = self.history[-1]["seconds"] if self.history else 0.0
         self._begun, self._begun_at = time.monotonic(), learner.step
 
@@ -95,7 +105,7 @@ class TrainingRun:
             **charts,
         }
         self.history.append(row)
-        write_json(self._out / HISTORY, self.history)
+        write_json(self._out / HISTORY_FILE, self.history)
         for folder, values in (
             ("charts", {**charts, "steps_per_second": rate}),
             ("losses", losses),
@@ -112,9 +122,9 @@ class TrainingRun:
 
     def save(self) -> None:
         """Writes the state."""
-        self._learner.save(self._out / STATE)
+        self._learner.save(self._out / STATE_FILE)
 
-    def finish(self, name: str, network: nn.Module, about: Mapping[str, Any]) -> None:
+    def finish(self, name: str, network: nn.Module, metadata: Mapping[str, Any]) -> None:
         """Writes the checkpoint, with config, hashes of files, last figures and commits, and the state."""
         metrics, commits = (
             self.history[-1],
@@ -124,7 +134,7 @@ class TrainingRun:
             self._out / name,
             network,
             {
-                **about,
+                **metadata,
                 "config": to_plain(self._config),
                 "files": self._files,
                 "metrics": metrics,
@@ -134,7 +144,17 @@ class TrainingRun:
         self.save()
 
 
-def device_of(name: str) -> torch.device:
+def _with_current_names(path: Path, schema: type) -> str:
+    """Return the text of a run's config file, with the current names of the config's fields."""
+    hashes = [line for line in path.read_text().splitlines(keepends=True) if line[0] == "#"]
+    try:
+        config: Any = validate(schema, read_yaml(path, "a mapping of config fields"), str(path))
+    except InputError:  # of another training
+        return ""
+    return config_yaml(config) + "".join(hashes)
+
+
+def resolve_device(name: str) -> torch.device:
     """The device of an option: auto, cpu or cuda.
 
     Raises:

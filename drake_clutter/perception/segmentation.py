@@ -230,7 +230,7 @@ class SegmentationNetwork(nn.Module):
             InputError: it cannot be read, or is none of a detector.
         """
         checkpoint = load_checkpoint(path)
-        metadata = {RENAMED_METADATA.get(key, key): v for key, v in checkpoint.about.items()}
+        metadata = {RENAMED_METADATA.get(key, key): v for key, v in checkpoint.metadata.items()}
         kind = metadata.get("kind")
         if kind != CHECKPOINT_KIND:
             raise InputError(

@@ -21,7 +21,7 @@ from drake_clutter.reports.scene_images import Annotations, Highlight, SceneRend
 from drake_clutter.scenes.interfaces import Instability, Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.tasks.belief import Decision
-from drake_clutter.tasks.exploration import Step
+from drake_clutter.tasks.exploration_task import Transition
 
 _TEMPLATE = Path(__file__).with_name("episode_page.html")
 _IMAGES = "images"
@@ -44,7 +44,7 @@ def write_episode_page(
     title: str,
     initial_scene: Scene,
     initial_perception: PerceptionResult,
-    steps: Sequence[Step],
+    steps: Sequence[Transition],
     summary: Mapping[str, Any],
     cell: WorkCell,
 ) -> None:
@@ -69,7 +69,7 @@ def write_episode_page(
             _move_html(images, number, scene, perception, step, frozenset(found_so_far), cell)
         )
         found_so_far.update(step.newly_found)
-        scene, perception = step.outcome.scene, step.look
+        scene, perception = step.outcome.scene, step.next_perception
     write_recording(
         out / "recording.html", initial_scene, episode_frames(initial_scene, steps), cell
     )
@@ -133,13 +133,13 @@ def _move_html(
     number: int,
     scene: Scene,
     look: PerceptionResult,
-    step: Step,
+    step: Transition,
     known: frozenset[str],
     cell: WorkCell,
 ) -> str:
     """One move's part of the page; `scene` and `look` are from before it, `known` is what had been found by then."""
     outcome, move_text = step.outcome, _move_text(step.move)
-    before_view, after_view = _visible_names(look), _visible_names(step.look)
+    before_view, after_view = _visible_names(look), _visible_names(step.next_perception)
     unknown = tuple(name for name in scene.names if name not in known)
     covered = tuple(name for name in scene.names if name in known and name not in before_view)
     before = Annotations(
@@ -199,16 +199,17 @@ def _move_html(
         )
     badge = f'<span class="badge {_BADGES.get(outcome.result, "")}">{escape(outcome.result.value)}</span>'
     threshold = look.observation.camera.visibility_threshold
+    after = step.next_perception.visible_fractions
     return (
         f'<article><div class="head"><h3>{number}. {escape(move_text)}</h3>{badge}</div><p>{" ".join(notes)}</p>'
         f'<div class="pair">{figures}</div>'
         f"{_pick_probabilities_html(step.decision, scene, step.newly_found)}"
         f"<h4>Visible share of each object, before &rarr; after (hidden below {threshold:.0%})</h4>"
-        f"{_visible_fractions_html(look.visible_fractions, step.look.visible_fractions, threshold, step.newly_found)}</article>"
+        f"{_visible_fractions_html(look.visible_fractions, after, threshold, step.newly_found)}</article>"
     )
 
 
-def _place_pose(scene: Scene, step: Step) -> Pose | None:
+def _place_pose(scene: Scene, step: Transition) -> Pose | None:
     """Where the picked object was let go; of a move that was not carried out, above the object it was meant for."""
     if step.outcome.result.was_executed:
         return step.outcome.X_TO_released or step.outcome.scene[step.move.pick].X_TO
@@ -221,9 +222,9 @@ def _place_pose(scene: Scene, step: Step) -> Pose | None:
 
 def _pick_probabilities_html(decision: Decision, scene: Scene, found: Sequence[str]) -> str:
     """What the agent went by: how likely it was to pick each object, the likeliest first, and what it knew."""
-    if not decision.picks:
+    if not decision.pick_probabilities:
         return ""
-    probabilities = sorted(decision.picks.items(), key=lambda item: -item[1])
+    probabilities = sorted(decision.pick_probabilities.items(), key=lambda item: -item[1])
     bars = [
         f'<div class="bar"><span>{escape(display_name(name))}</span>'
         f'<span class="track"><b style="width:{_percent(chance)}"></b></span><span>{chance:.0%}</span></div>'
@@ -237,11 +238,11 @@ def _pick_probabilities_html(decision: Decision, scene: Scene, found: Sequence[s
     html = f'<div class="bars">{"".join(bar for bar in bars if bar not in unlikely)}</div>'
     if unlikely:
         html += f'<details><summary>{len(unlikely)} less likely</summary><div class="bars">{"".join(unlikely)}</div></details>'
-    picked = 0.0 if decision.move is None else decision.picks[decision.move.pick]
+    picked = 0.0 if decision.move is None else decision.pick_probabilities[decision.move.pick]
     if skipped := [name for name, chance in probabilities if chance > picked]:
         html += f'<p class="soft">Passed over, as there was no room for it: {escape(_display_names(skipped))}.</p>'
-    html += f"<details><summary>What it knew</summary><p>{escape(_display_names(decision.known))}.</p></details>"
-    belief_text = f"it knew {len(decision.known)} of {len(scene.objects)} objects, and found {len(found)} more by this move"
+    html += f"<details><summary>What it knew</summary><p>{escape(_display_names(decision.considered))}.</p></details>"
+    belief_text = f"it knew {len(decision.considered)} of {len(scene.objects)} objects, and found {len(found)} more by this move"
     return f"<h4>The agent's choice of what to pick; {belief_text}</h4>{html}"
 
 

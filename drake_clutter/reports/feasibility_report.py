@@ -31,7 +31,7 @@ from drake_clutter.scenes.interfaces import ArmState, MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import pose_of
 from drake_clutter.statistics import wilson_interval
-from drake_clutter.tasks.feasibility import PLANNED
+from drake_clutter.tasks.feasibility_study import PLANNED
 
 Rows = Sequence[Mapping[str, Any]]
 

@@ -26,7 +26,7 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
 from drake_clutter.simulation.quiet import drake_silent_below
-from drake_clutter.tasks.exploration import Step
+from drake_clutter.tasks.exploration_task import Transition
 
 FRAMES_PER_SECOND = 40
 _CARRY_TIME = 0.5
@@ -56,7 +56,7 @@ _LIGHTS: dict[str, dict[str, Any]] = {
 _SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 
 
-def episode_frames(start: Scene, steps: Sequence[Step]) -> list[MotionSample]:
+def episode_frames(start: Scene, steps: Sequence[Transition]) -> list[MotionSample]:
     """An episode's moves as one motion: each object is lifted, carried over and set down, then everything settles.
 
     Where a move was made by teleport, in one instant, lifting and carrying are an illustration, and no robot's motion. Moves that

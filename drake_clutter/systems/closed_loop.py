@@ -40,7 +40,7 @@ from drake_clutter.systems.policy_system import Phase, PolicyState, PolicySystem
 from drake_clutter.systems.station_camera import add_camera, empty_depth
 from drake_clutter.systems.tracking import in_true_names, tracked
 from drake_clutter.tasks.belief import Belief, Policy
-from drake_clutter.tasks.exploration import Attempt
+from drake_clutter.tasks.exploration_task import MoveAttempt
 
 LATENCY = 1.15
 """From an observation to the plan [s]: 0.15 for perception, 1 for planning."""
@@ -69,7 +69,7 @@ class ClosedLoop:
 
     Attributes:
         scene: The true objects, as they were when the policy last looked.
-        look: What a perfect detector sees of them.
+        perception: What a perfect detector sees of them.
         simulation: Of the diagram.
         policy_system: Chooses the moves.
         planner_system: Plans them.
@@ -97,7 +97,7 @@ class ClosedLoop:
         world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else for_who_sees(world)
         self._detector = LabelDetector(world.cell.camera)
-        self.look = self._detector.perceive(scene)
+        self.perception = self._detector.perceive(scene)
         ways = PlannerConfig() if perceive is None else GUARDED
         self._planner, empty = PickPlacePlanner(world.cell, ways), empty_depth(world.cell)
         self.policy_system = PolicySystem(
@@ -166,7 +166,7 @@ class ClosedLoop:
         wall = time.perf_counter() - self._start_time
         return Timing(self.simulation.root.get_time(), wall, self._planning)
 
-    def rollout(self, policy: Policy) -> Iterator[Attempt]:
+    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
         """See `Backend.rollout`."""
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
@@ -182,7 +182,7 @@ class ClosedLoop:
                 yield self._attempt(before, tuple(motion))
                 motion.clear()
 
-    def _attempt(self, state: PolicyState, motion: tuple[MotionSample, ...]) -> Attempt:
+    def _attempt(self, state: PolicyState, motion: tuple[MotionSample, ...]) -> MoveAttempt:
         """Return how a move went, once the policy has looked again.
 
         Args:
@@ -202,14 +202,16 @@ class ClosedLoop:
             no_spot = plan.reason is PlanningFailureReason.NO_FREE_SPOT
             result = MoveResult.NO_FREE_PLACEMENT if no_spot else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if no_spot else str(plan))
-            return Attempt(decision, outcome, self.look)
+            return MoveAttempt(decision, outcome, self.perception)
         picked, outcome = self._outcome(plan)
         assert decision.move is not None
         decision = replace(decision, move=replace(decision.move, pick=picked))
         # The simulation goes on from where things are in it.
         self.scene = self.simulation.scene
-        self.look = self._detector.perceive(self.scene)
-        return Attempt(decision, replace(outcome, scene=self.scene, motion=motion), self.look)
+        self.perception = self._detector.perceive(self.scene)
+        return MoveAttempt(
+            decision, replace(outcome, scene=self.scene, motion=motion), self.perception
+        )
 
     def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:
         """Return the name of what was picked, and what the move has led to."""

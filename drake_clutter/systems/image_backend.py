@@ -86,12 +86,12 @@ class ImageBackend(SteppedBackend):
         outcome = super().execute(PickPlaceCommand(move, picked.X_TO, X_TO_place), rng)
         return replace(outcome, X_TO_released=command.X_TO_place)
 
-    def known_result(self, outcome: Outcome) -> MoveResult:
+    def observable_result(self, outcome: Outcome) -> MoveResult:
         """Return that the object was placed: what became of it shows when it is seen again."""
         return MoveResult.PLACED
 
-    def in_true_names(self, decision: Decision) -> Decision:
-        """See `SteppedBackend.in_true_names`."""
+    def to_ground_truth(self, decision: Decision) -> Decision:
+        """See `SteppedBackend.to_ground_truth`."""
         return in_true_names(decision, self.belief.objects, self.observation, self.scene.objects)
 
 

@@ -4,12 +4,12 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
-from drake_clutter.agents.exploration import BASELINES, FULL_KNOWLEDGE, make_explorers
+from drake_clutter.agents.explorers import BASELINE_POLICIES, ORACLE, make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
 from drake_clutter.systems.perception_system import LearnedPerception, Perceive
 from drake_clutter.tasks.belief import Policy
@@ -82,13 +82,13 @@ def policy_of(name: str, config: ClutterConfig) -> Policy:
     Raises:
         InputError: no such explorer, or one that knows more than the camera shows.
     """
-    if name in BASELINES:
-        return BASELINES[name]
-    explorers = None if name == FULL_KNOWLEDGE else make_explorers(name, config)
+    if name in BASELINE_POLICIES:
+        return BASELINE_POLICIES[name]
+    explorers = None if name == ORACLE else make_policy_factory(name, config)
     if explorers is not None:
-        from drake_clutter.agents.learned_explorer import LearnedExplorers  # takes PyTorch
+        from drake_clutter.agents.learned_explorer import LearnedExplorerFactory  # takes PyTorch
 
-        if isinstance(explorers, LearnedExplorers) and not explorers.privileged:
+        if isinstance(explorers, LearnedExplorerFactory) and not explorers.privileged:
             return explorers()
-    allowed = f"a student, or one of {', '.join(BASELINES)}"
+    allowed = f"a student, or one of {', '.join(BASELINE_POLICIES)}"
     raise InputError(f"agent: {name} knows more than the camera shows; allowed is {allowed}")

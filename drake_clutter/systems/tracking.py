@@ -163,8 +163,8 @@ def in_true_names(
     name = {TRAY: TRAY} | {o.name: nearest_object(objects, o.X_TO).name for o in known}
     return Decision(
         Move(name[decision.move.pick], name[decision.move.place]),
-        {name[pick]: chance for pick, chance in decision.picks.items()},
-        tuple(name[known] for known in decision.known),
+        {name[pick]: chance for pick, chance in decision.pick_probabilities.items()},
+        tuple(name[known] for known in decision.considered),
         observation,
     )
 

@@ -3,7 +3,7 @@
 import gymnasium
 
 gymnasium.register(
-    "ClutterGeneration-v0", entry_point="drake_clutter.tasks.generation:ClutterGeneration"
+    "ClutterGeneration-v0", entry_point="drake_clutter.tasks.generation_task:ClutterGeneration"
 )
 gymnasium.register(
     "ClutterExploration-v0",

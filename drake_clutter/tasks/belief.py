@@ -8,7 +8,7 @@ import numpy as np
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 
-UNMOVED_DISTANCE = 0.01
+UNMOVED_TOLERANCE = 0.01
 """Largest distance at which an object counts as not moved by the move that was to place it [m]."""
 
 
@@ -24,14 +24,14 @@ class Decision:
 
     Attributes:
         move: What to do; None: the explorer has no move.
-        picks: The probability of each pick, by name; empty if the explorer has none.
-        known: Names of the objects that it went by; empty if those are the ones in view.
+        pick_probabilities: The probability of each pick, by name; empty if the explorer has none.
+        considered: Names of the objects that it went by; empty if those are the ones in view.
         observation: What it was shown, if that is not what a perfect detector sees.
     """
 
     move: Move | None
-    picks: Mapping[str, float] = field(default_factory=dict)
-    known: tuple[str, ...] = ()
+    pick_probabilities: Mapping[str, float] = field(default_factory=dict)
+    considered: tuple[str, ...] = ()
     observation: Observation | None = field(default=None, repr=False, compare=False)
 
 
@@ -44,14 +44,14 @@ class Belief:
             which they were found. Until it is seen there, an object is where a move placed it.
         history: All moves so far.
         invalid_moves: Moves that could not be carried out since anything last changed.
-        picked_from: X_TO of the latest move's object before it was placed, until the next
+        previous_pose: X_TO of the latest move's object before it was placed, until the next
             observation shows whether it has left there; else None.
     """
 
     objects: tuple[SceneObject, ...] = ()
     history: tuple[Move, ...] = ()
     invalid_moves: tuple[Move, ...] = ()
-    picked_from: Pose | None = None
+    previous_pose: Pose | None = None
 
     def update(self, observation: Observation) -> "Belief":
         """Return the belief after an observation: what is in view is where it is seen.
@@ -64,11 +64,11 @@ class Belief:
             # What is seen as it was keeps its object, which has cached its corners.
             if there is None or (there.object_class, there.X_TO) != (d.object_class, d.X_TO):
                 objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
-        known = replace(self, objects=tuple(objects.values()), picked_from=None)
-        if self.picked_from is None:
+        known = replace(self, objects=tuple(objects.values()), previous_pose=None)
+        if self.previous_pose is None:
             return known
         pick = objects.get(self.history[-1].pick)
-        if pick is None or np.linalg.norm(self.picked_from.p - pick.X_TO.p) > UNMOVED_DISTANCE:
+        if pick is None or np.linalg.norm(self.previous_pose.p - pick.X_TO.p) > UNMOVED_TOLERANCE:
             return replace(known, invalid_moves=())
         stuck = [move for move in legal_moves(observation) if move.pick == pick.name]
         invalid = (*self.invalid_moves, *stuck) if stuck else ()
@@ -89,9 +89,9 @@ class Belief:
             return replace(self, history=history, invalid_moves=())
         picked_from = next(o.X_TO for o in self.objects if o.name == move.pick)
         objects = (replace(o, X_TO=X_TO_place) if o.name == move.pick else o for o in self.objects)
-        return replace(self, objects=tuple(objects), history=history, picked_from=picked_from)
+        return replace(self, objects=tuple(objects), history=history, previous_pose=picked_from)
 
-    def forget(self, names: Collection[str]) -> "Belief":
+    def remove(self, names: Collection[str]) -> "Belief":
         """Return the belief without some objects, which may be found again as others."""
         if not names:
             return self
@@ -123,7 +123,7 @@ def update_belief(
     """
     if tracker is not None:
         observation, lost = tracker(belief.objects, observation)
-        belief = belief.forget(lost)
+        belief = belief.remove(lost)
     return belief.update(observation), observation
 
 

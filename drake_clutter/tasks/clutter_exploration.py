@@ -15,22 +15,22 @@ from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset, relayout
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.belief import Decision
-from drake_clutter.tasks.episode import BackendFactory, teleport_backends
-from drake_clutter.tasks.exploration import Attempt, EpisodeEnd, ExplorationTask
+from drake_clutter.tasks.episode import BackendFactory, make_teleport_backend_factory
 from drake_clutter.tasks.exploration_graph import (
-    BOUND,
     EDGE_KINDS,
-    FEATURES,
-    GLOBALS,
-    GraphObservation,
-    exploration_graph,
+    FEATURE_BOUND,
+    GLOBAL_FEATURES,
+    NODE_FEATURES,
+    ExplorationObservation,
+    build_exploration_graph,
 )
+from drake_clutter.tasks.exploration_task import ExplorationTask, MoveAttempt, TerminationReason
 
-TRAINING_SET = "training/scenes/train_sg_star.json"
-_TRIES = 100
+DEFAULT_SCENES = "training/scenes/train_sg_star.json"
+MAX_RESET_ATTEMPTS = 100
 
 
-class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
+class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
     """Find every object that is hidden.
 
     A reset draws a graph from a set of scenes and lays it out with its stacks in new places; with `options={"scene": k}` it takes
@@ -55,7 +55,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
         privileged: bool = False,
         fidelity: str | BackendFactory = "fast",
         max_moves: int | None = None,
-        most_objects: int = 24,
+        max_objects: int = 24,
         config: ClutterConfig | None = None,
     ) -> None:
         """Makes an environment.
@@ -65,30 +65,30 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             privileged: whether all objects are seen, or K_t.
             fidelity: one of `TELEPORT_FIDELITIES`, or what starts episodes on other backends.
             max_moves: after which an episode ends; None: the config's.
-            most_objects: that a scene may have.
+            max_objects: that a scene may have.
             config: the world; None: the default one, in the cell that the scenes were made with.
         """
         if not isinstance(scenes, SceneDataset):
             scenes = load_scene_dataset(
-                resource_path(TRAINING_SET) if scenes is None else Path(scenes), load_catalog()
+                resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes), load_catalog()
             )
         self._config = config or ClutterConfig(cell=scenes.cell)
         self._privileged, self.scenes = privileged, scenes
         self._max_moves = max_moves or self._config.exploration.max_moves
-        self._nodes = most_objects + 1
+        self._nodes = max_objects + 1
         self.grammar = scenes.grammar
-        self.numbers = node_numbers([c.name for c in scenes.classes])
+        self.node_kind_ids = assign_node_kind_ids([c.name for c in scenes.classes])
         if isinstance(fidelity, str):
-            fidelity = teleport_backends(fidelity, self._config)
+            fidelity = make_teleport_backend_factory(fidelity, self._config)
         self._start_backend = fidelity
         self._judge = FastJudge(self._config)
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
-            "node_kind": box(0, len(self.numbers), (n,), np.int8),
-            "feature": box(-BOUND, BOUND, (n, len(FEATURES)), np.float32),
+            "node_kind": box(0, len(self.node_kind_ids), (n,), np.int8),
+            "feature": box(-FEATURE_BOUND, FEATURE_BOUND, (n, len(NODE_FEATURES)), np.float32),
             "edge": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
-            "glob": box(0, BOUND, (len(GLOBALS),), np.float32),
+            "glob": box(0, FEATURE_BOUND, (len(GLOBAL_FEATURES),), np.float32),
             "allowed": box(0, 1, (n, n), np.int8),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
@@ -96,7 +96,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[GraphObservation, dict[str, Any]]:
+    ) -> tuple[ExplorationObservation, dict[str, Any]]:
         """A scene at rest, and the first look at it."""
         super().reset(seed=seed)
         number = None if options is None else options.get("scene")
@@ -106,11 +106,13 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
             raise InputError(
                 f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them"
             )
-        return self.begin(self.scenes.settled_scene(number, self.grammar, self._config)), {}
+        return self.reset_to_scene(
+            self.scenes.settled_scene(number, self.grammar, self._config)
+        ), {}
 
-    def _begin_anew(self) -> GraphObservation:
+    def _begin_anew(self) -> ExplorationObservation:
         """With a scene that stands and hides something where its stacks are put now."""
-        for _ in range(_TRIES):
+        for _ in range(MAX_RESET_ATTEMPTS):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
             scene = relayout(
                 self.scenes.derivation(index, self.grammar),
@@ -119,34 +121,32 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
                 self.np_random,
             )
             if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
-                observation = self.begin(scene)
-                if self.task.end is None:
+                observation = self.reset_to_scene(scene)
+                if self.task.termination is None:
                     return observation
         most = self._nodes - 1
         raise InputError(
-            f"{self.scenes.name}: of {_TRIES} scenes none stands and hides something, with at most {most} objects"
+            f"{self.scenes.name}: of {MAX_RESET_ATTEMPTS} scenes none stands and hides something, with at most {most} objects"
         )
 
-    def begin(self, scene: Scene) -> GraphObservation:
+    def reset_to_scene(self, scene: Scene) -> ExplorationObservation:
         """Starts an episode on a scene at rest, and looks.
 
         Raises:
             InputError: it has more objects than there is room for.
         """
         if len(scene.objects) >= self._nodes:
-            raise InputError(
-                f"most_objects: {self._nodes - 1}; this scene has {len(scene.objects)}"
-            )
+            raise InputError(f"max_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
         self.backend, self._refused = self._start_backend(scene, self.np_random), 0
         self.task = ExplorationTask(
             scene,
-            self.backend.look,
+            self.backend.perception,
             self._config.exploration,
             self._max_moves,
         )
         return self._noted(self.observe())
 
-    def _noted(self, observation: GraphObservation) -> GraphObservation:
+    def _noted(self, observation: ExplorationObservation) -> ExplorationObservation:
         """Keeps which moves it allows, for the next step."""
         self._allowed = observation["allowed"].copy()
         return observation
@@ -154,7 +154,7 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
     @property
     def _spent(self) -> bool:
         """Whether all moves have been made, those included that were not allowed."""
-        return len(self.task.steps) + self._refused >= self._max_moves
+        return len(self.task.transitions) + self._refused >= self._max_moves
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -164,22 +164,22 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
     def _shown(self, privileged: bool) -> tuple[SceneObject, ...]:
         return self.backend.scene.objects if privileged else self.backend.belief.objects
 
-    def observe(self, *, privileged: bool | None = None) -> GraphObservation:
+    def observe(self, *, privileged: bool | None = None) -> ExplorationObservation:
         """The observation; or the other one, for a teacher that watches a student."""
         shown = self._shown(self._privileged if privileged is None else privileged)
-        belief, observation = self.backend.belief, self.backend.look.observation
-        return exploration_graph(
+        belief, observation = self.backend.belief, self.backend.perception.observation
+        return build_exploration_graph(
             shown,
             observation,
             belief.history,
-            self.numbers,
+            self.node_kind_ids,
             belief.invalid_moves,
-            nodes=self._nodes,
+            max_nodes=self._nodes,
         )
 
     def step(
         self, action: Any
-    ) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
+    ) -> tuple[ExplorationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carries a move out; one that is not allowed changes nothing, but counts towards the number of moves."""
         x, y = (int(v) for v in action)
         names = self.objects
@@ -190,25 +190,25 @@ class ClutterExploration(gymnasium.Env[GraphObservation, Any]):
                 0.0,
                 False,
                 self._spent,
-                {"end": EpisodeEnd.OUT_OF_MOVES} if self._spent else {},
+                {"end": TerminationReason.OUT_OF_MOVES} if self._spent else {},
             )
         move = Move(names[x - 1], names[y - 1] if y else TRAY)
         outcome = self.backend.step(move)
         if outcome.result is not MoveResult.COLLAPSED:
             self.backend.update_belief()
-        step = self.task.note(Attempt(Decision(move), outcome, self.backend.look))
-        observation, end = self._noted(self.observe()), self.task.end
+        step = self.task.record(MoveAttempt(Decision(move), outcome, self.backend.perception))
+        observation, end = self._noted(self.observe()), self.task.termination
         if end is None and self._spent:
-            end = EpisodeEnd.OUT_OF_MOVES
+            end = TerminationReason.OUT_OF_MOVES
         if end is None and not observation["allowed"].any():
-            end = EpisodeEnd.GAVE_UP
-        over = end in (EpisodeEnd.ALL_FOUND, EpisodeEnd.COLLAPSED)
+            end = TerminationReason.GAVE_UP
+        over = end in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
         info: dict[str, Any] = {"step": step}
         if end is not None:
             info["end"] = end
         return observation, step.reward, over, end is not None and not over, info
 
 
-def node_numbers(classes: list[str]) -> dict[str, int]:
+def assign_node_kind_ids(classes: list[str]) -> dict[str, int]:
     """The kinds of nodes of `exploration_graph`, by name: the tray's, then the classes'."""
     return {name: number for number, name in enumerate((TRAY, *classes), start=1)}

@@ -32,7 +32,12 @@ from drake_clutter.tasks.belief import (
     select_move,
     update_belief,
 )
-from drake_clutter.tasks.exploration import Attempt, EpisodeEnd, ExplorationTask, Step
+from drake_clutter.tasks.exploration_task import (
+    ExplorationTask,
+    MoveAttempt,
+    TerminationReason,
+    Transition,
+)
 
 
 class Backend(Protocol):
@@ -47,14 +52,14 @@ class Backend(Protocol):
         """The true objects, now."""
 
     @property
-    def look(self) -> PerceptionResult:
+    def perception(self) -> PerceptionResult:
         """What a perfect detector sees, now."""
 
     @property
     def belief(self) -> Belief:
         """What the policy knows, now."""
 
-    def rollout(self, policy: Policy) -> Iterator[Attempt]:
+    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
         """Yield each attempt of a policy, once the scene has been observed again.
 
         It ends when the policy has no move left.
@@ -66,8 +71,8 @@ def run_episode(
     policy: Policy,
     *,
     max_moves: int,
-    report: Callable[[Step], None] = lambda _: None,
-    until_all_found: bool = True,
+    on_transition: Callable[[Transition], None] = lambda _: None,
+    stop_when_all_found: bool = True,
 ) -> ExplorationTask:
     """Play an episode, and return its record.
 
@@ -75,14 +80,14 @@ def run_episode(
         backend: Where it takes place.
         policy: Chooses the moves.
         max_moves: Attempts after which the episode ends.
-        report: Called after each attempt.
-        until_all_found: Whether the episode ends when every object has been found.
+        on_transition: Called after each attempt.
+        stop_when_all_found: Whether the episode ends when every object has been found.
     """
-    task = ExplorationTask(backend.scene, backend.look, backend.config, max_moves)
-    goes_on = (None,) if until_all_found else (None, EpisodeEnd.ALL_FOUND)
+    task = ExplorationTask(backend.scene, backend.perception, backend.config, max_moves)
+    goes_on = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
     attempts = backend.rollout(policy)
-    while task.end in goes_on and (attempt := next(attempts, None)) is not None:
-        report(task.note(attempt))
+    while task.termination in goes_on and (attempt := next(attempts, None)) is not None:
+        on_transition(task.record(attempt))
     return task
 
 
@@ -101,7 +106,7 @@ class SteppedBackend:
     Attributes:
         config: Of the task.
         scene: The true objects, now.
-        look: What a perfect detector sees, now.
+        perception: What a perfect detector sees, now.
         belief: What the policy knows, now.
         observation: The latest, in the names of the belief.
     """
@@ -130,7 +135,7 @@ class SteppedBackend:
         """
         self._tracker, self._action_filter = tracker, action_filter
         self._executor, self._detector, self._rng = executor, detector, rng
-        self.config, self.scene, self.look = config, scene, detector.perceive(scene)
+        self.config, self.scene, self.perception = config, scene, detector.perceive(scene)
         self.belief = Belief()
         self.update_belief()
 
@@ -146,20 +151,20 @@ class SteppedBackend:
 
     def observe(self) -> Observation:
         """Return what is in view now."""
-        return self.look.observation
+        return self.perception.observation
 
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """Carry out a command."""
         outcome = self._executor.execute(self.scene, command, rng)
         if outcome.result.was_executed:
-            self.scene, self.look = outcome.scene, self._detector.perceive(outcome.scene)
+            self.scene, self.perception = outcome.scene, self._detector.perceive(outcome.scene)
         return outcome
 
-    def known_result(self, outcome: Outcome) -> MoveResult:
+    def observable_result(self, outcome: Outcome) -> MoveResult:
         """Return what the policy can know of an outcome."""
         return outcome.result
 
-    def in_true_names(self, decision: Decision) -> Decision:
+    def to_ground_truth(self, decision: Decision) -> Decision:
         """Return a decision in the names of the true objects."""
         return decision
 
@@ -181,11 +186,11 @@ class SteppedBackend:
             self.belief = self.belief.record(move, outcome.result)
         else:
             outcome = self.execute(command, rng)
-            result = self.known_result(outcome)
+            result = self.observable_result(outcome)
             self.belief = self.belief.record(move, result, command.X_TO_place)
         return outcome
 
-    def rollout(self, policy: Policy) -> Iterator[Attempt]:
+    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
         """See `Backend.rollout`."""
         while True:
             decision = select_move(
@@ -197,10 +202,10 @@ class SteppedBackend:
             )
             if decision.move is None:
                 return
-            recorded = self.in_true_names(decision)
+            recorded = self.to_ground_truth(decision)
             outcome = self.step(decision.move)
             self.update_belief()
-            yield Attempt(recorded, outcome, self.look)
+            yield MoveAttempt(recorded, outcome, self.perception)
 
 
 BackendFactory = Callable[[Scene, np.random.Generator], SteppedBackend]
@@ -212,7 +217,7 @@ judge; by Drake. What `equilibrium` cannot judge cannot be done: for training, w
 about one move in a hundred would take half the time."""
 
 
-def teleport_backends(
+def make_teleport_backend_factory(
     fidelity: str,
     config: ClutterConfig,
     *,

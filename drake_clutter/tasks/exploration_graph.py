@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
 
-GraphObservation = dict[str, NDArray[Any]]
+ExplorationObservation = dict[str, NDArray[Any]]
 
-FEATURES = (
+NODE_FEATURES = (
     *("x", "y", "z"),
     *("qw", "qx", "qy", "qz"),
     *("extent_x", "extent_y", "extent_z"),
@@ -27,10 +27,10 @@ the graph or the tray is, so that something else must carry it; how often it was
 EDGE_KINDS = ("carries", "is_below", "is_beside", "is_apart_from", "tray_carries", "tray_is_below")
 """Of the edge from the lower to the upper of two objects, or from the tray to an object: the upper rests on the lower, is above
 it without touching it, is beside it, or is further away."""
-GLOBALS = ("moves_made",)
+GLOBAL_FEATURES = ("moves_made",)
 """Of the graph, in `_MANY_MOVES`."""
 
-BOUND = 10.0
+FEATURE_BOUND = 10.0
 """That no number of the graph exceeds."""
 _LENGTH, _MANY_PICKS, _MANY_MOVES = 0.35, 3.0, 20.0
 _OVERLAP = 0.003
@@ -54,34 +54,34 @@ def _overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
     return np.asarray(overlap.min(axis=2))
 
 
-def exploration_graph(
+def build_exploration_graph(
     objects: Sequence[SceneObject],
     observation: Observation,
     history: Sequence[Move],
-    numbers: Mapping[str, int],
+    node_kind_ids: Mapping[str, int],
     invalid_moves: Collection[Move] = (),
-    nodes: int = 0,
-) -> GraphObservation:
+    max_nodes: int = 0,
+) -> ExplorationObservation:
     """The graph as arrays; node 0 is the tray, node k the k-th object.
 
     Args:
         objects: n of them.
         observation: what is in view; those in view must be among the objects.
         history: the episode's moves so far.
-        numbers: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
+        node_kind_ids: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
         invalid_moves: moves that may not be made.
-        nodes: N, that there is room for; 0: as many as there are.
+        max_nodes: N, that there is room for; 0: as many as there are.
 
     Returns:
         node_kind (N,), 0 is padding; feature (N, `FEATURES`); edge (N (N - 1) / 2, 2) lower and upper; edge_kind, number in
         `EDGE_KINDS` from 1 on, 0 is padding; glob (`GLOBALS`,); allowed (N, N), which moves may be made: to pick a row's
         node and put it onto a column's. It follows from what is in view, and from what has failed.
     """
-    count, room = len(objects), nodes or len(objects) + 1
+    count, room = len(objects), max_nodes or len(objects) + 1
     seen = {detection.name: detection for detection in observation.detections}
-    kind, feature = np.zeros(room, np.int8), np.zeros((room, len(FEATURES)), np.float32)
+    kind, feature = np.zeros(room, np.int8), np.zeros((room, len(NODE_FEATURES)), np.float32)
     allowed = np.zeros((room, room), np.int8)
-    kind[0] = numbers[TRAY]
+    kind[0] = node_kind_ids[TRAY]
     edge, edge_kind = (
         np.zeros((room * (room - 1) // 2, 2), np.int16),
         np.zeros(room * (room - 1) // 2, np.int8),
@@ -105,7 +105,7 @@ def exploration_graph(
                     np.count_nonzero(detection.mask) * pixel[k] ** 2 / float(extent[0] * extent[1]),
                 )
             picks = sum(move.pick == o.name for move in history)
-            kind[k + 1] = numbers[o.object_class.name]
+            kind[k + 1] = node_kind_ids[o.object_class.name]
             # Of a rotation's two, always the same, also when a component that should be 0 is a little off.
             sign = 1 if next((q for q in o.X_TO.quaternion if abs(q) > 0.01), 1) > 0 else -1
             feature[k + 1] = (
@@ -116,7 +116,7 @@ def exploration_graph(
                 share,
                 above[k].any(),
                 max(0.0, low[k] - floor[k] - _TOUCHING) / _LENGTH,
-                min(BOUND, picks / _MANY_PICKS),
+                min(FEATURE_BOUND, picks / _MANY_PICKS),
             )
         # From the lower to the upper; of equally low ones, in an order that does not depend on theirs.
         order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], low))
@@ -129,13 +129,13 @@ def exploration_graph(
         edge_kind[:pairs] = np.where(rests, 1, np.where(over, 2, np.where(gap < _BESIDE, 3, 4)))
         edge[pairs : pairs + count, 1] = np.arange(1, count + 1)
         edge_kind[pairs : pairs + count] = np.where(low < _TOUCHING, 5, 6)
-        in_view = np.flatnonzero(feature[:, FEATURES.index("in_view")])
+        in_view = np.flatnonzero(feature[:, NODE_FEATURES.index("in_view")])
         allowed[in_view[:, None], in_view] = allowed[in_view, 0] = 1
         np.fill_diagonal(allowed, 0)
         node = {TRAY: 0} | {o.name: k for k, o in enumerate(objects, start=1)}
         for move in invalid_moves:
             allowed[node[move.pick], node[move.place]] = 0
-    glob = np.array([min(BOUND, len(history) / _MANY_MOVES)], np.float32)
+    glob = np.array([min(FEATURE_BOUND, len(history) / _MANY_MOVES)], np.float32)
     return {
         "node_kind": kind,
         "feature": feature,

@@ -21,9 +21,9 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.stability.executor import FastExecutor
 from drake_clutter.stability.judge import FastJudge
 
-MOST_OBJECTS = 64
+MAX_OBJECTS = 64
 """Objects in a scene, see `RayCaster.cover`."""
-LONGEST = 30
+MAX_PLAN_LENGTH = 30
 """Moves; longer plans are not looked for."""
 
 
@@ -36,27 +36,27 @@ class Solvability(Enum):
 
 
 @dataclass(frozen=True)
-class Solution:
+class SearchResult:
     """What a search found, under the fast judge.
 
     Attributes:
-        answer: solvable, proved unsolvable, or neither within the budget.
+        solvability: solvable, proved unsolvable, or neither within the budget.
         plan: moves that reveal everything without a collapse; empty unless solvable.
-        at_least: no plan has fewer moves.
-        never_found: what no sequence of moves can reveal, if that is the proof.
-        moves_tried: what the search cost.
+        lower_bound: no plan has fewer moves.
+        unrevealable: what no sequence of moves can reveal, if that is the proof.
+        moves_evaluated: what the search cost.
     """
 
-    answer: Solvability
+    solvability: Solvability
     plan: tuple[Move, ...]
-    at_least: int
-    never_found: tuple[str, ...]
-    moves_tried: int
+    lower_bound: int
+    unrevealable: tuple[str, ...]
+    moves_evaluated: int
 
     @property
-    def fewest(self) -> bool:
+    def is_optimal(self) -> bool:
         """Whether the plan is proved to have the fewest moves."""
-        return self.answer is Solvability.SOLVABLE and len(self.plan) == self.at_least
+        return self.solvability is Solvability.SOLVABLE and len(self.plan) == self.lower_bound
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class _OutOfBudgetError(Exception):
     pass
 
 
-class FullKnowledgeSearch:
+class OracleSearch:
     """Searches for the fewest moves that reveal every object (iterative deepening A*, Korf 1985).
 
     First a plan is sought that moves only what is in the way; then shorter ones, exhaustively, from the lower bound on. The
@@ -113,47 +113,53 @@ class FullKnowledgeSearch:
         seed: int = 0,
         budget: int = 5000,
         *,
-        fewest: bool = True,
+        optimal: bool = True,
         known: Collection[str] = (),
         rng: np.random.Generator | None = None,
-        failed: Collection[Move] = (),
-    ) -> Solution:
+        invalid_moves: Collection[Move] = (),
+    ) -> SearchResult:
         """The fewest moves for a scene at rest.
 
         Args:
             scene: as it settled.
             seed: of the places that are equally good; an episode of the same seed puts the objects where the plan does.
             budget: moves to try at most.
-            fewest: whether to look for a shorter plan when there is one.
+            optimal: whether to look for a shorter plan when there is one.
             known: what has been in view before.
             rng: in place of the seed: as it will be when the plan is carried out. It is left as it is.
-            failed: moves that turned out impossible in this scene; no plan begins with one of them.
+            invalid_moves: moves that turned out impossible in this scene; no plan begins with one of them.
 
         Raises:
             InputError: the scene has more objects than the search takes.
         """
-        if len(scene.objects) > MOST_OBJECTS:
+        if len(scene.objects) > MAX_OBJECTS:
             raise InputError(
-                f"objects: {len(scene.objects)}; allowed are {MOST_OBJECTS} at most, for a full-knowledge search"
+                f"objects: {len(scene.objects)}; allowed are {MAX_OBJECTS} at most, for a full-knowledge search"
             )
-        self._failed = failed
+        self._failed = invalid_moves
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
         fixed = self._judge.never_movable(scene)
-        never = self.never_found(scene, start.known, fixed if isinstance(fixed, frozenset) else ())
+        never = self.find_unrevealable(
+            scene, start.known, fixed if isinstance(fixed, frozenset) else ()
+        )
         if never:
-            return Solution(Solvability.UNSOLVABLE, (), start.at_least, never, 0)
+            return SearchResult(Solvability.UNSOLVABLE, (), start.at_least, never, 0)
         plan, at_least, exhausted = None, start.at_least, False
         try:
             self._left = budget // 2
-            plan = self._dive(start, LONGEST, only_blockers=True)
+            plan = self._dive(start, MAX_PLAN_LENGTH, only_blockers=True)
         except _OutOfBudgetError:
             pass
         self._left += budget - budget // 2
-        if plan is not None and not fewest:
-            return Solution(Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
+        if plan is not None and not optimal:
+            return SearchResult(
+                Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left
+            )
         try:
-            while not exhausted and at_least < (len(plan) if plan is not None else LONGEST + 1):
+            while not exhausted and at_least < (
+                len(plan) if plan is not None else MAX_PLAN_LENGTH + 1
+            ):
                 self._doubts = 0
                 shorter = self._dive(start, at_least, only_blockers=False)
                 if shorter is not None:
@@ -166,8 +172,10 @@ class FullKnowledgeSearch:
         except _OutOfBudgetError:
             pass
         if plan is not None:
-            return Solution(Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left)
-        return Solution(
+            return SearchResult(
+                Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left
+            )
+        return SearchResult(
             Solvability.UNSOLVABLE if exhausted else Solvability.UNDECIDED,
             (),
             at_least,
@@ -232,7 +240,7 @@ class FullKnowledgeSearch:
                 return moves, involved
         return 0, involved  # out of the frame, see `never_found`
 
-    def never_found(
+    def find_unrevealable(
         self, scene: Scene, known: Collection[str], fixed: Collection[str]
     ) -> tuple[str, ...]:
         """What is out of the camera's frame, or stays hidden behind objects that can never be moved.

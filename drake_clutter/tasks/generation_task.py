@@ -25,16 +25,17 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.validation import Flag, InRange, NonNegative, config_class
+from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
 
-MOST_IN_A_STACK = 0.6
+MAX_BALANCED_STACK_FRACTION = 0.6
 """Of a balanced scene's objects."""
 
-GraphObservation = dict[str, NDArray[Any]]
+GenerationObservation = dict[str, NDArray[Any]]
 
 
 @config_class
-class GenerationTask:
+@renamed_fields(must_come_apart="require_disassembly", margin="contact_margin")
+class GenerationTaskConfig:
     """What is asked of a generated scene.
 
     Attributes:
@@ -42,25 +43,25 @@ class GenerationTask:
         hidden_reward: w_u, per hidden object of a stable scene.
         balance_reward: for a stable scene of which no stack holds more than `MOST_IN_A_STACK` of the objects. Not in the paper.
         instability_reward: w_s, for a scene that is unstable, or that cannot be laid out or judged.
-        must_come_apart: whether a stack that cannot be taken away from the top, object by object, counts as unstable.
-        margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
+        require_disassembly: whether a stack that cannot be taken away from the top, object by object, counts as unstable.
+        contact_margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
     """
 
     nodes: Annotated[int, InRange(3, 1000)] = 25
     hidden_reward: NonNegative = 0.5
     balance_reward: NonNegative = 0.5
     instability_reward: Annotated[float, InRange(-1e300, 0.0)] = -1.0
-    must_come_apart: Flag = True
-    margin: NonNegative = 0.003
+    require_disassembly: Flag = True
+    contact_margin: NonNegative = 0.003
 
 
-class StackFault(Enum):
+class StackFailure(Enum):
     """Why a stack ends the derivation."""
 
     TOO_HIGH = "stack too high"
     UNSTABLE = "unstable"
-    CANNOT_BE_JUDGED = "cannot be judged"
-    HELD_DOWN = "does not come apart"
+    INCONCLUSIVE = "cannot be judged"
+    NOT_DISASSEMBLABLE = "does not come apart"
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,14 @@ class GraphVocabulary:
     edge_kinds: tuple[Orientation | str, ...]
 
     @staticmethod
-    def of(grammar: SceneGrammar) -> "GraphVocabulary":
+    def from_grammar(grammar: SceneGrammar) -> "GraphVocabulary":
         """That of a grammar."""
         return GraphVocabulary(
             (TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY, *grammar.classes), (PRIMITIVE, *Orientation)
         )
 
 
-def most_edges(nodes: int) -> int:
+def max_edges(nodes: int) -> int:
     """Of a graph of that size: a tree's, and one more for each pair, which takes three nodes below an `end`."""
     return nodes - 1 + max(0, nodes - 2) // 3
 
@@ -91,31 +92,35 @@ class PartialScene:
     """A derivation under way, and what is known of its finished stacks."""
 
     def __init__(
-        self, grammar: SceneGrammar, task: GenerationTask, config: ClutterConfig, judge: FastJudge
+        self,
+        grammar: SceneGrammar,
+        task: GenerationTaskConfig,
+        config: ClutterConfig,
+        judge: FastJudge,
     ) -> None:
         """Starts from the tray; `judge` is asked about every stack."""
-        vocabulary = GraphVocabulary.of(grammar)
+        vocabulary = GraphVocabulary.from_grammar(grammar)
         self._grammar, self._task, self._config, self._judge = grammar, task, config, judge
         self._budget = NodeBudget(task.nodes)
         self._node_number = {kind: k for k, kind in enumerate(vocabulary.node_kinds, start=1)}
         self._edge_number = {kind: k for k, kind in enumerate(vocabulary.edge_kinds, start=1)}
         self.graph = ClutterGraph()
         self.rules: list[str] = []
-        self.origins: dict[
+        self.object_positions: dict[
             int, NDArray[np.float64]
         ] = {}  # of the objects of finished stacks, m, over the tray's centre
-        self.hidden = 0
-        self.fault: StackFault | None = None
-        self._look()
+        self.num_hidden = 0
+        self.failure: StackFailure | None = None
+        self._match_rules()
 
-    def _look(self) -> None:
+    def _match_rules(self) -> None:
         self._matches = self._grammar.matches(self.graph)
-        self.mask = self._grammar.feasible(self.graph, self._budget, self._matches)
+        self.action_mask = self._grammar.feasible(self.graph, self._budget, self._matches)
 
     @property
     def finished(self) -> bool:
         """Whether no rule is feasible any more."""
-        return not self.mask.any()
+        return not self.action_mask.any()
 
     def apply(self, rule: int) -> None:
         """Applies a feasible rule to its first match, and judges the stack that it finishes, if it finishes one."""
@@ -126,7 +131,7 @@ class PartialScene:
         changed = match[self._grammar.rules[rule].left.rewritten]
         if changed != ClutterGraph.TRAY_NODE and (bottom := self._finished_stack(changed)):
             self._judge_stack(Stack(self.graph, self._grammar.classes, bottom, self._config.layout))
-        self._look()
+        self._match_rules()
 
     def _finished_stack(self, node: int) -> list[int]:
         """What stands on the tray of the stack that a node belongs to, if all its attributes are terminal; else nothing."""
@@ -153,28 +158,28 @@ class PartialScene:
         return [] if PRIMITIVE in edges else bottom
 
     def _judge_stack(self, stack: Stack) -> None:
-        self.origins |= dict(zip(stack.nodes, stack.p_T, strict=True))
+        self.object_positions |= dict(zip(stack.nodes, stack.p_T, strict=True))
         scene = Scene(tuple(stack.objects()), self._config.cell.support)
         if stack.upper[2] > self._config.layout.max_stack_height:
-            self.fault = StackFault.TOO_HIGH
+            self.failure = StackFailure.TOO_HIGH
         elif isinstance(found := self._judge.stability(scene), InconclusiveVerdict):
-            self.fault = StackFault.CANNOT_BE_JUDGED
+            self.failure = StackFailure.INCONCLUSIVE
         elif found is not None:
-            self.fault = StackFault.UNSTABLE
-        elif self._task.must_come_apart and not self._judge.comes_apart(scene):
-            self.fault = StackFault.HELD_DOWN
+            self.failure = StackFailure.UNSTABLE
+        elif self._task.require_disassembly and not self._judge.comes_apart(scene):
+            self.failure = StackFailure.NOT_DISASSEMBLABLE
         else:
             shares = self._judge.rays.visible_shares(scene.objects).values()
-            self.hidden += sum(
+            self.num_hidden += sum(
                 share < self._config.cell.camera.visibility_threshold for share in shares
             )
 
-    def worth(self, hidden: int) -> float:
+    def terminal_reward(self, hidden: int) -> float:
         """Of the derived graph, if its scene is stable and hides that many objects."""
-        balanced = self.graph.largest_stack_share() <= MOST_IN_A_STACK
+        balanced = self.graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION
         return self._task.hidden_reward * hidden + self._task.balance_reward * balanced
 
-    def scene(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:
+    def lay_out_and_judge(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:
         """The finished scene with its stacks in places drawn at random, judged; None if it cannot stand on the tray."""
         derivation = Derivation(self.graph, tuple(self.rules))
         scene = lay_out(derivation, self._grammar.classes, self._config, rng)
@@ -187,14 +192,14 @@ class PartialScene:
             else (scene, verdict)
         )
 
-    def observe(self) -> GraphObservation:
+    def observe(self) -> GenerationObservation:
         """The graph as arrays, see `ClutterGeneration`."""
-        nodes, edges = self._task.nodes, most_edges(self._task.nodes)
+        nodes, edges = self._task.nodes, max_edges(self._task.nodes)
         kind, flags = np.zeros(nodes, np.int8), np.zeros((nodes, 4), np.int8)
         position = np.zeros((nodes, 3), np.float32)
         count = len(self.graph)
         kind[:count] = [self._node_number[k] for k in self.graph.kinds()]
-        for node, p_TO in self.origins.items():
+        for node, p_TO in self.object_positions.items():
             flags[node, 0], position[node] = 1, p_TO
         for column, (pattern, match) in enumerate(
             zip(self._grammar.patterns, self._matches, strict=True)
@@ -224,7 +229,7 @@ class PartialScene:
         }
 
 
-class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
+class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     """Derive a graph whose scene is stable and hides objects.
 
     Observation, with N = nodes, E = `most_edges(N)`; rows beyond the graph are zeros:
@@ -249,7 +254,7 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
     def __init__(
         self,
         classes: Sequence[ObjectClass] | None = None,
-        task: GenerationTask | None = None,
+        task: GenerationTaskConfig | None = None,
         config: ClutterConfig | None = None,
     ) -> None:
         """Makes an environment.
@@ -259,11 +264,11 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
             task: what is asked.
             config: the world.
         """
-        self.task, self._config = task or GenerationTask(), config or ClutterConfig()
+        self.task, self._config = task or GenerationTaskConfig(), config or ClutterConfig()
         self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
-        self.vocabulary = GraphVocabulary.of(self.grammar)
-        self._judge = FastJudge(self._config, margin=self.task.margin)
-        n, e = self.task.nodes, most_edges(self.task.nodes)
+        self.vocabulary = GraphVocabulary.from_grammar(self.grammar)
+        self._judge = FastJudge(self._config, margin=self.task.contact_margin)
+        n, e = self.task.nodes, max_edges(self.task.nodes)
         far = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
         box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
@@ -281,34 +286,34 @@ class ClutterGeneration(gymnasium.Env[GraphObservation, int]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[GraphObservation, dict[str, Any]]:
+    ) -> tuple[GenerationObservation, dict[str, Any]]:
         """The start graph: the tray."""
         super().reset(seed=seed)
         self.partial = PartialScene(self.grammar, self.task, self._config, self._judge)
-        return self.partial.observe(), {"action_mask": self.partial.mask.astype(np.int8)}
+        return self.partial.observe(), {"action_mask": self.partial.action_mask.astype(np.int8)}
 
     def step(
         self, action: int
-    ) -> tuple[GraphObservation, SupportsFloat, bool, bool, dict[str, Any]]:
+    ) -> tuple[GenerationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Applies a rule."""
-        partial, earned = self.partial, self.task.hidden_reward * self.partial.hidden
-        if not partial.mask[action]:
+        partial, earned = self.partial, self.task.hidden_reward * self.partial.num_hidden
+        if not partial.action_mask[action]:
             return (
                 partial.observe(),
                 0.0,
                 partial.finished,
                 False,
-                {"action_mask": partial.mask.astype(np.int8)},
+                {"action_mask": partial.action_mask.astype(np.int8)},
             )
         partial.apply(int(action))
-        info: dict[str, Any] = {"action_mask": partial.mask.astype(np.int8)}
-        worth = self.task.hidden_reward * partial.hidden
-        over = partial.finished or partial.fault is not None
+        info: dict[str, Any] = {"action_mask": partial.action_mask.astype(np.int8)}
+        worth = self.task.hidden_reward * partial.num_hidden
+        over = partial.finished or partial.failure is not None
         if over:
-            made = partial.scene(self.np_random) if partial.fault is None else None
+            made = partial.lay_out_and_judge(self.np_random) if partial.failure is None else None
             if made is None:
-                worth, info["fault"] = self.task.instability_reward, partial.fault
+                worth, info["fault"] = self.task.instability_reward, partial.failure
             else:
                 info["scene"], info["verdict"] = made
-                worth = partial.worth(len(made[1].hidden))
+                worth = partial.terminal_reward(len(made[1].hidden))
         return partial.observe(), worth - earned, over, False, info

@@ -32,14 +32,14 @@ from drake_clutter.tasks.belief import legal_moves
 
 PLANNED = "planned"
 """The result of a move that has a plan; any other is a `PlanningFailureReason`'s value."""
-NOISE = (0.002, 0.005, 0.010, 0.020, 0.040)
+POSE_ERRORS = (0.002, 0.005, 0.010, 0.020, 0.040)
 """m, standard deviations of the error of a pose along x and along y; its yaw has half a degree for each mm."""
-NOISY_MOVES = 6
+MAX_NOISY_MOVES = 6
 """Planned moves per scene that are tried with wrong poses."""
 
 
 @dataclass(frozen=True)
-class MoveRow:
+class MoveRecord:
     """One legal move in one scene with one arm: a row of `moves.csv`.
 
     Attributes:
@@ -81,11 +81,11 @@ class MoveRow:
     manipulability: float = math.nan
 
 
-MOVE_COLUMNS = tuple(field.name for field in fields(MoveRow))
+MOVE_RECORD_FIELDS = tuple(field.name for field in fields(MoveRecord))
 
 
 @dataclass(frozen=True)
-class NoiseRow:
+class PoseErrorRecord:
     """A planned move, planned again from wrong poses and checked against the right ones: a row of `noise.csv`.
 
     Attributes:
@@ -110,7 +110,7 @@ class FeasibilityStudy:
         self._detector = LabelDetector(world.cell.camera)
         self._planner: PickPlacePlanner | None = None
 
-    def moves(self, name: str, number: int, scene: Scene) -> list[MoveRow]:
+    def plan_all_moves(self, name: str, number: int, scene: Scene) -> list[MoveRecord]:
         """Every legal move in a scene at rest.
 
         Args:
@@ -144,21 +144,21 @@ class FeasibilityStudy:
         scene: Scene,
         move: Move,
         command: PickPlaceCommand | None,
-    ) -> MoveRow:
+    ) -> MoveRecord:
         picked = scene[move.pick]
         lower, upper = picked.bounds_T
         x, y = (lower[:2] + upper[:2]) / 2
-        row = MoveRow(
+        row = MoveRecord(
             self._setup,
             name,
             move.pick,
             move.place,
             picked.object_class.name,
-            rest_of(picked),
+            resting_side(picked),
             round(float(x), 6),
             round(float(y), 6),
             round(picked.top_height, 6),
-            len(below(picked, scene.objects)),
+            len(objects_below(picked, scene.objects)),
         )
         if command is None:
             return replace(row, about=move.place)
@@ -186,19 +186,19 @@ class FeasibilityStudy:
             manipulability=float(robot.manipulability(ends).min()),
         )
 
-    def noise(
-        self, name: str, number: int, scene: Scene, rows: Sequence[MoveRow]
-    ) -> list[NoiseRow]:
+    def test_pose_errors(
+        self, name: str, number: int, scene: Scene, rows: Sequence[MoveRecord]
+    ) -> list[PoseErrorRecord]:
         """Some of the planned moves, planned from wrong poses: do the plans hold where the objects really are?"""
         planned = [row for row in rows if row.result == PLANNED]
         rng, planner, found = (
             self._rng(number, 1_000_000),
             self.planner(scene.support),
-            list[NoiseRow](),
+            list[PoseErrorRecord](),
         )
-        for k in sorted(rng.permutation(len(planned))[:NOISY_MOVES].tolist()):
+        for k in sorted(rng.permutation(len(planned))[:MAX_NOISY_MOVES].tolist()):
             row = planned[k]
-            for error in NOISE:
+            for error in POSE_ERRORS:
                 believed = [_misjudged(o, error, rng) for o in scene.objects]
                 picked = next(o for o in believed if o.name == row.pick)
                 X_TO = Pose((row.place_x, row.place_y, row.place_z), picked.X_TO.quaternion)
@@ -208,7 +208,7 @@ class FeasibilityStudy:
                     if isinstance(plan, PlanningFailure)
                     else self._holds(plan, scene, planner, error)
                 )
-                found.append(NoiseRow(self._setup, name, row.pick, row.place, error, result))
+                found.append(PoseErrorRecord(self._setup, name, row.pick, row.place, error, result))
         return found
 
     def _holds(
@@ -255,7 +255,7 @@ def _misjudged(o: SceneObject, error: float, rng: np.random.Generator) -> SceneO
     return replace(o, X_TO=Pose((px + x, py + y, pz), turned))
 
 
-def rest_of(o: SceneObject) -> str:
+def resting_side(o: SceneObject) -> str:
     """Which of an object's axes points up."""
     if o.object_class.shape is Shape.CYLINDER:
         return "upright" if abs(o.X_TO.rotation[2, 2]) > 0.5 else "lying"
@@ -263,7 +263,7 @@ def rest_of(o: SceneObject) -> str:
     return ("flat", "side", "upright")[int(np.argsort(np.argsort(o.object_class.size))[up])]
 
 
-def below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
+def objects_below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
     """The names of the objects under one, seen from above."""
     lower, upper = picked.bounds_T
     found = []

@@ -18,7 +18,7 @@ from drake_clutter.grammar import (
     canonical_form,
     uniform_choice,
 )
-from drake_clutter.learning.shipped import checkpoint_path, weights_of
+from drake_clutter.learning.pretrained import checkpoint_path, checkpoint_sha256
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
@@ -26,13 +26,17 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.statistics import mean_interval, wilson_interval
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch, Solvability
-from drake_clutter.tasks.generation import MOST_IN_A_STACK, GenerationTask, PartialScene
+from drake_clutter.tasks.generation_task import (
+    MAX_BALANCED_STACK_FRACTION,
+    GenerationTaskConfig,
+    PartialScene,
+)
+from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.validation import to_plain
 
 SEARCH_BUDGET = 400
 """Moves that are tried to find out whether a scene is solvable."""
-LAYOUT_TRIES = 1000
+MAX_LAYOUT_ATTEMPTS = 1000
 """Graphs in a row that may fail to be laid out before the budget is called too large for the tray."""
 
 
@@ -45,7 +49,7 @@ class GenerationAgent(Protocol):
         """A terminal graph within the budget."""
 
 
-TRAINED = {
+PRETRAINED_GENERATORS = {
     "sg": "training/checkpoints/sg.safetensors",
     "sg-star": "training/checkpoints/sg_star.safetensors",
     "sg-14": "training/checkpoints/sg_14.safetensors",
@@ -69,27 +73,31 @@ class HillClimber:
     Scenes are rated as `ClutterGeneration` does, without learning anything from one to the next.
     """
 
-    TRIES = 150
+    NUM_CANDIDATES = 150
     """Graphs that are derived for each scene."""
 
     def __init__(self, config: ClutterConfig) -> None:
         self._config = config
-        self._judge = FastJudge(config, margin=GenerationTask().margin)
+        self._judge = FastJudge(config, margin=GenerationTaskConfig().contact_margin)
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
         """See `GenerationAgent.derive`."""
-        task = GenerationTask(nodes=budget.nodes)
+        task = GenerationTaskConfig(nodes=budget.nodes)
         best, best_worth = None, -np.inf
-        for _ in range(self.TRIES):
+        for _ in range(self.NUM_CANDIDATES):
             partial = PartialScene(grammar, task, self._config, self._judge)
             kept: tuple[str, ...] = best.rules[: rng.integers(len(best.rules))] if best else ()
             for name in kept:
                 partial.apply(grammar.index[name])
             while not partial.finished:
-                partial.apply(int(rng.choice(np.flatnonzero(partial.mask))))
-            worth = task.instability_reward if partial.fault else partial.worth(partial.hidden)
+                partial.apply(int(rng.choice(np.flatnonzero(partial.action_mask))))
+            worth = (
+                task.instability_reward
+                if partial.failure
+                else partial.terminal_reward(partial.num_hidden)
+            )
             if worth >= best_worth:
                 best, best_worth = Derivation(partial.graph, tuple(partial.rules)), worth
         assert best is not None
@@ -109,7 +117,7 @@ def make_generation_agent(
     Raises:
         InputError: no such agent, a file that is no checkpoint of one, or a temperature for an agent that has none.
     """
-    learned = name in TRAINED or name.endswith(".safetensors")
+    learned = name in PRETRAINED_GENERATORS or name.endswith(".safetensors")
     if temperature is not None and not (learned and temperature > 0):
         raise InputError(
             f"--temperature {temperature:g} for {name}; allowed is a positive one, for a trained agent"
@@ -120,9 +128,9 @@ def make_generation_agent(
         return HillClimber(config)
     if not learned:
         raise InputError(
-            f"--agent {name}; allowed are random, hill-climbing, {', '.join(TRAINED)}, or a .safetensors file"
+            f"--agent {name}; allowed are random, hill-climbing, {', '.join(PRETRAINED_GENERATORS)}, or a .safetensors file"
         )
-    path = checkpoint_path(name, TRAINED)
+    path = checkpoint_path(name, PRETRAINED_GENERATORS)
     from drake_clutter.agents.learned_generator import (
         LearnedGenerator,
     )  # takes PyTorch, which the others do without
@@ -153,10 +161,14 @@ class GenerationJob:
     temperature: float | None = None
 
     @property
-    def fields(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The same for JSON, with the hash of a trained agent's weights: all that decides what the scenes are."""
         folder = str(self.catalog_folder.resolve()) if self.catalog_folder else None
-        weights = {"weights": found} if (found := weights_of(self.agent, TRAINED)) else {}
+        weights = (
+            {"weights": found}
+            if (found := checkpoint_sha256(self.agent, PRETRAINED_GENERATORS))
+            else {}
+        )
         return {**to_plain(self), **weights, "catalog_folder": folder}
 
 
@@ -186,7 +198,7 @@ class SceneGenerator:
         self._budget = NodeBudget(job.nodes)
         self._agent: GenerationAgent = make_generation_agent(job.agent, job.config, job.temperature)
         self._judge = DrakeJudge(job.config)
-        self._search = FullKnowledgeSearch(job.config)
+        self._search = OracleSearch(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:
         """The scene of an index, judged; it depends on nothing but the job and the index."""
@@ -196,14 +208,14 @@ class SceneGenerator:
         solvable = None
         if verdict.stable:
             solvable = self._search.solve(
-                scene.with_poses(verdict.settled), self._job.seed, SEARCH_BUDGET, fewest=False
-            ).answer
+                scene.with_poses(verdict.settled), self._job.seed, SEARCH_BUDGET, optimal=False
+            ).solvability
         return GeneratedScene(scene, verdict, failures, solvable)
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
         """A scene as laid out, and why the graphs drawn before it could not be."""
         failures: Counter[str] = Counter()
-        for _ in range(LAYOUT_TRIES):
+        for _ in range(MAX_LAYOUT_ATTEMPTS):
             derivation = self._agent.derive(self._grammar, self._budget, rng)
             scene = lay_out(
                 derivation, self._grammar.classes, self._job.config, rng, self._job.seed
@@ -212,11 +224,11 @@ class SceneGenerator:
                 return scene, failures
             failures[scene.reason.value] += 1
         raise RuntimeError(
-            f"{LAYOUT_TRIES} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}"
+            f"{MAX_LAYOUT_ATTEMPTS} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}"
         )
 
 
-def summarise(
+def summarize_scenes(
     job: GenerationJob,
     scenes: Iterable[tuple[Scene, Verdict]],
     solvable: Sequence[Solvability | None] | None = None,
@@ -259,7 +271,7 @@ def summarise(
         "mean_stacks": float(np.mean(stacks)),
         "mean_objects": float(np.mean(objects)),
         "largest_stack_share": float(np.mean(largest)),
-        "balanced_share": float(np.mean(np.array(largest) <= MOST_IN_A_STACK)),
+        "balanced_share": float(np.mean(np.array(largest) <= MAX_BALANCED_STACK_FRACTION)),
         "class_entropy": float(-(shares * np.log2(shares)).sum()),
         "classes": dict(sorted(kinds.items())),
         "instability_reasons": dict(reasons.most_common()),

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_clutter.agents.backends import backends
-from drake_clutter.agents.exploration import PolicyMaker, make_explorers
+from drake_clutter.agents.backend_factory import make_backend_factory
+from drake_clutter.agents.explorers import PolicyFactory, make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
@@ -18,11 +18,11 @@ from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration import EpisodeEnd
+from drake_clutter.tasks.exploration_task import TerminationReason
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeSpec:
     """What is to be played: an agent on a scene at rest. `index` seeds its chances.
 
     Attributes:
@@ -68,7 +68,7 @@ class EpisodeResult:
     not_carried_out: int
 
 
-class EpisodePlayer:
+class EpisodeRunner:
     """Plays episodes at a fidelity; a worker for the runner."""
 
     def __init__(
@@ -83,36 +83,36 @@ class EpisodePlayer:
         # In this process: an object class is known by its identity.
         self._catalog = load_catalog(catalog_folder)
         self._set = cache(partial(load_scene_dataset, catalog=self._catalog))
-        self._start_backend = backends(fidelity, config)
-        self._explorers: dict[str, PolicyMaker] = {}
+        self._start_backend = make_backend_factory(fidelity, config)
+        self._explorers: dict[str, PolicyFactory] = {}
 
-    def _scene(self, episode: Episode) -> Scene:
+    def _scene(self, episode: EpisodeSpec) -> Scene:
         if episode.number is None:
             return load_scene(episode.file, self._catalog).settled_scene
         held = self._set(episode.file)
         return held.settled_scene(episode.number, held.grammar, self._config)
 
-    def __call__(self, episode: Episode) -> EpisodeResult:
+    def __call__(self, episode: EpisodeSpec) -> EpisodeResult:
         """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
         if episode.agent not in self._explorers:
-            self._explorers[episode.agent] = make_explorers(episode.agent, self._config)
+            self._explorers[episode.agent] = make_policy_factory(episode.agent, self._config)
         backend = self._start_backend(self._scene(episode), item_rng(self._seed, episode.index))
         policy = self._explorers[episode.agent](backend)
         task = run_episode(backend, policy, max_moves=self._max_moves)
-        found_after = np.cumsum([len(step.newly_found) for step in task.steps], dtype=int)
+        found_after = np.cumsum([len(step.newly_found) for step in task.transitions], dtype=int)
         return EpisodeResult(
             scene=episode.scene,
             agent=episode.agent,
-            ended=(task.end or EpisodeEnd.GAVE_UP).value,
-            hidden=len(task.hidden_at_start),
+            ended=(task.termination or TerminationReason.GAVE_UP).value,
+            hidden=len(task.initially_hidden),
             found=len(task.found),
-            moves=len(task.steps),
+            moves=len(task.transitions),
             found_after=tuple(int(n) for n in found_after),
-            not_carried_out=sum(not step.outcome.result.was_executed for step in task.steps),
+            not_carried_out=sum(not step.outcome.result.was_executed for step in task.transitions),
         )
 
 
-def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) -> dict[str, Any]:
+def summarize_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) -> dict[str, Any]:
     """An agent's row: what it had found within so many moves, whether all, and collapses, with 95 % intervals.
 
     Args:
@@ -124,9 +124,11 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
         "hidden": float(np.mean([r.hidden for r in results])),
     }
     for limit in limits:
-        won = [r.ended == EpisodeEnd.ALL_FOUND.value and r.moves <= limit for r in results]
+        won = [r.ended == TerminationReason.ALL_FOUND.value and r.moves <= limit for r in results]
         found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
-        fallen = [r.ended == EpisodeEnd.COLLAPSED.value and r.moves <= limit for r in results]
+        fallen = [
+            r.ended == TerminationReason.COLLAPSED.value and r.moves <= limit for r in results
+        ]
         row[f"within_{limit}"] = {
             "success": sum(won) / len(won),
             "success_ci95": wilson_interval(sum(won), len(won)),
@@ -137,7 +139,7 @@ def summarise_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) 
             "collapsed": sum(fallen) / len(results),
             "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
         }
-    won_moves = [r.moves for r in results if r.ended == EpisodeEnd.ALL_FOUND.value]
+    won_moves = [r.moves for r in results if r.ended == TerminationReason.ALL_FOUND.value]
     row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
     row["moves_of_successes_ci95"] = mean_interval(won_moves)
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(

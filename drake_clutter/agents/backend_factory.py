@@ -9,14 +9,16 @@ from drake_clutter.tasks.episode import (
     TELEPORT_FIDELITIES,
     BackendFactory,
     SteppedBackend,
-    teleport_backends,
+    make_teleport_backend_factory,
 )
 
 FIDELITIES = (*TELEPORT_FIDELITIES, "arm")
 """How moves are carried out: by teleport, or planned and simulated with the arm."""
 
 
-def backends(fidelity: str, config: ClutterConfig, *, follow_falls: bool = False) -> BackendFactory:
+def make_backend_factory(
+    fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
+) -> BackendFactory:
     """Return what starts episodes.
 
     Args:
@@ -27,4 +29,4 @@ def backends(fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
     if fidelity == "arm":
         detector = LabelDetector(config.cell.camera)
         return partial(SteppedBackend, ArmExecutor(config), detector, config.exploration)
-    return teleport_backends(fidelity, config, follow_falls=follow_falls)
+    return make_teleport_backend_factory(fidelity, config, follow_falls=follow_falls)

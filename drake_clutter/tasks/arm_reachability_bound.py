@@ -6,18 +6,18 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.stability.judge import FastJudge
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
+from drake_clutter.tasks.oracle_search import OracleSearch
 
 
-class ArmCeiling:
+class ArmReachabilityBound:
     """Knows everything of a scene, and what the cup holds."""
 
     def __init__(self, world: ClutterConfig) -> None:
         """For scenes in a world."""
         self._world, self._judge = world, FastJudge(world)
-        self._search = FullKnowledgeSearch(world, self._judge)
+        self._search = OracleSearch(world, self._judge)
 
-    def never_found(self, scene: Scene) -> tuple[str, ...]:
+    def find_unrevealable(self, scene: Scene) -> tuple[str, ...]:
         """What stays hidden behind what no cup holds, and behind what carries that; the scene is at rest."""
         planner = PickPlacePlanner(self._world.cell.with_support(scene.support), PlannerConfig())
         fixed = {o.name for o in scene.objects if not planner.can_grasp(o)}
@@ -26,4 +26,4 @@ class ArmCeiling:
             while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
                 fixed |= below
         in_view = self._judge.rays.observe(scene)[0].detections
-        return self._search.never_found(scene, [d.name for d in in_view], fixed)
+        return self._search.find_unrevealable(scene, [d.name for d in in_view], fixed)

@@ -10,7 +10,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.belief import Decision
 
 
-class EpisodeEnd(Enum):
+class TerminationReason(Enum):
     """Why an episode is over."""
 
     ALL_FOUND = "all found"
@@ -20,18 +20,18 @@ class EpisodeEnd(Enum):
 
 
 @dataclass(frozen=True)
-class Attempt:
+class MoveAttempt:
     """A decision, and what it led to.
 
     Attributes:
         decision: In the names of the true objects; its move is not None.
         outcome: How the move went.
-        look: What a perfect detector sees afterwards.
+        next_perception: What a perfect detector sees afterwards.
     """
 
     decision: Decision
     outcome: Outcome
-    look: PerceptionResult
+    next_perception: PerceptionResult
 
     @property
     def move(self) -> Move:
@@ -41,7 +41,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class Step(Attempt):
+class Transition(MoveAttempt):
     """An attempt, and what it was worth.
 
     Attributes:
@@ -61,60 +61,62 @@ class ExplorationTask:
     counts as one.
 
     Attributes:
-        start: The scene at the start.
+        initial_scene: The scene at the start.
         scene: The scene now.
-        first_look: What a perfect detector sees at the start.
-        look: What a perfect detector sees now.
-        known: Names of all objects that have been in view.
-        steps: The attempts so far.
+        initial_perception: What a perfect detector sees at the start.
+        perception: What a perfect detector sees now.
+        detected: Names of all objects that have been in view.
+        transitions: The attempts so far.
     """
 
     def __init__(
         self,
         scene: Scene,
-        first_look: PerceptionResult,
+        initial_perception: PerceptionResult,
         config: ExplorationConfig,
         max_moves: int,
     ) -> None:
         """Start the record of an episode on a scene at rest."""
         self._config, self._max_moves = config, max_moves
-        self.start = self.scene = scene
-        self.first_look = self.look = first_look
-        self.known: tuple[str, ...] = tuple(d.name for d in first_look.observation.detections)
-        self.hidden_at_start = tuple(name for name in scene.names if name not in self.known)
-        self.steps: list[Step] = []
+        self.initial_scene = self.scene = scene
+        self.initial_perception = self.perception = initial_perception
+        self.detected: tuple[str, ...] = tuple(
+            d.name for d in initial_perception.observation.detections
+        )
+        self.initially_hidden = tuple(name for name in scene.names if name not in self.detected)
+        self.transitions: list[Transition] = []
 
     @property
-    def end(self) -> EpisodeEnd | None:
+    def termination(self) -> TerminationReason | None:
         """Why the episode is over, or None while it goes on."""
-        if self.steps and self.steps[-1].outcome.result is MoveResult.COLLAPSED:
-            return EpisodeEnd.COLLAPSED
-        if len(self.known) == len(self.scene.objects):
-            return EpisodeEnd.ALL_FOUND
-        return EpisodeEnd.OUT_OF_MOVES if len(self.steps) >= self._max_moves else None
+        if self.transitions and self.transitions[-1].outcome.result is MoveResult.COLLAPSED:
+            return TerminationReason.COLLAPSED
+        if len(self.detected) == len(self.scene.objects):
+            return TerminationReason.ALL_FOUND
+        return TerminationReason.OUT_OF_MOVES if len(self.transitions) >= self._max_moves else None
 
     @property
     def found(self) -> tuple[str, ...]:
         """The objects that were hidden at the start and are known now."""
-        return tuple(name for name in self.hidden_at_start if name in self.known)
+        return tuple(name for name in self.initially_hidden if name in self.detected)
 
-    def note(self, attempt: Attempt) -> Step:
+    def record(self, attempt: MoveAttempt) -> Transition:
         """Take in an attempt.
 
         Raises:
             ValueError: The scene has collapsed; after any other end an episode may go on.
         """
-        if self.end is EpisodeEnd.COLLAPSED:
+        if self.termination is TerminationReason.COLLAPSED:
             raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
         collapsed = attempt.outcome.result is MoveResult.COLLAPSED
-        self.scene, self.look = attempt.outcome.scene, attempt.look
-        seen = {d.name for d in self.look.observation.detections}
-        newly = tuple(n for n in self.scene.names if n in seen and n not in self.known)
+        self.scene, self.perception = attempt.outcome.scene, attempt.next_perception
+        seen = {d.name for d in self.perception.observation.detections}
+        newly = tuple(n for n in self.scene.names if n in seen and n not in self.detected)
         if collapsed:
             newly = ()
-        self.known += newly
+        self.detected += newly
         reward = self._config.detection_reward * len(newly)
         reward += self._config.collapse_penalty if collapsed else 0.0
-        step = Step(attempt.decision, attempt.outcome, attempt.look, newly, reward)
-        self.steps.append(step)
+        step = Transition(attempt.decision, attempt.outcome, attempt.next_perception, newly, reward)
+        self.transitions.append(step)
         return step

@@ -13,48 +13,54 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drake_clutter.agents.exploration_episodes import Played, play_episodes
 from drake_clutter.agents.explorer_network import (
     ExplorerNetwork,
-    decide,
-    log_probability,
-    stacked_graphs,
+    action_log_probs,
+    collate_graphs,
+    sample_actions,
 )
+from drake_clutter.agents.rollouts import Rollout, collect_rollouts
 from drake_clutter.learning.checkpoint import (
     learner_tensors,
     load_tensors,
-    part_of,
     restore_learner,
     save_tensors,
+    tensors_with_prefix,
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration_graph import GraphObservation
-from drake_clutter.validation import Flag, InRange, NonNegative, config_class
+from drake_clutter.tasks.exploration_graph import ExplorationObservation
+from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
 
 
 @config_class
-class CloningConfig:
+@renamed_fields(
+    rounds="iterations",
+    episodes="episodes_per_iteration",
+    updates="updates_per_iteration",
+    batch="batch_size",
+)
+class BehaviorCloningConfig:
     """How a student learns.
 
     Attributes:
-        rounds: in all; episodes: per round.
+        iterations: in all; episodes_per_iteration: per round.
         dagger: whether the student plays from the second round on.
-        updates: per round; batch: states per update.
+        updates_per_iteration: per round; batch_size: states per update.
         learning_rate: at the beginning; it falls to 0 in a straight line.
         width: of the network.
     """
 
-    rounds: Annotated[int, InRange(1)] = 40
-    episodes: Annotated[int, InRange(1)] = 100
+    iterations: Annotated[int, InRange(1)] = 40
+    episodes_per_iteration: Annotated[int, InRange(1)] = 100
     dagger: Flag = True
-    updates: Annotated[int, InRange(1)] = 400
-    batch: Annotated[int, InRange(1)] = 128
+    updates_per_iteration: Annotated[int, InRange(1)] = 400
+    batch_size: Annotated[int, InRange(1)] = 128
     learning_rate: NonNegative = 1e-3
     width: Annotated[int, InRange(1)] = 32
 
 
-class Cloning:
+class BehaviorCloningLearner:
     """One training, round by round.
 
     Attributes:
@@ -67,7 +73,7 @@ class Cloning:
         self,
         environment: ClutterExploration,
         teacher: ExplorerNetwork,
-        config: CloningConfig,
+        config: BehaviorCloningConfig,
         seed: int,
         device: torch.device,
     ) -> None:
@@ -79,36 +85,37 @@ class Cloning:
             seed,
         )
         torch.manual_seed(seed)
-        self.network = ExplorerNetwork(len(environment.numbers), config.width).to(device)
+        self.network = ExplorerNetwork(len(environment.node_kind_ids), config.width).to(device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.step = 0
         self.losses: dict[str, float] = {}
-        self._states: GraphObservation = {}
+        self._states: ExplorationObservation = {}
         self._moves = np.zeros((0, 2), np.int64)
 
-    def advance(self) -> list[Played]:
+    def train_iteration(self) -> list[Rollout]:
         """One round; returns its episodes."""
         rng = item_rng(self._seed, 1, self.step)
         student_plays = self.config.dagger and self.step > 0
 
         def act(
-            environments: Sequence[ClutterExploration], observations: Sequence[GraphObservation]
+            environments: Sequence[ClutterExploration],
+            observations: Sequence[ExplorationObservation],
         ) -> tuple[NDArray[np.int64], list[Any]]:
-            wanted = self.wanted(environments)
+            wanted = self.expert_actions(environments)
             played = (
-                decide(self.network, stacked_graphs(observations), rng)[0]
+                sample_actions(self.network, collate_graphs(observations), rng)[0]
                 if student_plays
                 else wanted
             )
             return played, list(wanted)
 
-        played = play_episodes(
-            self._environment, self.config.episodes, (self._seed, 2, self.step), act
+        played = collect_rollouts(
+            self._environment, self.config.episodes_per_iteration, (self._seed, 2, self.step), act
         )
-        states = stacked_graphs(
+        states = collate_graphs(
             [observation for episode in played for observation in episode.observations]
         )
-        moves = np.array([move for episode in played for move in episode.notes])
+        moves = np.array([move for episode in played for move in episode.policy_extras])
         self._states = {
             name: np.concatenate([self._states[name], new]) if self._states else new
             for name, new in states.items()
@@ -118,10 +125,10 @@ class Cloning:
         self.step += 1
         return played
 
-    def wanted(self, environments: Sequence[ClutterExploration]) -> NDArray[np.int64]:
+    def expert_actions(self, environments: Sequence[ClutterExploration]) -> NDArray[np.int64]:
         """(B, 2) what the teacher would do, as nodes of the student's graphs."""
-        moves = decide(
-            self._teacher, stacked_graphs([e.observe(privileged=True) for e in environments]), None
+        moves = sample_actions(
+            self._teacher, collate_graphs([e.observe(privileged=True) for e in environments]), None
         )[0]
         found = np.zeros_like(moves)
         for row, environment in enumerate(environments):
@@ -133,19 +140,21 @@ class Cloning:
         return found
 
     def _learn(self, rng: np.random.Generator) -> None:
-        device, total = self.network.mark.device, 0.0
+        device, total = self.network.pick_marker.device, 0.0
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * (1 - self.step / self.config.rounds)
-        for _ in range(self.config.updates):
-            part = rng.integers(len(self._moves), size=self.config.batch)
+            group["lr"] = self.config.learning_rate * (1 - self.step / self.config.iterations)
+        for _ in range(self.config.updates_per_iteration):
+            part = rng.integers(len(self._moves), size=self.config.batch_size)
             found = self.network({name: array[part] for name, array in self._states.items()})
             moves = torch.from_numpy(self._moves[part]).to(device)
-            loss = -log_probability(found, self.network.places(found, moves[:, 0]), moves).mean()
+            loss = -action_log_probs(
+                found, self.network.place_log_probs(found, moves[:, 0]), moves
+            ).mean()
             self._optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimizer.step()
             total += loss.item()
-        self.losses = {"cloning": total / self.config.updates}
+        self.losses = {"cloning": total / self.config.updates_per_iteration}
 
     def save(self, path: Path) -> None:
         """Writes all that the training needs to go on as if it had never been interrupted."""
@@ -158,6 +167,8 @@ class Cloning:
         """Goes on where `save` was called, in a training of the same config, seed and teacher."""
         tensors, state = load_tensors(path)
         restore_learner(self.network, self._optimizer, tensors)
-        self._states = {name: value.numpy() for name, value in part_of(tensors, "states").items()}
+        self._states = {
+            name: value.numpy() for name, value in tensors_with_prefix(tensors, "states").items()
+        }
         self._moves = self._states.pop("moves")
         self.step = state["step"]

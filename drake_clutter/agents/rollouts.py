@@ -8,64 +8,65 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.agents.explorer_network import ExplorerNetwork, decide, stacked_graphs
+from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration import EpisodeEnd
-from drake_clutter.tasks.exploration_graph import GraphObservation
+from drake_clutter.tasks.exploration_graph import ExplorationObservation
+from drake_clutter.tasks.exploration_task import TerminationReason
 
-Act = Callable[
-    [Sequence[ClutterExploration], Sequence[GraphObservation]], tuple[NDArray[np.int64], list[Any]]
+PolicyFn = Callable[
+    [Sequence[ClutterExploration], Sequence[ExplorationObservation]],
+    tuple[NDArray[np.int64], list[Any]],
 ]
 """From environments and what they show: (B, 2) moves, and what is to be noted with each."""
 
 
 @dataclass
-class Played:
+class Rollout:
     """One episode, move by move.
 
     Attributes:
-        observations, moves, rewards: of each move; notes: what `Act` returned with it.
-        end: why it ended.
-        hidden, found: objects hidden at the start, and those of them that were found.
+        observations, actions, rewards: of each move; policy_extras: what `Act` returned with it.
+        termination: why it ended.
+        num_hidden, num_found: objects hidden at the start, and those of them that were found.
     """
 
-    observations: list[GraphObservation] = field(default_factory=list)
-    moves: list[NDArray[np.int64]] = field(default_factory=list)
+    observations: list[ExplorationObservation] = field(default_factory=list)
+    actions: list[NDArray[np.int64]] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
-    notes: list[Any] = field(default_factory=list)
-    end: EpisodeEnd = EpisodeEnd.GAVE_UP
-    hidden: int = 0
-    found: int = 0
+    policy_extras: list[Any] = field(default_factory=list)
+    termination: TerminationReason = TerminationReason.GAVE_UP
+    num_hidden: int = 0
+    num_found: int = 0
 
 
-def play_episodes(
+def collect_rollouts(
     environment: ClutterExploration,
     count: int,
     seed: Sequence[int],
-    act: Act,
-    side_by_side: int = 32,
-) -> list[Played]:
+    policy_fn: PolicyFn,
+    num_envs: int = 32,
+) -> list[Rollout]:
     """Plays episodes; the same for the same path of seeds.
 
     Args:
         environment: copies of it are played; they share its judge's memory.
         count: of episodes.
         seed: path under which each episode has a seed of its own.
-        act: chooses the moves.
-        side_by_side: episodes at a time.
+        policy_fn: chooses the moves.
+        num_envs: episodes at a time.
     """
-    played = [Played() for _ in range(count)]
+    played = [Rollout() for _ in range(count)]
     waiting = iter(range(count))
-    running: dict[int, tuple[ClutterExploration, GraphObservation]] = {}
+    running: dict[int, tuple[ClutterExploration, ExplorationObservation]] = {}
     while True:
-        while len(running) < side_by_side and (number := next(waiting, None)) is not None:
+        while len(running) < num_envs and (number := next(waiting, None)) is not None:
             twin = copy(environment)
             observation, _ = twin.reset(seed=int(item_rng(*seed, number).integers(2**31)))
             running[number] = twin, observation
         if not running:
             return played
-        moves, notes = act(
+        moves, notes = policy_fn(
             [twin for twin, _ in running.values()],
             [observation for _, observation in running.values()],
         )
@@ -74,38 +75,40 @@ def play_episodes(
             episode = played[number]
             observation, reward, over, out_of_moves, info = twin.step(move)
             episode.observations.append(before)
-            episode.moves.append(move)
+            episode.actions.append(move)
             episode.rewards.append(float(reward))
-            episode.notes.append(note)
+            episode.policy_extras.append(note)
             running[number] = twin, observation
             if over or out_of_moves:
-                episode.end, episode.hidden, episode.found = (
+                episode.termination, episode.num_hidden, episode.num_found = (
                     info["end"],
-                    len(twin.task.hidden_at_start),
+                    len(twin.task.initially_hidden),
                     len(twin.task.found),
                 )
                 del running[number]
 
 
-def acting(network: ExplorerNetwork, rng: np.random.Generator | None) -> Act:
+def make_policy_fn(network: ExplorerNetwork, rng: np.random.Generator | None) -> PolicyFn:
     """A network's moves, drawn, or without a generator the most likely; noted are log-probability and value."""
 
     def act(
-        _: Sequence[ClutterExploration], observations: Sequence[GraphObservation]
+        _: Sequence[ClutterExploration], observations: Sequence[ExplorationObservation]
     ) -> tuple[NDArray[np.int64], list[Any]]:
-        moves, chance, value = decide(network, stacked_graphs(observations), rng)[:3]
+        moves, chance, value = sample_actions(network, collate_graphs(observations), rng)[:3]
         return moves, list(zip(chance.tolist(), value.tolist(), strict=True))
 
     return act
 
 
-def figures(episodes: Sequence[Played]) -> dict[str, float]:
+def episode_metrics(episodes: Sequence[Rollout]) -> dict[str, float]:
     """What to watch while an explorer learns."""
-    won = [len(e.moves) for e in episodes if e.end is EpisodeEnd.ALL_FOUND]
+    won = [len(e.actions) for e in episodes if e.termination is TerminationReason.ALL_FOUND]
     return {
         "success": len(won) / len(episodes),
-        "found_share": sum(e.found for e in episodes) / max(1, sum(e.hidden for e in episodes)),
-        "collapsed": sum(e.end is EpisodeEnd.COLLAPSED for e in episodes) / len(episodes),
+        "found_share": sum(e.num_found for e in episodes)
+        / max(1, sum(e.num_hidden for e in episodes)),
+        "collapsed": sum(e.termination is TerminationReason.COLLAPSED for e in episodes)
+        / len(episodes),
         "moves_of_successes": float(np.mean(won)) if won else 0.0,
         "score": float(np.mean([sum(e.rewards) for e in episodes])),
     }

@@ -8,12 +8,12 @@ from drake_clutter.files import InputError, file_sha256
 from drake_clutter.resources import resource_path
 
 
-def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
+def checkpoint_path(name: str, pretrained: Mapping[str, str]) -> Path:
     """The file of a trained agent.
 
     Args:
         name: of a shipped one, or a user's own .safetensors file.
-        shipped: where those are, by name.
+        pretrained: where those are, by name.
 
     Raises:
         InputError: it is not shipped yet, or PyTorch is not installed.
@@ -24,22 +24,22 @@ def checkpoint_path(name: str, shipped: Mapping[str, str]) -> Path:
             f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]"
         )
     try:
-        return resource_path(shipped[name]) if name in shipped else Path(name)
+        return resource_path(pretrained[name]) if name in pretrained else Path(name)
     except FileNotFoundError as error:
         raise InputError(
             f"--agent {name}: {error}; train it with the scripts of training/, and give its file"
         ) from error
 
 
-def weights_of(name: str, shipped: Mapping[str, str]) -> str:
+def checkpoint_sha256(name: str, pretrained: Mapping[str, str]) -> str:
     """The hash of a trained agent's weights; "" for an agent that has none. Arguments as for `checkpoint_path`.
 
     Raises:
         InputError: they cannot be read.
     """
-    if name not in shipped and not name.endswith(".safetensors"):
+    if name not in pretrained and not name.endswith(".safetensors"):
         return ""
-    path = checkpoint_path(name, shipped)
+    path = checkpoint_path(name, pretrained)
     try:
         return file_sha256(path)
     except OSError as error:

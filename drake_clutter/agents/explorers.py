@@ -6,13 +6,13 @@ import numpy as np
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.learning.shipped import checkpoint_path
+from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
 from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
 from drake_clutter.tasks.episode import Backend
-from drake_clutter.tasks.full_knowledge import FullKnowledgeSearch
+from drake_clutter.tasks.oracle_search import OracleSearch
 
 
 def random_explorer(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
@@ -61,7 +61,7 @@ def largest_clear(belief: Belief, observation: Observation, rng: np.random.Gener
     )
 
 
-class FullKnowledge:
+class OracleExplorer:
     """The oracle: follows plans of `FullKnowledgeSearch`, which knows the true scene.
 
     It has no move where there is no plan. Objects land where a plan puts them as long as nothing
@@ -71,7 +71,7 @@ class FullKnowledge:
     BUDGET = 2000
     """Moves that may be tried for a plan."""
 
-    def __init__(self, backend: Backend, search: FullKnowledgeSearch) -> None:
+    def __init__(self, backend: Backend, search: OracleSearch) -> None:
         """Begin an episode on a backend, whose true scene is looked at."""
         self._backend, self._search = backend, search
         self._plan: list[Move] = []
@@ -91,21 +91,21 @@ class FullKnowledge:
                 budget=self.BUDGET,
                 known=known,
                 rng=rng,
-                failed=failed,
+                invalid_moves=failed,
             )
             self._plan = list(found.plan)
         return Decision(self._plan.pop(0) if self._plan else None)
 
 
-PolicyMaker = Callable[[Backend], Policy]
+PolicyFactory = Callable[[Backend], Policy]
 """Makes the policy of an episode; a privileged one may look at the backend's true scene."""
 
-BASELINES: dict[str, Policy] = {
+BASELINE_POLICIES: dict[str, Policy] = {
     "random": random_explorer,
     "largest-first": largest_first,
     "largest-clear": largest_clear,
 }
-TRAINED = {
+PRETRAINED_EXPLORERS = {
     "teacher": "training/checkpoints/teacher.safetensors",
     "student": "training/checkpoints/student.safetensors",
     "student-dagger": "training/checkpoints/student_dagger.safetensors",
@@ -115,10 +115,12 @@ TRAINED = {
 """The shipped checkpoints, by the agent's name."""
 
 
-FULL_KNOWLEDGE = "full-knowledge"
+ORACLE = "full-knowledge"
 
 
-def make_explorers(name: str, config: ClutterConfig, classes: Collection[str] = ()) -> PolicyMaker:
+def make_policy_factory(
+    name: str, config: ClutterConfig, classes: Collection[str] = ()
+) -> PolicyFactory:
     """What makes an explorer for each episode.
 
     Args:
@@ -129,17 +131,17 @@ def make_explorers(name: str, config: ClutterConfig, classes: Collection[str] = 
     Raises:
         InputError: no such explorer, a file that is no checkpoint of one, or one that has not learned one of the classes.
     """
-    if name in BASELINES:
-        return lambda _: BASELINES[name]
-    if name == FULL_KNOWLEDGE:
-        search = FullKnowledgeSearch(config)
-        return lambda backend: FullKnowledge(backend, search)
-    if name not in TRAINED and not name.endswith(".safetensors"):
-        allowed = ", ".join([*BASELINES, *TRAINED, FULL_KNOWLEDGE])
+    if name in BASELINE_POLICIES:
+        return lambda _: BASELINE_POLICIES[name]
+    if name == ORACLE:
+        search = OracleSearch(config)
+        return lambda backend: OracleExplorer(backend, search)
+    if name not in PRETRAINED_EXPLORERS and not name.endswith(".safetensors"):
+        allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, ORACLE])
         raise InputError(f"--agent {name}; allowed are {allowed}, or a .safetensors file")
-    path = checkpoint_path(name, TRAINED)
+    path = checkpoint_path(name, PRETRAINED_EXPLORERS)
     from drake_clutter.agents.learned_explorer import (
-        LearnedExplorers,
+        LearnedExplorerFactory,
     )  # takes PyTorch, which the others do without
 
-    return LearnedExplorers(path, config.exploration, classes)
+    return LearnedExplorerFactory(path, config.exploration, classes)
