@@ -9,7 +9,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 import iiwa14
-from drake_clutter.cell.primitives import Rod
+from drake_clutter.cell.primitives import LinkPrimitive
 from drake_clutter.resources import resource_path
 from ur_e_series import E_SERIES, UR3E, UR5E
 from ur_family import UrArm, ur_sdf
@@ -18,11 +18,15 @@ DATA = Path(__file__).parent / "data"
 MODELS = {**{arm.name: ur_sdf(arm) for arm in E_SERIES}, "iiwa14": iiwa14.iiwa14_sdf()}
 
 
-def outlines(arm: UrArm) -> tuple[tuple[Rod, ...], ...]:
-    return arm.base_outline, *(link.outline for link in arm.links)
+def outlines(arm: UrArm) -> tuple[tuple[LinkPrimitive, ...], ...]:
+    return arm.base_collision_geometry, *(link.collision_geometry for link in arm.links)
 
 
-OUTLINES = {"ur3e": outlines(UR3E), "ur5e": outlines(UR5E), "iiwa14": iiwa14.OUTLINES}
+COLLISION_GEOMETRY = {
+    "ur3e": outlines(UR3E),
+    "ur5e": outlines(UR5E),
+    "iiwa14": iiwa14.COLLISION_GEOMETRY,
+}
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -62,7 +66,7 @@ def test_masses_and_limits_are_the_published_ones(
     assert np.degrees(plant.GetVelocityUpperLimits()) == pytest.approx(speeds_deg, abs=1e-3)
 
 
-def outside(points: NDArray[np.float64], rod: Rod) -> float:
+def outside(points: NDArray[np.float64], rod: LinkPrimitive) -> float:
     """Return by how much the outermost of some points is outside of a rod [m]."""
     start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
@@ -70,11 +74,11 @@ def outside(points: NDArray[np.float64], rod: Rod) -> float:
     return float(away.max() - rod.radius)
 
 
-@pytest.mark.parametrize("name", OUTLINES)
+@pytest.mark.parametrize("name", COLLISION_GEOMETRY)
 def test_the_capsules_cover_the_real_links(name: str) -> None:
     """Each capsule holds the corners of the convex hull of its part, and is not 3 mm too thick."""
     with np.load(DATA / f"{name}_outline.npz") as corners:
-        for number, rods in enumerate(OUTLINES[name]):
+        for number, rods in enumerate(COLLISION_GEOMETRY[name]):
             for part, rod in enumerate(rods):
                 excess = outside(corners[f"{number}.{part}"] * 1e-5, rod)
                 assert -0.003 < excess <= 0, f"link {number}, capsule {part}"

@@ -54,7 +54,7 @@ def test_an_object_under_a_larger_one_is_hidden(camera: OverheadCamera) -> None:
 
 
 def test_hidden_is_below_the_threshold_in_order() -> None:
-    camera = OverheadCamera(Camera.over(1.6, visibility_threshold=0.25))
+    camera = OverheadCamera(Camera.overhead(1.6, visibility_threshold=0.25))
     assert camera.hidden({"b": 0.0, "a": 0.2499, "c": 0.25, "d": 1.0}) == ("b", "a")
 
 
@@ -197,7 +197,7 @@ def test_images_do_not_depend_on_what_was_rendered_before(config_camera: Camera)
 
 @pytest.fixture(scope="module")
 def config_camera() -> Camera:
-    return Camera.over(1.6, width=320, height=240)
+    return Camera.overhead(1.6, width=320, height=240)
 
 
 def test_the_order_of_objects_changes_labels_alone(camera: OverheadCamera) -> None:

@@ -14,8 +14,8 @@ from test_placement import carried_by, deepest_with, placed_at
 from test_rays import SCENES, labels
 
 from drake_clutter.cell.camera import Camera, pixel_grid
-from drake_clutter.cell.pinhole import backproject, in_camera, pose_in_camera, project
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pinhole import backproject, point_to_camera, pose_to_camera, project
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.render_scene import render_scene
 from drake_clutter.config import upgrade
@@ -77,7 +77,9 @@ def test_points_are_found_again(seed: int) -> None:
     assert camera.to_camera(p_T) == pytest.approx(p_C, abs=1e-12)
     by_pose = camera.X_TC.multiply(p_C.T).T
     assert by_pose == pytest.approx(p_T, abs=1e-12)
-    assert np.array([in_camera(camera.pinhole, *p) for p in p_T]) == pytest.approx(p_C, abs=1e-12)
+    assert np.array([point_to_camera(camera.pinhole, *p) for p in p_T]) == pytest.approx(
+        p_C, abs=1e-12
+    )
     assert np.array([project(camera.pinhole, *p) for p in p_C]) == pytest.approx(pixels, abs=1e-8)
     again = [backproject(camera.pinhole, u, v, d) for (u, v), d in zip(pixels, depth, strict=True)]
     assert np.array(again) == pytest.approx(p_T, abs=1e-12)
@@ -89,7 +91,7 @@ def test_points_are_found_again(seed: int) -> None:
 def test_a_pose_in_the_camera_s_frame(seed: int) -> None:
     camera, generator = anywhere(seed), rng(seed)
     R, p = Rotation.random(rng=generator).as_matrix(), generator.uniform(-1, 1, 3)
-    R_CO, p_CO = pose_in_camera(camera.pinhole, R, p)
+    R_CO, p_CO = pose_to_camera(camera.pinhole, R, p)
     corner = generator.uniform(-0.1, 0.1, 3)
     assert R_CO @ corner + p_CO == pytest.approx(
         camera.to_camera((R @ corner + p)[None])[0], abs=1e-12
@@ -99,8 +101,8 @@ def test_a_pose_in_the_camera_s_frame(seed: int) -> None:
 def test_a_camera_that_looks_straight_down_is_exact() -> None:
     """Not a bit is lost to its rotation: x, -y and the difference of heights, also in 32 bit."""
     camera, p_T = DEFAULT_CELL.camera, rng(0).uniform(-0.5, 0.5, (100, 3))
-    assert camera.vertical
-    assert not CAMERA.vertical
+    assert camera.is_vertical
+    assert not CAMERA.is_vertical
     assert np.array_equal(
         camera.to_camera(p_T), np.column_stack([p_T[:, 0], -p_T[:, 1], 1.6 - p_T[:, 2]])
     )

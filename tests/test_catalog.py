@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, PairArrangement, Rest, Shape, load_catalog
-from drake_clutter.cell.sdf import sdf_text
+from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.files import InputError
 from drake_clutter.simulation.plant import add_scene_plant
 
@@ -210,7 +210,7 @@ def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
     def block(mass_g: int) -> ObjectClass:
         text = f"classes:\n  block: {{shape: box, size_mm: [50, 60, 70], mass_g: {mass_g}, source: made up}}\n"
         load_catalog.cache_clear()  # a process reads a folder once
-        sdf_text.cache_clear()
+        read_sdf_text.cache_clear()
         return load_catalog(user_catalog(tmp_path, text)).classes["block"]
 
     def body_mass(entry: ObjectClass) -> float:

@@ -8,7 +8,7 @@ from conftest import DEFAULT_CELL, resting
 from pydrake.math import RigidTransform
 from test_robot_model import CELLS, robot
 
-from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.robots.robot_model import load_robot

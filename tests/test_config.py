@@ -39,7 +39,7 @@ def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
 def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
     text = "camera: {altitude: 2, width: 320, hidden_below: 0.2}\nlayout: {tray_side: 0.5, stack_gap: 0.02}\n"
     config = load_config(config_file(tmp_path, text))
-    camera = Camera.over(2.0, width=320, visibility_threshold=0.2)
+    camera = Camera.overhead(2.0, width=320, visibility_threshold=0.2)
     cell = DEFAULT_CELL.model_copy(update={"support": tray(0.5), "cameras": {"overhead": camera}})
     assert config == replace(
         ClutterConfig(), layout=replace(ClutterConfig().layout, stack_gap=0.02), cell=cell
@@ -138,8 +138,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 def test_the_focal_length_is_that_of_the_field_of_view() -> None:
     """At 45 degrees half the height of the image lies one focal length times tan(22.5 deg) from its middle."""
-    assert Camera.over(1.6, height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
-    assert Camera.over(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(
+    assert Camera.overhead(1.6, height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
+    assert Camera.overhead(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(
         240.0 * (1 + 2**0.5)
     )
 

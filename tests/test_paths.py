@@ -72,7 +72,7 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
         np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0)
         / (times[1] - times[0]) ** 2
     )
-    pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.acceleration
+    pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.max_acceleration
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
 

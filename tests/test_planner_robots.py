@@ -8,7 +8,7 @@ from conftest import DEFAULT_CELL, cell_with, resting, rng
 
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import (

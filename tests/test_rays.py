@@ -124,8 +124,8 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
 @pytest.mark.parametrize(
     "config",
     [
-        Camera.over(1.1, width=320, height=240, fov_y_deg=60.0),
-        Camera.over(1.6, width=200, height=300, fov_y_deg=20.0),
+        Camera.overhead(1.1, width=320, height=240, fov_y_deg=60.0),
+        Camera.overhead(1.6, width=200, height=300, fov_y_deg=20.0),
     ],
     ids=["wide", "narrow"],
 )

@@ -7,7 +7,7 @@ import pytest
 from conftest import DEFAULT_CELL
 from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
 
-from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.files import InputError
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.simulation.cell_plant import check_models

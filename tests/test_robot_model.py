@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.cell.robot import JointLimits, RobotSpec
+from drake_clutter.cell.pose_spec import PoseSpec
+from drake_clutter.cell.robot_spec import JointLimits, RobotSpec
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.resources import resource_path
 from drake_clutter.robots import ur_kinematics as kinematics

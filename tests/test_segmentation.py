@@ -33,7 +33,7 @@ from drake_clutter.scenes.scene import Pose
 from drake_clutter.systems.scenario import DETECTORS
 from drake_clutter.validation import validate
 
-CAMERA = Camera.over(1.6, width=160, height=120)
+CAMERA = Camera.overhead(1.6, width=160, height=120)
 WINDOW = ImageWindow.around_support(CAMERA, TRAY)
 CLASSES = ("gelatin_box", "sugar_box")
 

@@ -46,7 +46,7 @@ def test_the_cell(shelf: ClutterConfig) -> None:
     X_TS, size = cell.pedestal
     bottom = X_TS.translation()[2] - size[2] / 2
     assert bottom == pytest.approx(cell.table_height, abs=0.002)
-    assert not cell.pedestal_in_support
+    assert not cell.pedestal_overlaps_support
 
 
 def test_both_judges_agree_on_generated_scenes(shelf: ClutterConfig) -> None:

@@ -72,7 +72,7 @@ def clearance(cell: WorkCell, robot: RobotModel, with_view: bool) -> Callable[[F
 def test_home_is_clear_and_out_of_the_view(name: str) -> None:
     cell = cell_of(name)
     robot = load_robot(cell.robot)
-    assert not cell.pedestal_in_support
+    assert not cell.pedestal_overlaps_support
     assert clearance(cell, robot, with_view=True)(robot.home) > 0.008
     X_TG = cell.robot.X_TB @ RigidTransform(robot.forward_kinematics(robot.home))
     if name != "ur10":

@@ -10,7 +10,7 @@ from conftest import cell_with, resting, scene_of
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.fixture import Fixture
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.files import InputError
 from drake_clutter.planning.collision_model import CollisionModel

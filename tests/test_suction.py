@@ -8,13 +8,18 @@ from conftest import CLASSES, DEFAULT_CELL, resting
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_clutter.catalog import Rest, Shape, load_catalog
-from drake_clutter.cell.gripper import GraspFailure, GraspSampling, Gripper, NoGrasp
-from drake_clutter.cell.suction import GRAVITY, SuctionGripper, carried_load, unevenness
+from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
+from drake_clutter.cell.suction import (
+    GRAVITY,
+    SuctionGripper,
+    lip_flatness_deviation,
+    payload_wrench,
+)
 from drake_clutter.simulation.plant import rigid_transform
 
 CUP = SuctionGripper()
 ALONG_MINUS_X = RotationMatrix(np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]))
-SAMPLING = GraspSampling(spacing=0.012, count=9, least_acceleration=0.3)
+SAMPLING = GraspSampling(spacing=0.012, max_grasps=9, min_payload_acceleration=0.3)
 
 
 def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
@@ -26,32 +31,36 @@ def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
 
 def test_a_flat_face_seals() -> None:
     box, can = CLASSES["cracker_box"], CLASSES["tomato_soup_can"]
-    assert unevenness(box, on_top(0.115), CUP.cup_diameter) == pytest.approx(0.0, abs=1e-12)
-    assert unevenness(can, on_top(0.0505, x=0.033 - 0.0130), CUP.cup_diameter) == pytest.approx(
+    assert lip_flatness_deviation(box, on_top(0.115), CUP.cup_diameter) == pytest.approx(
         0.0, abs=1e-12
     )
+    assert lip_flatness_deviation(
+        can, on_top(0.0505, x=0.033 - 0.0130), CUP.cup_diameter
+    ) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_an_edge_does_not() -> None:
     """The rim of a can, and a face narrower than the cup."""
     assert (
-        unevenness(CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter)
+        lip_flatness_deviation(
+            CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter
+        )
         == math.inf
     )
     onto_side = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]]).T  # 28 mm deep
     narrow = RigidTransform(RotationMatrix(onto_side), [0.0, 0.0425, 0.0])
-    assert unevenness(CLASSES["gelatin_box"], narrow, 0.030) == math.inf
+    assert lip_flatness_deviation(CLASSES["gelatin_box"], narrow, 0.030) == math.inf
 
 
 def test_tilt_and_curvature_show_in_millimetres() -> None:
     """A plane tilted by a across a ring of diameter d: d * tan(a). A cylinder of radius r: r - sqrt(r^2 - (d / 2)^2)."""
-    found = unevenness(
+    found = lip_flatness_deviation(
         CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.cup_diameter
     )
     assert found == pytest.approx(CUP.cup_diameter * math.tan(math.radians(5)), rel=1e-6)
     side = RigidTransform(ALONG_MINUS_X, [0.033, 0.0, 0.0])
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
-    assert unevenness(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(
+    assert lip_flatness_deviation(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(
         sagitta, rel=0.1
     )  # of a prism of 32 sides
 
@@ -68,7 +77,7 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
                 x = np.eye(3)[(axis + 1) % 3]
                 R = RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
                 X = RigidTransform(R, -z * o.size[axis] / 2)
-                if unevenness(o, X, diameter) > CUP.unevenness:
+                if lip_flatness_deviation(o, X, diameter) > CUP.unevenness:
                     return False
         return True
 
@@ -82,26 +91,30 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
 def test_a_marker_cannot_be_held() -> None:
     side = RigidTransform(ALONG_MINUS_X, [0.009, 0.0, 0.0])
     for diameter in (0.010, 0.015, 0.025, 0.040):
-        assert unevenness(CLASSES["large_marker"], side, diameter) > CUP.unevenness
+        assert lip_flatness_deviation(CLASSES["large_marker"], side, diameter) > CUP.unevenness
 
 
 def test_the_pull() -> None:
-    assert CUP.pull == pytest.approx(0.8 * 101_325 * math.pi * 0.0125**2)
+    assert CUP.holding_force == pytest.approx(0.8 * 101_325 * math.pi * 0.0125**2)
 
 
 def test_shares_of_a_load_by_hand() -> None:
     zero = np.zeros(3)
-    assert CUP.load_ratio(np.array([0.0, 0.0, CUP.pull]), zero) == pytest.approx(1.0)
-    assert CUP.load_ratio(zero, np.array([0.0, CUP.pull * 0.0125 / 2, 0.0])) == pytest.approx(1.0)
-    assert CUP.load_ratio(np.array([CUP.friction * CUP.pull, 0.0, 0.0]), zero) == pytest.approx(1.0)
+    assert CUP.load_ratio(np.array([0.0, 0.0, CUP.holding_force]), zero) == pytest.approx(1.0)
+    assert CUP.load_ratio(
+        zero, np.array([0.0, CUP.holding_force * 0.0125 / 2, 0.0])
+    ) == pytest.approx(1.0)
+    assert CUP.load_ratio(
+        np.array([CUP.friction * CUP.holding_force, 0.0, 0.0]), zero
+    ) == pytest.approx(1.0)
     assert CUP.load_ratio(np.array([0.0, 0.0, -5.0]), zero) == 0.0, "pressed on"
     assert CUP.load_ratio(np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))) == pytest.approx(
-        np.array([10, 20]) / CUP.pull
+        np.array([10, 20]) / CUP.holding_force
     )
 
 
 def test_what_hangs_still_pulls_with_its_weight() -> None:
-    force, moment = carried_load(0.5, np.array([0.02, 0.0, 0.1]), np.zeros(3))
+    force, moment = payload_wrench(0.5, np.array([0.02, 0.0, 0.1]), np.zeros(3))
     assert force == pytest.approx([0.0, 0.0, 0.5 * GRAVITY])
     assert moment == pytest.approx([0.0, -0.02 * 0.5 * GRAVITY, 0.0])
 
@@ -112,36 +125,36 @@ def test_accelerations_that_a_grasp_bears() -> None:
     high = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.15]))
     assert 0 < high < low
     share = CUP.load_ratio(
-        *carried_load(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
+        *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
     )
     assert 0.8 / CUP.safety < share <= 1.001 / CUP.safety
-    assert CUP.max_acceleration(CUP.pull / GRAVITY, np.zeros(3)) == -1.0
+    assert CUP.max_acceleration(CUP.holding_force / GRAVITY, np.zeros(3)) == -1.0
 
 
 def test_grasps_begin_in_the_middle_of_the_top() -> None:
     gripper: Gripper = DEFAULT_CELL.gripper
     box = resting("cracker_box", xy=(0.1, -0.2))
-    found = gripper.grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
-    assert not isinstance(found, NoGrasp)
-    assert len(found) == SAMPLING.count
+    found = gripper.sample_grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
+    assert not isinstance(found, GraspFailure)
+    assert len(found) == SAMPLING.max_grasps
     assert found[0].p_TG == pytest.approx([0.1, -0.2, box.top_height])
     distances = [float(np.linalg.norm(grasp.p_TG - found[0].p_TG)) for grasp in found]
     assert (np.diff(distances) > -1e-9).all()
     assert found[0].payload.mass == box.object_class.mass
-    assert found[0].payload.acceleration >= found[-1].payload.acceleration >= 0.3
+    assert found[0].payload.max_acceleration >= found[-1].payload.max_acceleration >= 0.3
 
 
 def test_why_there_is_no_grasp() -> None:
     can = resting("tomato_soup_can")
     rim = CUP.model_copy(update={"cup_diameter": 0.08})
-    found = rim.grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
-    assert found == NoGrasp(GraspFailure.NO_SEAL, math.inf)
+    found = rim.sample_grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
+    assert found == GraspFailure(GraspFailureReason.NO_SEAL, math.inf)
     weak = CUP.model_copy(update={"vacuum": 0.1})
-    found = weak.grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
-    assert found == NoGrasp(GraspFailure.TOO_HEAVY, can.object_class.mass)
+    found = weak.sample_grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
+    assert found == GraspFailure(GraspFailureReason.TOO_HEAVY, can.object_class.mass)
 
 
 def test_it_seals_where_the_lip_is_even() -> None:
     can = CLASSES["tomato_soup_can"]
-    assert CUP.seals(can, on_top(0.0505))
-    assert not CUP.seals(can, on_top(0.0505, x=0.025))
+    assert CUP.can_attach(can, on_top(0.0505))
+    assert not CUP.can_attach(can, on_top(0.0505, x=0.025))

@@ -77,8 +77,8 @@ def test_the_arrays_belong_together(file: Path) -> None:
     middle = (q[2:] - q[:-2]) / (time[2:] - time[:-2])[:, None]
     assert np.abs(middle - v[1:-1]).max() < 0.15
     assert np.abs(torque).max() > 10
-    assert (np.abs(torque) <= [1.01 * link.torque for link in LINKS]).all()
-    assert (np.abs(v) <= [1.01 * link.speed for link in LINKS]).all()
+    assert (np.abs(torque) <= [1.01 * link.max_torque for link in LINKS]).all()
+    assert (np.abs(v) <= [1.01 * link.max_speed for link in LINKS]).all()
     switches = np.flatnonzero(np.diff(suction.astype(int)))
     assert len(switches) == 2, "on once, off once"
 

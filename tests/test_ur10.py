@@ -10,7 +10,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_clutter.cell.primitives import Rod
+from drake_clutter.cell.primitives import LinkPrimitive
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.ur_kinematics import (
     UR_JOINT_NAMES,
@@ -18,7 +18,7 @@ from drake_clutter.robots.ur_kinematics import (
     inverse_kinematics,
     jacobian,
 )
-from ur10 import BASE_OUTLINE, LINKS, ur10_sdf
+from ur10 import BASE_COLLISION_GEOMETRY, LINKS, ur10_sdf
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
 """Corners (V, 3), in 10 um, and triangles of each link in its frame: the meshes of ROS-Industrial's ur_description (BSD)."""
@@ -79,7 +79,7 @@ def test_every_inertia_is_physical(plant: MultibodyPlant) -> None:
         assert M_LLo_L.IsPhysicallyValid()
 
 
-def within(points: NDArray[np.float64], rod: Rod) -> NDArray[np.bool_]:
+def within(points: NDArray[np.float64], rod: LinkPrimitive) -> NDArray[np.bool_]:
     start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     return np.asarray(
@@ -87,7 +87,7 @@ def within(points: NDArray[np.float64], rod: Rod) -> NDArray[np.bool_]:
     )
 
 
-def left_uncovered(triangles: NDArray[np.float64], rods: tuple[Rod, ...]) -> int:
+def left_uncovered(triangles: NDArray[np.float64], rods: tuple[LinkPrimitive, ...]) -> int:
     """Of triangles (F, 3 corners, 3): a capsule that holds all corners of one holds it whole; the others are cut into four."""
     for _ in range(7):
         covered = np.any([within(triangles, rod).all(axis=1) for rod in rods], axis=0)
@@ -110,10 +110,10 @@ def test_the_capsules_cover_the_real_link(name: str) -> None:
     with np.load(OUTLINES) as outlines:
         triangles = outlines[f"{name}.corners"][outlines[f"{name}.triangles"]] * 1e-5
     rods = (
-        BASE_OUTLINE
+        BASE_COLLISION_GEOMETRY
         if name == "base"
-        else next(link.outline for link in LINKS if link.name == name)
+        else next(link.collision_geometry for link in LINKS if link.name == name)
     )
     assert left_uncovered(triangles, rods) == 0
-    thinner = tuple(Rod(rod.start, rod.end, rod.radius - 0.003) for rod in rods)
+    thinner = tuple(LinkPrimitive(rod.start, rod.end, rod.radius - 0.003) for rod in rods)
     assert left_uncovered(triangles, thinner) > 0, "no capsule is 3 mm thicker than it has to be"

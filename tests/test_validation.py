@@ -10,7 +10,7 @@ import pytest
 from pydantic import Field
 
 import drake_clutter
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.config import load_config
 from drake_clutter.files import InputError

@@ -9,7 +9,7 @@ from PIL import Image
 from pydrake.math import RollPitchYaw
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.commands.render_scene import render_scene
 from drake_clutter.files import InputError
@@ -32,10 +32,10 @@ def test_a_pose_is_roll_pitch_and_yaw(rpy_deg: tuple[float, float, float]) -> No
 
 @pytest.mark.parametrize("yaw", [0.0, 30.0, -45.0, 90.0])
 def test_a_camera_that_looks_straight_down_is_vertical_at_any_yaw(yaw: float) -> None:
-    assert Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(180.0, 0.0, yaw))).vertical
+    assert Camera(pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(180.0, 0.0, yaw))).is_vertical
     assert not Camera(
         pose=PoseSpec(translation=(0.1, 0.0, 1.6), rpy_deg=(179.0, 0.0, yaw))
-    ).vertical
+    ).is_vertical
 
 
 def test_a_pedestal_stands_upright_under_a_tilted_base() -> None:
@@ -50,8 +50,8 @@ def test_a_pedestal_stands_upright_under_a_tilted_base() -> None:
 
 def test_a_base_over_the_support_without_a_pedestal_is_not_in_it() -> None:
     over = "robot.base={translation: [-0.2, 0, 1.3], rpy_deg: [180, 0, 0]}"
-    assert cell_with(over).pedestal_in_support
-    assert not cell_with(over, "robot.pedestal_side=0").pedestal_in_support
+    assert cell_with(over).pedestal_overlaps_support
+    assert not cell_with(over, "robot.pedestal_side=0").pedestal_overlaps_support
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_whether_a_turned_pedestal_stands_in_the_support(
     x: float, y: float, yaw: float, stands_in: bool
 ) -> None:
     base = f"robot.base={{translation: [{x}, {y}, 0.3], rpy_deg: [0, 0, {yaw}]}}"
-    assert cell_with(base).pedestal_in_support is stands_in
+    assert cell_with(base).pedestal_overlaps_support is stands_in
 
 
 def test_which_camera_is_the_first_counts() -> None:
@@ -85,8 +85,8 @@ def test_which_camera_is_the_first_counts() -> None:
 
 
 def test_a_camera_must_be_near_enough_to_see_the_support() -> None:
-    assert Camera.over(9.9, fov_y_deg=10.0).sees(TRAY)
-    assert not Camera.over(10.1, fov_y_deg=10.0).sees(TRAY)
+    assert Camera.overhead(9.9, fov_y_deg=10.0).sees_support(TRAY)
+    assert not Camera.overhead(10.1, fov_y_deg=10.0).sees_support(TRAY)
 
 
 def test_depth_beyond_sixteen_bits_is_none(tmp_path: Path) -> None:

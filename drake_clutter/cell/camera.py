@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell.pinhole import FARTHEST, NEAREST, Floats, Pinhole
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pinhole import MAX_DEPTH, MIN_DEPTH, Floats, Pinhole
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.support import Support
 from drake_clutter.validation import Flag, InRange, StrictModel
 
@@ -21,7 +21,7 @@ D435_FOV_Y_DEG = 42.5
 """Vertical field of view of the color stream of an Intel RealSense D435 [deg] (data sheet)."""
 D435_FOCAL_LENGTH = 480 / 2 / math.tan(math.radians(D435_FOV_Y_DEG) / 2)
 """Its focal length at 640 x 480 [px]."""
-_PARALLEL = 1e-3
+_MIN_RAY_SLOPE = 1e-3
 """A ray that falls by less, for 1 m along the optical axis, is taken to be parallel to the floor [m]."""
 
 
@@ -60,7 +60,7 @@ class Camera(StrictModel):
     depth_noise: Flag = True
 
     @staticmethod
-    def over(altitude: float, **fields: Any) -> "Camera":
+    def overhead(altitude: float, **fields: Any) -> "Camera":
         """Return a camera above the support's center that looks straight down, x along the support's x.
 
         Args:
@@ -91,7 +91,7 @@ class Camera(StrictModel):
         return self.width / 2 - 1, self.height / 2 - 1
 
     @property
-    def vertical(self) -> bool:
+    def is_vertical(self) -> bool:
         """Whether the optical axis is."""
         return self.pinhole.X_CT[8:10] == (0.0, 0.0)
 
@@ -135,7 +135,8 @@ class Camera(StrictModel):
         y = (pixels[..., 1] - v0) * depth / self.focal_length
         R_TC, p_TC = self.X_TC.rotation().matrix().tolist(), self.X_TC.translation().tolist()
         return np.stack(
-            [_along(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)], axis=-1
+            [_rotate_component(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)],
+            axis=-1,
         )
 
     def rays(self, pixels: NDArray[Any]) -> Floats:
@@ -167,18 +168,18 @@ class Camera(StrictModel):
         corners = np.array(
             [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, height)]
         )
-        if (self.depth(corners) < NEAREST).any():
+        if (self.depth(corners) < MIN_DEPTH).any():
             return None
         pixels = self.project(corners)
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         return (low + high) / 2, float((high - low).max())
 
-    def sees(self, support: Support) -> bool:
+    def sees_support(self, support: Support) -> bool:
         """Return whether any part of the support's floor is in the image, and near enough."""
         x, y = (np.linspace(-half, half, 41) for half in support.half_size)
         p_T = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
         depth = self.depth(p_T)
-        p_T = p_T[(depth > NEAREST) & (depth < FARTHEST)]
+        p_T = p_T[(depth > MIN_DEPTH) & (depth < MAX_DEPTH)]
         if self.X_TC.translation()[2] <= 0 or not len(p_T):
             return False
         pixels = self.project(p_T)
@@ -187,7 +188,7 @@ class Camera(StrictModel):
         )
 
 
-def _along(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
+def _rotate_component(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Return the sum of components by a row of a rotation.
 
     What counts for nothing is left out, also where it is infinite.
@@ -220,7 +221,7 @@ def _floor_depth(camera: Camera) -> NDArray[np.float32]:
     down = rays @ camera.X_TC.rotation().matrix()[2]
     height = camera.X_TC.translation()[2]
     depth = np.full(down.shape, np.inf)
-    np.divide(-height, down, out=depth, where=down * height < -_PARALLEL * abs(height))
+    np.divide(-height, down, out=depth, where=down * height < -_MIN_RAY_SLOPE * abs(height))
     found = depth.astype(np.float32)
     found.setflags(write=False)
     return found

@@ -8,7 +8,7 @@ Sources: see `suction`; the masses of tube and cup are assumed.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.primitives import Rod, sdf_link, sdf_pose
+from drake_clutter.cell.primitives import LinkPrimitive, sdf_link, sdf_pose
 
 EPICK_LENGTH = 0.1023
 EPICK_RADIUS = 0.044
@@ -17,9 +17,9 @@ EPICK_MASS = 0.71
 TUBE_RADIUS, TUBE_MASS, CUP_MASS = 0.010, 0.05, 0.02
 """m, kg, kg."""
 _BODY, _METAL, _RUBBER = "0.20 0.21 0.23 1", "0.70 0.71 0.73 1", "0.12 0.12 0.13 1"
-_CRITICAL = 2.0
+_DAMPING_RATIO = 2.0
 """Damping of the bellows, in units of what a load of `_LOAD` would need not to swing."""
-_LOAD = 0.5
+_REFERENCE_LOAD = 0.5
 """kg."""
 
 
@@ -42,10 +42,10 @@ def epick_sdf(
         stiffness: Of that joint [N/m].
         compliant: False for a cup that is fixed to the body, as planning uses it.
     """
-    body = Rod((0.0, 0.0, 0.0), (0.0, 0.0, EPICK_LENGTH), EPICK_RADIUS, _BODY)
+    body = LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, EPICK_LENGTH), EPICK_RADIUS, _BODY)
     tube = EPICK_LENGTH + extension
-    stem = Rod((0.0, 0.0, EPICK_LENGTH), (0.0, 0.0, tube), TUBE_RADIUS, _METAL)
-    bellows = Rod((0.0, 0.0, -cup_length), (0.0, 0.0, 0.0), cup_diameter / 2, _RUBBER)
+    stem = LinkPrimitive((0.0, 0.0, EPICK_LENGTH), (0.0, 0.0, tube), TUBE_RADIUS, _METAL)
+    bellows = LinkPrimitive((0.0, 0.0, -cup_length), (0.0, 0.0, 0.0), cup_diameter / 2, _RUBBER)
     rods = (body, stem) if extension else (body,)
     mass = EPICK_MASS + TUBE_MASS
     moment = EPICK_MASS * EPICK_LENGTH / 2 + TUBE_MASS * (EPICK_LENGTH + tube) / 2
@@ -57,7 +57,7 @@ def epick_sdf(
     cup_pose = "\n      " + sdf_pose(p_FG, Rotation.identity(), "body")
     cup_link = sdf_link("cup", cup_pose, CUP_MASS, p_GCm, cup, cup, "cylinder")
     lower = f"<lower>{-stroke:g}</lower>"
-    damping = f"<damping>{_CRITICAL * 2 * (stiffness * _LOAD) ** 0.5:.6g}</damping>"
+    damping = f"<damping>{_DAMPING_RATIO * 2 * (stiffness * _REFERENCE_LOAD) ** 0.5:.6g}</damping>"
     axis = f"""
       <axis>
         <xyz>0 0 1</xyz>

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import model_validator
 
 from drake_clutter.cell.model_file import MaybeModelFile
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.validation import Fraction, InRange, NonEmptyText, StrictModel, allowed_error
 
 Extent = Annotated[float, InRange(0.001, 10.0)]

@@ -25,17 +25,17 @@ class Payload:
     Attributes:
         mass: [kg].
         p_GCm: Center of mass, rounded, so that plants can be kept [m]. Shape (3,).
-        acceleration: Greatest of G, in any direction; infinite without a load [m/s^2].
+        max_acceleration: Greatest of G, in any direction; infinite without a load [m/s^2].
     """
 
     mass: float = 0.0
     p_GCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    acceleration: float = math.inf
+    max_acceleration: float = math.inf
 
     @property
-    def along_axis(self) -> float:
+    def max_axis_acceleration(self) -> float:
         """Greatest acceleration along each axis, so that the vector is within the limit [m/s^2]."""
-        return self.acceleration / math.sqrt(3)
+        return self.max_acceleration / math.sqrt(3)
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Grasp:
     payload: Payload
 
 
-class GraspFailure(Enum):
+class GraspFailureReason(Enum):
     """Why a gripper offers no grasp."""
 
     NO_SEAL = "no seal"
@@ -59,16 +59,16 @@ class GraspFailure(Enum):
 
 
 @dataclass(frozen=True)
-class NoGrasp:
+class GraspFailure:
     """No grasp, and the number behind the reason.
 
     Attributes:
         reason: Of the grasp that came furthest.
-        number: Deviation from a plane under the best grasp [m], or the object's mass [kg].
+        value: Deviation from a plane under the best grasp [m], or the object's mass [kg].
     """
 
-    reason: GraspFailure
-    number: float
+    reason: GraspFailureReason
+    value: float
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class GraspSampling:
 
     Attributes:
         spacing: Between neighboring points of a face [m].
-        count: Largest number of grasps.
-        least_acceleration: That a grasp must bear [m/s^2].
+        max_grasps: Largest number of grasps.
+        min_payload_acceleration: That a grasp must bear [m/s^2].
     """
 
     spacing: float
-    count: int
-    least_acceleration: float
+    max_grasps: int
+    min_payload_acceleration: float
 
 
 class Gripper(Protocol):
@@ -112,15 +112,15 @@ class Gripper(Protocol):
             compliant: False for a rigid model, as planning uses it.
         """
 
-    def grasps(
+    def sample_grasps(
         self,
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[Grasp, ...] | NoGrasp:
+    ) -> tuple[Grasp, ...] | GraspFailure:
         """Return where it grasps an object from above, the nearest to its middle first."""
 
-    def seals(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether it takes hold of an object at a pose."""
 
     def max_acceleration(self, mass: float, p_GCm: Floats) -> float:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-NEAREST = 0.01
+MIN_DEPTH = 0.01
 """What is not so far before the camera is out of its sight [m]."""
-FARTHEST = 10.0
+MAX_DEPTH = 10.0
 """What is farther has no depth in a rendered image [m]."""
 
 
@@ -38,7 +38,7 @@ class Pinhole(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def in_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
+def point_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
     """Return a point of T [m] in C [m]."""
     X = camera.X_CT
     return (
@@ -49,7 +49,7 @@ def in_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def turned_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
+def vector_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
     """Return a vector of T in C."""
     X = camera.X_CT
     return (
@@ -79,10 +79,10 @@ def backproject(camera, u, v, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def pose_in_camera(camera, R, p):  # type: ignore[no-untyped-def]
+def pose_to_camera(camera, R, p):  # type: ignore[no-untyped-def]
     """Return R_CO (3, 3) and p_CO [m] of a pose R_TO (3, 3), p_TO (3,) [m]."""
     R_CO = np.empty((3, 3))
     for column in range(3):
-        x, y, z = turned_to_camera(camera, R[0, column], R[1, column], R[2, column])
+        x, y, z = vector_to_camera(camera, R[0, column], R[1, column], R[2, column])
         R_CO[0, column], R_CO[1, column], R_CO[2, column] = x, y, z
-    return R_CO, in_camera(camera, p[0], p[1], p[2])
+    return R_CO, point_to_camera(camera, p[0], p[1], p[2])

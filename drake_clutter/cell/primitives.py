@@ -12,19 +12,19 @@ Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Rod:
+class LinkPrimitive:
     """A cylinder, or with round ends a capsule.
 
     Attributes:
         start, end: (3,) m, ends of its axis, in the link's frame.
         radius: m.
-        colour: of a visual one.
+        color: of a visual one.
     """
 
     start: Point
     end: Point
     radius: float
-    colour: str = ""
+    color: str = ""
 
 
 def sdf_pose(p: Floats, rotation: Rotation, relative_to: str = "") -> str:
@@ -34,29 +34,32 @@ def sdf_pose(p: Floats, rotation: Rotation, relative_to: str = "") -> str:
     return f'<pose rotation_format="quat_xyzw"{frame}>{numbers}</pose>'
 
 
-def sdf_geometry(kind: str, name: str, rod: Rod, shape: str) -> str:
+def sdf_geometry(element: str, name: str, primitive: LinkPrimitive, shape: str) -> str:
     """A visual or collision element: the rod as a cylinder or capsule."""
-    start, end = np.array(rod.start), np.array(rod.end)
+    start, end = np.array(primitive.start), np.array(primitive.end)
     length = math.dist(start, end)
     turn, _ = Rotation.align_vectors((end - start)[None], np.array([[0.0, 0.0, 1.0]]))
     material = (
-        f"\n        <material><diffuse>{rod.colour}</diffuse></material>"
-        if kind == "visual" and rod.colour
+        f"\n        <material><diffuse>{primitive.color}</diffuse></material>"
+        if element == "visual" and primitive.color
         else ""
     )
     return f"""
-      <{kind} name="{name}">
+      <{element} name="{name}">
         {sdf_pose((start + end) / 2, turn)}
-        <geometry><{shape}><radius>{rod.radius:.6g}</radius><length>{length:.6g}</length></{shape}></geometry>{material}
-      </{kind}>"""
+        <geometry><{shape}><radius>{primitive.radius:.6g}</radius><length>{length:.6g}</length></{shape}></geometry>{material}
+      </{element}>"""
 
 
-def sdf_inertial(mass: float, p_LCm: Floats, spine: Rod) -> str:
+def sdf_inertial(mass: float, p_LCm: Floats, primitive: LinkPrimitive) -> str:
     """Of a solid cylinder of the mass that is as long and as thick as the link's longest part, about the centre of mass."""
-    start, end = np.array(spine.start), np.array(spine.end)
+    start, end = np.array(primitive.start), np.array(primitive.end)
     length = max(float(np.linalg.norm(end - start)), 1e-3)
     axis = (end - start) / length
-    along, across = mass * spine.radius**2 / 2, mass * (3 * spine.radius**2 + length**2) / 12
+    along, across = (
+        mass * primitive.radius**2 / 2,
+        mass * (3 * primitive.radius**2 + length**2) / 12,
+    )
     tensor = across * np.eye(3) + (along - across) * np.outer(axis, axis)
     parts = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     entries = "".join(
@@ -75,16 +78,20 @@ def sdf_link(
     pose: str,
     mass: float,
     p_LCm: Floats,
-    outline: tuple[Rod, ...],
-    looks: tuple[Rod, ...],
+    collision_geometry: tuple[LinkPrimitive, ...],
+    visual_geometry: tuple[LinkPrimitive, ...],
     shape: str = "capsule",
 ) -> str:
     """A link; its outline consists of capsules or cylinders, the inertia is that of its longest visible part."""
-    spine = max(looks, key=lambda rod: math.dist(rod.start, rod.end))
+    spine = max(visual_geometry, key=lambda rod: math.dist(rod.start, rod.end))
     shapes = [
-        sdf_geometry("collision", f"outline_{k}", rod, shape) for k, rod in enumerate(outline)
+        sdf_geometry("collision", f"outline_{k}", rod, shape)
+        for k, rod in enumerate(collision_geometry)
     ]
-    shapes += [sdf_geometry("visual", f"part_{k}", rod, "cylinder") for k, rod in enumerate(looks)]
+    shapes += [
+        sdf_geometry("visual", f"part_{k}", rod, "cylinder")
+        for k, rod in enumerate(visual_geometry)
+    ]
     return f"""
     <link name="{name}">{pose}{sdf_inertial(mass, p_LCm, spine)}{"".join(shapes)}
     </link>"""

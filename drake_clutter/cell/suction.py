@@ -18,22 +18,28 @@ from scipy.spatial import ConvexHull
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
-from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, NoGrasp, Payload
+from drake_clutter.cell.gripper import (
+    Grasp,
+    GraspFailure,
+    GraspFailureReason,
+    GraspSampling,
+    Payload,
+)
 from drake_clutter.validation import InRange, StrictModel
 
 Floats = NDArray[np.float64]
 
-ATMOSPHERE = 101_325.0
+ATMOSPHERIC_PRESSURE = 101_325.0
 """Pa."""
 GRAVITY = 9.81
 """m/s^2."""
-_RING = 24
+_NUM_LIP_POINTS = 24
 """Points of the lip that are looked at."""
-_STANDOFF = 0.05
+_RAY_STANDOFF = 0.05
 """m above the lip, from which is looked."""
-_DOWN = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+_DOWNWARD_ROTATION = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 """R_TG of a cup that points down."""
-_DIRECTIONS = np.array(
+_ACCELERATION_DIRECTIONS = np.array(
     [
         [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)]
         for e in (-0.8, 0.0, 0.8)
@@ -71,9 +77,9 @@ class SuctionGripper(StrictModel):
     safety: Annotated[float, InRange(1.0, 100.0)] = 1.5
 
     @property
-    def pull(self) -> float:
+    def holding_force(self) -> float:
         """Force with which the atmosphere presses the lip on [N]."""
-        return self.vacuum * ATMOSPHERE * math.pi * self.cup_diameter**2 / 4
+        return self.vacuum * ATMOSPHERIC_PRESSURE * math.pi * self.cup_diameter**2 / 4
 
     @property
     def length(self) -> float:
@@ -106,47 +112,51 @@ class SuctionGripper(StrictModel):
             compliant=compliant,
         )
 
-    def grasps(
+    def sample_grasps(
         self,
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[Grasp, ...] | NoGrasp:
+    ) -> tuple[Grasp, ...] | GraspFailure:
         """Return where the cup seals on an object's top and can hold, see `Gripper`."""
         corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
         corners_T = corners_T + X_TO.translation()
         lower, upper = corners_T.min(axis=0), corners_T.max(axis=0)
         found, least = list[Grasp](), math.inf
-        for x, y in _points(lower[:2], upper[:2], sampling.spacing):
-            X_TG = RigidTransform(_DOWN, [x, y, upper[2]])
-            deviation = unevenness(object_class, X_TO.InvertAndCompose(X_TG), self.cup_diameter)
+        for x, y in _grid_points(lower[:2], upper[:2], sampling.spacing):
+            X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2]])
+            deviation = lip_flatness_deviation(
+                object_class, X_TO.InvertAndCompose(X_TG), self.cup_diameter
+            )
             least = min(least, deviation)
             if deviation > self.unevenness:
                 continue
             p_GCm = X_TG.rotation().inverse() @ (X_TO.translation() - X_TG.translation())
             acceleration = self.max_acceleration(object_class.mass, p_GCm)
-            if acceleration >= sampling.least_acceleration:
+            if acceleration >= sampling.min_payload_acceleration:
                 # How the load hangs to the side depends on the yaw; its depth below G does not.
                 p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
                 payload = Payload(object_class.mass, p_GCm, round(acceleration, 1))
                 found.append(Grasp(X_TG.translation(), payload))
-                if len(found) == sampling.count:
+                if len(found) == sampling.max_grasps:
                     break
         if found:
             return tuple(found)
         if least > self.unevenness:
-            return NoGrasp(GraspFailure.NO_SEAL, least)
-        return NoGrasp(GraspFailure.TOO_HEAVY, object_class.mass)
+            return GraspFailure(GraspFailureReason.NO_SEAL, least)
+        return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
 
-    def seals(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether the lip follows the surface at a pose."""
-        return unevenness(object_class, X_OG, self.cup_diameter) <= self.unevenness
+        return lip_flatness_deviation(object_class, X_OG, self.cup_diameter) <= self.unevenness
 
     def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
         """Return the acceleration [m/s^2] of a cup that points down, see `Gripper`."""
 
         def bears(accelerations: Floats) -> NDArray[np.bool_]:
-            load = carried_load(mass, p_GCm, accelerations[:, None, None] * _DIRECTIONS)
+            load = payload_wrench(
+                mass, p_GCm, accelerations[:, None, None] * _ACCELERATION_DIRECTIONS
+            )
             return np.asarray(self.load_ratio(*load).max(axis=1) * self.safety <= 1)
 
         low, high = 0.0, 50.0
@@ -162,14 +172,14 @@ class SuctionGripper(StrictModel):
         """Return the larger of what opens the lip and what makes it slide, see `Gripper`."""
         radius = self.cup_diameter / 2
         bending = np.hypot(moment[..., 0], moment[..., 1])
-        opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / self.pull
-        pressed = np.maximum(self.pull - force[..., 2], 1e-9)
+        opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / self.holding_force
+        pressed = np.maximum(self.holding_force - force[..., 2], 1e-9)
         # A thin ring that turns in place slides with its whole circumference at its radius.
         tangential = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius)
         return np.asarray(np.maximum(opening, tangential / (self.friction * pressed)))
 
 
-def _points(lower: Floats, upper: Floats, spacing: float) -> Floats:
+def _grid_points(lower: Floats, upper: Floats, spacing: float) -> Floats:
     """Return points of a rectangle, (n, 2), the nearest to its middle first."""
     steps = [np.arange(0, (hi - lo) / 2, spacing) for lo, hi in zip(lower, upper, strict=True)]
     x, y = np.meshgrid(*(np.concatenate([-s[:0:-1], s]) for s in steps), indexing="ij")
@@ -180,12 +190,12 @@ def _points(lower: Floats, upper: Floats, spacing: float) -> Floats:
 
 
 @lru_cache(maxsize=256)
-def _half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
+def _piece_half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
     """(F, 4) of each convex piece: it is where n . p + d <= 0."""
     return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
 
 
-def surface_under_lip(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
+def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
     """How far below the lip an object's surface is, along the cup's axis, at points around the lip, m; infinite in the air.
 
     Args:
@@ -194,12 +204,12 @@ def surface_under_lip(object_class: ObjectClass, X_OG: RigidTransform, diameter:
         diameter: m, of the lip.
     """
     R_OG = X_OG.rotation().matrix()
-    angle = np.arange(_RING) * (2 * np.pi / _RING)
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_RING)]) * diameter / 2
-    p = (ring - np.array([0.0, 0.0, _STANDOFF])) @ R_OG.T + X_OG.translation()
+    angle = np.arange(_NUM_LIP_POINTS) * (2 * np.pi / _NUM_LIP_POINTS)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_NUM_LIP_POINTS)]) * diameter / 2
+    p = (ring - np.array([0.0, 0.0, _RAY_STANDOFF])) @ R_OG.T + X_OG.translation()
     along = R_OG[:, 2]
-    depth = np.full(_RING, np.inf)
-    for half_spaces in _half_spaces(object_class):
+    depth = np.full(_NUM_LIP_POINTS, np.inf)
+    for half_spaces in _piece_half_spaces(object_class):
         steep, outside = half_spaces[:, :3] @ along, p @ half_spaces[:, :3].T + half_spaces[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -outside / steep
@@ -207,19 +217,21 @@ def surface_under_lip(object_class: ObjectClass, X_OG: RigidTransform, diameter:
         leaves = np.where(steep > 1e-9, crossing, np.inf).min(axis=1)
         beside = (outside[:, np.abs(steep) <= 1e-9] > 0).any(axis=1)
         depth = np.where((enters <= leaves) & ~beside, np.minimum(depth, enters), depth)
-    return depth - _STANDOFF
+    return depth - _RAY_STANDOFF
 
 
-def unevenness(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> float:
+def lip_flatness_deviation(
+    object_class: ObjectClass, X_OG: RigidTransform, diameter: float
+) -> float:
     """How far, in m, the surface under the lip leaves a plane across the cup; infinite if the lip is partly in the air.
 
     Tilt, curvature, edges and gaps all show as this one number. Arguments: see `surface_under_lip`.
     """
-    depth = surface_under_lip(object_class, X_OG, diameter)
+    depth = lip_surface_profile(object_class, X_OG, diameter)
     return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
 
 
-def carried_load(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
+def payload_wrench(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
     """Force (..., 3) N and moment (..., 3) N m on the lip of a cup that points down, from a body that it carries.
 
     Args:

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.fixture import Fixture
-from drake_clutter.cell.pose import PoseSpec
-from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.pose_spec import PoseSpec
+from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.support import Support
 from drake_clutter.resources import resource_path
@@ -29,7 +29,7 @@ GripperSpec = SuctionGripper
 """Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
 `Annotated[SuctionGripper | Other, Field(discriminator="kind")]`; each satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
-_RESERVED = ("tray", "camera", "pedestal", "robot", "gripper")
+_RESERVED_NAMES = ("tray", "camera", "pedestal", "robot", "gripper")
 """Names of what stands in a cell besides fixtures."""
 
 
@@ -52,8 +52,8 @@ class WorkCell(StrictModel):
 
     @field_validator("fixtures")
     @classmethod
-    def _names_differ(cls, fixtures: tuple[Fixture, ...], info: ValidationInfo) -> Any:
-        taken = [*_RESERVED, *info.data.get("cameras", ())]
+    def _check_fixture_names(cls, fixtures: tuple[Fixture, ...], info: ValidationInfo) -> Any:
+        taken = [*_RESERVED_NAMES, *info.data.get("cameras", ())]
         for fixture in fixtures:
             if fixture.name in taken:
                 what = f"names that differ, also from {', '.join(taken)}"
@@ -63,17 +63,15 @@ class WorkCell(StrictModel):
 
     @field_validator("cameras")
     @classmethod
-    def _first_sees_support(
-        cls, cameras: dict[str, Camera], info: ValidationInfo
-    ) -> dict[str, Camera]:
+    def _check_cameras(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
         if unfit := [name for name in cameras if not name.isidentifier()]:
             raise rejected_error(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
-        if taken := [name for name in cameras if name in _RESERVED and name != "camera"]:
+        if taken := [name for name in cameras if name in _RESERVED_NAMES and name != "camera"]:
             raise rejected_error(
-                f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED)}"
+                f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED_NAMES)}"
             )
         name, camera = next(iter(cameras.items()))
-        if "support" in info.data and not camera.sees(info.data["support"]):
+        if "support" in info.data and not camera.sees_support(info.data["support"]):
             raise rejected_error(
                 f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image"
             )
@@ -99,21 +97,21 @@ class WorkCell(StrictModel):
         height = z - self.table_height
         if not side or height <= 0.01:
             return None
-        X_TS = RigidTransform(self._upright.rotation(), [x, y, height / 2 + self.table_height])
+        X_TS = RigidTransform(self._upright_base.rotation(), [x, y, height / 2 + self.table_height])
         return X_TS, (side, side, height - 0.002)
 
     @property
-    def _upright(self) -> RigidTransform:
+    def _upright_base(self) -> RigidTransform:
         """The turn of the base about the vertical alone."""
         return PoseSpec(rpy_deg=(0.0, 0.0, self.robot.base.rpy_deg[2])).transform
 
     @property
-    def pedestal_in_support(self) -> bool:
+    def pedestal_overlaps_support(self) -> bool:
         """Whether the pedestal, or the base if it has none, would stand in the support."""
         side, p_TB = self.robot.pedestal_side, self.robot.X_TB.translation()
         if not side and p_TB[2] > self.support.wall_height:
             return False  # from a ceiling, or a wall
-        edges = self._upright.rotation().matrix()[:2, :2].T
+        edges = self._upright_base.rotation().matrix()[:2, :2].T
         support = self.support.half_size + self.support.wall_thickness
         axes = np.vstack([np.eye(2), edges])  # across each edge of either
         reach = np.abs(axes) @ support + np.abs(axes @ edges.T).sum(axis=1) * side / 2
@@ -153,23 +151,25 @@ def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
         InputError: The file, the field and what is allowed.
     """
     given = read_yaml(path, "a mapping with robot, gripper, support and cameras")
-    cell = validate(WorkCell, _with_paths(given, path.parent), str(path))
+    cell = validate(WorkCell, _with_absolute_paths(given, path.parent), str(path))
     return load_config_as(cell, settings=settings)
 
 
-def _with_paths(given: Any, folder: Path) -> Any:
+def _with_absolute_paths(given: Any, folder: Path) -> Any:
     """Return the document with its models' paths made absolute, as they are relative to the cell's file."""
     if not isinstance(given, dict):
         return given
-    made = dict(given)
+    absolute = dict(given)
     if isinstance(robot := given.get("robot"), dict):
-        made["robot"] = _with_path(robot, folder)
+        absolute["robot"] = _with_absolute_path(robot, folder)
     if isinstance(fixtures := given.get("fixtures"), list):
-        made["fixtures"] = [_with_path(f, folder) if isinstance(f, dict) else f for f in fixtures]
-    return made
+        absolute["fixtures"] = [
+            _with_absolute_path(f, folder) if isinstance(f, dict) else f for f in fixtures
+        ]
+    return absolute
 
 
-def _with_path(part: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _with_absolute_path(part: dict[str, Any], folder: Path) -> dict[str, Any]:
     model = part.get("model")
     if isinstance(model, str) and model and not model.startswith("package://"):
         return {**part, "model": str((folder / model).resolve())}

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import field_validator
 
 from drake_clutter.catalog import load_catalog
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.files import InputError, prepare_output_directory, write_json, write_text

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_clutter.cell.pinhole import Floats, Pinhole, pose_in_camera, project
+from drake_clutter.cell.pinhole import Floats, Pinhole, pose_to_camera, project
 
 DEPTH_TOLERANCE = 0.006
 """m along the optical axis, within which what is seen agrees with a pose."""
@@ -144,7 +144,7 @@ def ray_row(R, v, camera):  # type: ignore[no-untyped-def]
 def pose_consistency(cylinder, half, R, p, view, rays, within):  # type: ignore[no-untyped-def]
     """0 to 1, how well a pose R (3, 3), p (3,) m explains what is seen, from about as many `rays` as are asked for."""
     camera, window = view.camera, view.window
-    R, p = pose_in_camera(camera, R, p)
+    R, p = pose_to_camera(camera, R, p)
     top, bottom, left, right = image_bounds(half, R, p, view.depth.shape, camera)
     if top == bottom or left == right:
         return 0.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
-from drake_clutter.cell.pinhole import pose_in_camera
+from drake_clutter.cell.pinhole import pose_to_camera
 from drake_clutter.perception.pose_score import (
     camera_position_in_object,
     cast_ray_row,
@@ -77,7 +77,7 @@ def _compare_with_depth(cylinder, half, R, p, depth, camera):  # type: ignore[no
         First row and column of a rectangle that holds it; (rows, columns) int8 what its pixels say,
         and float32 how far away the pose is there, m; how many pixels it covers.
     """
-    R, p = pose_in_camera(camera, R, p)
+    R, p = pose_to_camera(camera, R, p)
     top, bottom, left, right = image_bounds(half, R, p, depth.shape, camera)
     said, far = (
         np.zeros((bottom - top, right - left), np.int8),

@@ -8,7 +8,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-from drake_clutter.cell.gripper import Grasp, GraspSampling, Gripper, NoGrasp
+from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, Gripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.pick_place_plan import (
@@ -92,7 +92,7 @@ class PickPlacePlanner:
         grasps = self._grasps(picked)
         if isinstance(grasps, PlanningFailure):
             return grasps
-        if self.cell.pedestal_in_support:
+        if self.cell.pedestal_overlaps_support:
             return PlanningFailure(PlanningFailureReason.IN_COLLISION, "pedestal and tray")
         scene = self.collision_model(objects, occluded)
         if hit := scene.distances_below(self.tool.robot.home, self.config.min_distance):
@@ -135,10 +135,10 @@ class PickPlacePlanner:
         sampling = GraspSampling(
             config.grasp_spacing, config.max_grasps, config.min_payload_acceleration
         )
-        found = self._gripper.grasps(object_class, rigid_transform(picked.X_TO), sampling)
-        if isinstance(found, NoGrasp):
+        found = self._gripper.sample_grasps(object_class, rigid_transform(picked.X_TO), sampling)
+        if isinstance(found, GraspFailure):
             return PlanningFailure(
-                PlanningFailureReason(found.reason.value), picked.name, found.number
+                PlanningFailureReason(found.reason.value), picked.name, found.value
             )
         return found
 

@@ -459,7 +459,10 @@ class PickPlaceSearch:
             return found
 
         upright = segment.name != "approach", segment.name != "retreat"  # at home it may go any way
-        acceleration, jacobian = payload.along_axis, self._collision_model.gripper_jacobian
+        acceleration, jacobian = (
+            payload.max_axis_acceleration,
+            self._collision_model.gripper_jacobian,
+        )
         ends_of = segment.trajectory, self._robot, upright, carried
         quick = optimize_trajectory(
             TrajectoryOptimizationProblem(

@@ -130,7 +130,7 @@ def score_base_positions(
             update={"translation": (x, y, cell.robot.base.translation[2])}
         )
         moved = cell.model_copy(update={"robot": cell.robot.model_copy(update={"base": base})})
-        if moved.pedestal_in_support:
+        if moved.pedestal_overlaps_support:
             found.append((0.0, 0.0))
             continue
         reached = ReachabilityAnalysis(moved).compute_map((0.05, 0.25, 0.45), 0.15)

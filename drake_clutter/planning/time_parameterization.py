@@ -123,9 +123,9 @@ def parameterize_time_optimal(
         fastest = ((LIMIT_FRACTION * robot.velocity_limits / np.abs(slope)) ** 2).min(axis=1)
     limit = np.broadcast_to(LIMIT_FRACTION * robot.acceleration_limits, slope.shape)
     rows = [(slope, curve, -limit, limit)]
-    if math.isfinite(payload.acceleration):
+    if math.isfinite(payload.max_acceleration):
         p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
-        limit = np.full(p_BCm.shape, payload.along_axis)
+        limit = np.full(p_BCm.shape, payload.max_axis_acceleration)
         of_load = np.gradient(p_BCm, grid, axis=0, edge_order=2)
         rows.append((of_load, np.gradient(of_load, grid, axis=0, edge_order=2), -limit, limit))
 
@@ -193,10 +193,10 @@ def scale_to_limits(trajectory: Trajectory, cell: WorkCell, payload: Payload) ->
     square = (np.abs(v) / robot.velocity_limits / LIMIT_FRACTION).max() ** 2
     square = max(square, (np.abs(a) / robot.acceleration_limits / LIMIT_FRACTION).max())
     square = max(square, (np.abs(moving) / room).max())
-    if math.isfinite(payload.acceleration):
+    if math.isfinite(payload.max_acceleration):
         p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
         of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
-        square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.acceleration)
+        square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.max_acceleration)
     by = max(1.0, math.sqrt(square))
     return PathParameterizedTrajectory(
         trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]])

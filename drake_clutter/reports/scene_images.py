@@ -220,7 +220,7 @@ class SceneRenderer:
 def _camera_above(support: Support, size: tuple[int, int] = OVERHEAD_SIZE) -> Camera:
     """A camera for pictures of a size from above a support."""
     width, height = (_OVERSAMPLING * pixels for pixels in size)
-    return Camera.over(
+    return Camera.overhead(
         _CAMERA_HEIGHT * max(support.size) / _REFERENCE_SIDE,
         width=width,
         height=height,

@@ -18,7 +18,7 @@ from pydrake.multibody.tree import (
     RigidBody,
 )
 
-from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.files import InputError
 from drake_clutter.robots.model_parsing import (
     find_mimic_joint,

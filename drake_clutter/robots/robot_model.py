@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell.robot import RobotSpec
+from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.files import InputError
 from drake_clutter.robots import ur_kinematics as kinematics
 from drake_clutter.robots.inverse_kinematics import InverseKinematics, UrInverseKinematics

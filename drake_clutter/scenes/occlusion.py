@@ -75,7 +75,7 @@ def occluded_boxes(
         for o, z in zip(known_objects, lower, strict=True)
         if z > _MIN_HIDDEN_HEIGHT
     ]
-    behind = [] if observation.camera.vertical else _boxes_behind(known_objects, observation)
+    behind = [] if observation.camera.is_vertical else _boxes_behind(known_objects, observation)
     return (*shadows, *behind, *_unidentified_boxes(known_objects, observation, empty_depth))
 
 
@@ -153,7 +153,7 @@ def _unidentified_boxes(
         points = p_TP[part == k]
         if len(points) >= _MIN_POINTS and np.ptp(points[:, :2], axis=0).min() > 0:
             top = float(np.quantile(points[:, 2], _TOP_QUANTILE))
-            if not observation.camera.vertical:
+            if not observation.camera.is_vertical:
                 points = np.vstack([points, _project_to_floor(points, observation)])
             blocks.append(OccludedBox.below_points(points, top))
     return blocks

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
-from drake_clutter.cell.pinhole import NEAREST, in_camera, project
+from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
@@ -77,7 +77,7 @@ def _project_to_pixels(
         & (rows < camera.height)
         & (columns >= 0)
         & (columns < camera.width)
-        & (depth > NEAREST)
+        & (depth > MIN_DEPTH)
     )
     return rows * within, columns * within, np.where(within, depth, np.nan)
 
@@ -191,9 +191,9 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
             if state[i, j] == 0:
                 state[i, j] = 1
                 for level in levels:
-                    p_x, p_y, point_depth = in_camera(camera, x[i], y[j], level)
+                    p_x, p_y, point_depth = point_to_camera(camera, x[i], y[j], level)
                     is_free = False
-                    if point_depth > NEAREST:
+                    if point_depth > MIN_DEPTH:
                         u, v = project(camera, p_x, p_y, point_depth)
                         column, row = int(np.rint(u)), int(np.rint(v))
                         is_free = (
@@ -297,7 +297,7 @@ def _search_placements(
             + np.arange(0, oriented.height + config.release_height, _HEIGHT_STEP)
         )
         if (
-            not observation.camera.vertical
+            not observation.camera.is_vertical
         ):  # nothing that is seen through below speaks for what is above
             levels = np.append(levels, floor + oriented.height + config.release_height)
         arguments = (grid.x, grid.y, levels, oriented.footprint, cells, cost)

@@ -25,7 +25,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
-from drake_clutter.cell.pinhole import FARTHEST
+from drake_clutter.cell.pinhole import MAX_DEPTH
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
@@ -83,7 +83,7 @@ class Intrinsics:
         over_tray = RenderCameraCore(
             RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform()
         )
-        depth = DepthRenderCamera(anywhere, DepthRange(0.1, FARTHEST))
+        depth = DepthRenderCamera(anywhere, DepthRange(0.1, MAX_DEPTH))
         return Intrinsics(
             ColorRenderCamera(anywhere, False),
             depth,

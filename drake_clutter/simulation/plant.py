@@ -12,7 +12,7 @@ from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass, Rest, Shape
-from drake_clutter.cell.sdf import sdf_text
+from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -117,7 +117,7 @@ def populated(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:
-        text = sdf_text(object_class.model_path, visuals=visuals)
+        text = read_sdf_text(object_class.model_path, visuals=visuals)
         (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
         if (

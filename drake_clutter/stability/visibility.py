@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.cell.pinhole import NEAREST, in_camera, project, turned_to_camera
+from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project, vector_to_camera
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shapes import Floats, Ints, Shapes
@@ -28,7 +28,7 @@ def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
 
     The plane: its normal in T, and how far it is along that from the camera, m.
     """
-    nx, ny, nz = turned_to_camera(camera, nx, ny, nz)
+    nx, ny, nz = vector_to_camera(camera, nx, ny, nz)
     along, down = nx / camera.focal_length / k, ny / camera.focal_length / k
     return along, down, nz / k - along * camera.u0 - down * camera.v0
 
@@ -42,7 +42,7 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
     """
     height, width = hit.shape
     eye = camera.p_TC
-    p_x, p_y, p_z = turned_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
+    p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
     begin, end = (
         np.zeros(height, np.int64),
@@ -65,7 +65,7 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
             u, v = np.empty(count), np.empty(count)
         top, bottom = np.inf, -np.inf
         for c in range(count):
-            x, y, z = in_camera(
+            x, y, z = point_to_camera(
                 camera,
                 table.corner[first + c, 0],
                 table.corner[first + c, 1],
@@ -117,16 +117,16 @@ def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
     All are 0 if nothing of it is in the image.
     """
     height, width = image_shape
-    p_x, p_y, p_z = turned_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
+    p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     top, bottom, left, right = np.inf, -np.inf, np.inf, -np.inf
     for corner in range(8):
-        x, y, z = in_camera(
+        x, y, z = point_to_camera(
             camera,
             posed.upper[0] if corner & 1 else posed.lower[0],
             posed.upper[1] if corner & 2 else posed.lower[1],
             posed.upper[2] if corner & 4 else posed.lower[2],
         )
-        if z + p_z < NEAREST:
+        if z + p_z < MIN_DEPTH:
             return 0, 0, 0, 0
         u, v = project(camera, x + p_x, y + p_y, z + p_z)
         left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)

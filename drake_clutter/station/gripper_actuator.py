@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import surface_under_lip
+from drake_clutter.cell.suction import lip_surface_profile
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01
@@ -137,13 +137,15 @@ class SuctionActuator:
             name: self._cup_pose_in_object(context, name) for name in station.graspable_objects
         }
         gaps = {
-            name: surface_under_lip(station.object_classes[name], X_OG, suction.cup_diameter).min()
+            name: lip_surface_profile(
+                station.object_classes[name], X_OG, suction.cup_diameter
+            ).min()
             for name, X_OG in grasps.items()
         }
         if not gaps:
             return
         first = min(gaps, key=lambda name: gaps[name])
-        seals = suction.seals(station.object_classes[first], grasps[first])
+        seals = suction.can_attach(station.object_classes[first], grasps[first])
         if gaps[first] <= MAX_SEAL_GAP and seals:
             station.grasp.attach(context, station.scene_plant.bodies[first])
             self.status = replace(self.status, held=first, last_held=first)

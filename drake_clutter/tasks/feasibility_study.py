@@ -219,7 +219,7 @@ class FeasibilityStudy:
         picked, gripper = scene[plan.pick], self._world.cell.gripper
         X_TG = RigidTransform(planner.tool.pose(q))
         X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
-        if not gripper.seals(picked.object_class, X_OG):
+        if not gripper.can_attach(picked.object_class, X_OG):
             return PlanningFailureReason.NO_SEAL.value
         around = planner.collision_model(scene.objects)
         touching = (*gripper.contact_links, plan.pick)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.primitives import Rod, sdf_link, sdf_pose
+from drake_clutter.cell.primitives import LinkPrimitive, sdf_link, sdf_pose
 
 Floats = NDArray[np.float64]
 
@@ -20,25 +20,25 @@ class ArmLink:
         name: As in the model.
         mass: [kg].
         p_LCm: Center of mass in the link's frame [m]. Shape (3,).
-        outline: Capsules that cover it.
-        looks: Cylinders that it is drawn with.
+        collision_geometry: Capsules that cover it.
+        visual_geometry: Cylinders that it is drawn with.
         joint: Name of the joint before it; "" for the base.
         X_PL: Pose in the frame of the link before, when the joint is at 0. Shape (4, 4).
-        limit: Greatest angle of the joint either way [rad].
-        torque: Greatest torque of the joint [N m].
-        speed: Greatest speed of the joint [rad/s].
+        max_angle: Greatest angle of the joint either way [rad].
+        max_torque: Greatest torque of the joint [N m].
+        max_speed: Greatest speed of the joint [rad/s].
     """
 
     name: str
     mass: float
     p_LCm: Floats
-    outline: tuple[Rod, ...]
-    looks: tuple[Rod, ...]
+    collision_geometry: tuple[LinkPrimitive, ...]
+    visual_geometry: tuple[LinkPrimitive, ...]
     joint: str = ""
     X_PL: Floats | None = None
-    limit: float = 0.0
-    torque: float = 0.0
-    speed: float = 0.0
+    max_angle: float = 0.0
+    max_torque: float = 0.0
+    max_speed: float = 0.0
 
 
 def arm_sdf(name: str, written_by: str, links: Sequence[ArmLink], X_LF: Floats) -> str:
@@ -55,9 +55,18 @@ def arm_sdf(name: str, written_by: str, links: Sequence[ArmLink], X_LF: Floats) 
         X, pose = link.X_PL, ""
         if X is not None:
             pose = "\n      " + sdf_pose(X[:3, 3], Rotation.from_matrix(X[:3, :3]), parent)
-        parts.append(sdf_link(link.name, pose, link.mass, link.p_LCm, link.outline, link.looks))
+        parts.append(
+            sdf_link(
+                link.name,
+                pose,
+                link.mass,
+                link.p_LCm,
+                link.collision_geometry,
+                link.visual_geometry,
+            )
+        )
         if link.joint:
-            parts.append(_joint(link, parent))
+            parts.append(_joint_sdf(link, parent))
         parent = link.name
     return f"""<?xml version="1.0"?>
 <!-- Written by {written_by}, which names the sources. -->
@@ -71,7 +80,7 @@ def arm_sdf(name: str, written_by: str, links: Sequence[ArmLink], X_LF: Floats) 
 """
 
 
-def _joint(link: ArmLink, parent: str) -> str:
+def _joint_sdf(link: ArmLink, parent: str) -> str:
     return f"""
     <joint name="{link.joint}" type="revolute">
       <parent>{parent}</parent>
@@ -79,8 +88,8 @@ def _joint(link: ArmLink, parent: str) -> str:
       <axis>
         <xyz>0 0 1</xyz>
         <limit>
-          <lower>{-link.limit:.12g}</lower><upper>{link.limit:.12g}</upper>
-          <effort>{link.torque:g}</effort><velocity>{link.speed:.6g}</velocity>
+          <lower>{-link.max_angle:.12g}</lower><upper>{link.max_angle:.12g}</upper>
+          <effort>{link.max_torque:g}</effort><velocity>{link.max_speed:.6g}</velocity>
         </limit>
       </axis>
     </joint>"""

@@ -11,104 +11,110 @@ mass is assumed.
 
 import math
 
-from drake_clutter.cell.primitives import Rod
+from drake_clutter.cell.primitives import LinkPrimitive
 from drake_clutter.robots.ur_kinematics import UR10_PARAMETERS
-from ur_family import CAP, JOINT, TUBE, Link, UrArm, ur_sdf
+from ur_family import CAP_COLOR, JOINT_COLOR, TUBE_COLOR, UrArm, UrLink, ur_sdf
 from ur_family import JOINT_RANGE as JOINT_RANGE
 
-_SHOULDER_SPEED, _SPEED = math.radians(120), math.radians(180)
+_SHOULDER_SPEED, _WRIST_SPEED = math.radians(120), math.radians(180)
 LINKS = (
-    Link(
+    UrLink(
         "shoulder",
         7.1,
         (0.021, 0.0, 0.027),
         330.0,
         _SHOULDER_SPEED,
-        (Rod((0.0, 0.0, 0.1124), (0.0, -0.0122, 0.1287), 0.107),),
+        (LinkPrimitive((0.0, 0.0, 0.1124), (0.0, -0.0122, 0.1287), 0.107),),
         (
-            Rod((0.0, 0.0, 0.0385), (0.0, 0.0, 0.185), 0.0750, JOINT),
-            Rod((0.0, 0.0, 0.185), (0.0, 0.0, 0.2150), 0.0700, CAP),
-            Rod((0.0, 0.0, 0.1273), (0.0, -0.0855, 0.1273), 0.0750, JOINT),
+            LinkPrimitive((0.0, 0.0, 0.0385), (0.0, 0.0, 0.185), 0.0750, JOINT_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.185), (0.0, 0.0, 0.2150), 0.0700, CAP_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.1273), (0.0, -0.0855, 0.1273), 0.0750, JOINT_COLOR),
         ),
     ),
-    Link(
+    UrLink(
         "upper_arm",
         12.7,
         (0.38, 0.0, 0.158),
         330.0,
         _SHOULDER_SPEED,
         (
-            Rod((-0.0384, 0.0, 0.1743), (-0.0054, 0.0, 0.1658), 0.114),
-            Rod((-0.13, 0.0, 0.1754), (-0.56, 0.0, 0.1784), 0.067),
-            Rod((-0.609, 0.0, 0.1699), (-0.5929, 0.0, 0.1775), 0.084),
+            LinkPrimitive((-0.0384, 0.0, 0.1743), (-0.0054, 0.0, 0.1658), 0.114),
+            LinkPrimitive((-0.13, 0.0, 0.1754), (-0.56, 0.0, 0.1784), 0.067),
+            LinkPrimitive((-0.609, 0.0, 0.1699), (-0.5929, 0.0, 0.1775), 0.084),
         ),
         (
-            Rod((0.0, 0.0, 0.0865), (0.0, 0.0, 0.232), 0.0745, JOINT),
-            Rod((0.0, 0.0, 0.232), (0.0, 0.0, 0.2625), 0.0700, CAP),
-            Rod((0.0, 0.0, 0.1760), (-0.612, 0.0, 0.1760), 0.0540, TUBE),
-            Rod((-0.612, 0.0, 0.1165), (-0.612, 0.0, 0.218), 0.0600, JOINT),
-            Rod((-0.612, 0.0, 0.218), (-0.612, 0.0, 0.2430), 0.0560, CAP),
+            LinkPrimitive((0.0, 0.0, 0.0865), (0.0, 0.0, 0.232), 0.0745, JOINT_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.232), (0.0, 0.0, 0.2625), 0.0700, CAP_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.1760), (-0.612, 0.0, 0.1760), 0.0540, TUBE_COLOR),
+            LinkPrimitive((-0.612, 0.0, 0.1165), (-0.612, 0.0, 0.218), 0.0600, JOINT_COLOR),
+            LinkPrimitive((-0.612, 0.0, 0.218), (-0.612, 0.0, 0.2430), 0.0560, CAP_COLOR),
         ),
     ),
-    Link(
+    UrLink(
         "forearm",
         4.27,
         (0.24, 0.0, 0.068),
         150.0,
-        _SPEED,
+        _WRIST_SPEED,
         (
-            Rod((-0.0067, 0.0, 0.0589), (-0.0551, 0.0, 0.0472), 0.088),
-            Rod((-0.11, 0.0, 0.0483), (-0.52, 0.0, 0.0481), 0.048),
-            Rod((-0.5456, 0.0, 0.0471), (-0.5732, 0.0, 0.0558), 0.072),
+            LinkPrimitive((-0.0067, 0.0, 0.0589), (-0.0551, 0.0, 0.0472), 0.088),
+            LinkPrimitive((-0.11, 0.0, 0.0483), (-0.52, 0.0, 0.0481), 0.048),
+            LinkPrimitive((-0.5456, 0.0, 0.0471), (-0.5732, 0.0, 0.0558), 0.072),
         ),
         (
-            Rod((0.0, 0.0, -0.0195), (0.0, 0.0, 0.005), 0.0560, CAP),
-            Rod((0.0, 0.0, 0.005), (0.0, 0.0, 0.1160), 0.0595, JOINT),
-            Rod((0.0, 0.0, 0.0480), (-0.5723, 0.0, 0.0480), 0.0430, TUBE),
-            Rod((-0.5723, 0.0, -0.0085), (-0.5723, 0.0, 0.012), 0.0420, CAP),
-            Rod((-0.5723, 0.0, 0.012), (-0.5723, 0.0, 0.1095), 0.0450, JOINT),
+            LinkPrimitive((0.0, 0.0, -0.0195), (0.0, 0.0, 0.005), 0.0560, CAP_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.005), (0.0, 0.0, 0.1160), 0.0595, JOINT_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.0480), (-0.5723, 0.0, 0.0480), 0.0430, TUBE_COLOR),
+            LinkPrimitive((-0.5723, 0.0, -0.0085), (-0.5723, 0.0, 0.012), 0.0420, CAP_COLOR),
+            LinkPrimitive((-0.5723, 0.0, 0.012), (-0.5723, 0.0, 0.1095), 0.0450, JOINT_COLOR),
         ),
     ),
-    Link(
+    UrLink(
         "wrist_1",
         2.0,
         (0.0, 0.007, 0.018),
         56.0,
-        _SPEED,
-        (Rod((0.0, -0.0142, 0.1639), (0.0, 0.0009, 0.1569), 0.067),),
+        _WRIST_SPEED,
+        (LinkPrimitive((0.0, -0.0142, 0.1639), (0.0, 0.0009, 0.1569), 0.067),),
         (
-            Rod((0.0, 0.0, 0.1100), (0.0, 0.0, 0.188), 0.0450, JOINT),
-            Rod((0.0, 0.0, 0.188), (0.0, 0.0, 0.2095), 0.0420, CAP),
-            Rod((0.0, 0.0, 0.1639), (0.0, -0.0615, 0.1639), 0.0450, JOINT),
+            LinkPrimitive((0.0, 0.0, 0.1100), (0.0, 0.0, 0.188), 0.0450, JOINT_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.188), (0.0, 0.0, 0.2095), 0.0420, CAP_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.1639), (0.0, -0.0615, 0.1639), 0.0450, JOINT_COLOR),
         ),
     ),
-    Link(
+    UrLink(
         "wrist_2",
         2.0,
         (0.0, 0.007, 0.018),
         56.0,
-        _SPEED,
-        (Rod((0.0, -0.0014, 0.109), (0.0, 0.014, 0.1161), 0.067),),
+        _WRIST_SPEED,
+        (LinkPrimitive((0.0, -0.0014, 0.109), (0.0, 0.014, 0.1161), 0.067),),
         (
-            Rod((0.0, 0.0, 0.0620), (0.0, 0.0, 0.140), 0.0450, JOINT),
-            Rod((0.0, 0.0, 0.140), (0.0, 0.0, 0.1615), 0.0420, CAP),
-            Rod((0.0, 0.0, 0.1157), (0.0, 0.0615, 0.1157), 0.0450, JOINT),
+            LinkPrimitive((0.0, 0.0, 0.0620), (0.0, 0.0, 0.140), 0.0450, JOINT_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.140), (0.0, 0.0, 0.1615), 0.0420, CAP_COLOR),
+            LinkPrimitive((0.0, 0.0, 0.1157), (0.0, 0.0615, 0.1157), 0.0450, JOINT_COLOR),
         ),
     ),
-    Link(
+    UrLink(
         "wrist_3",
         0.365,
         (0.0, 0.0, -0.026),
         56.0,
-        _SPEED,
-        (Rod((0.0, -0.001, 0.0690), (0.0, -0.001, 0.0712), 0.047),),
-        (Rod((0.0, 0.0, 0.0620), (0.0, 0.0, 0.0920), 0.0450, TUBE),),
+        _WRIST_SPEED,
+        (LinkPrimitive((0.0, -0.001, 0.0690), (0.0, -0.001, 0.0712), 0.047),),
+        (LinkPrimitive((0.0, 0.0, 0.0620), (0.0, 0.0, 0.0920), 0.0450, TUBE_COLOR),),
     ),
 )
-BASE_OUTLINE = (Rod((0.0, -0.0247, 0.0091), (0.0, 0.0245, 0.0083), 0.0825),)
-BASE_LOOKS = (Rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.0380), 0.0750, JOINT),)
+BASE_COLLISION_GEOMETRY = (LinkPrimitive((0.0, -0.0247, 0.0091), (0.0, 0.0245, 0.0083), 0.0825),)
+BASE_VISUAL_GEOMETRY = (LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, 0.0380), 0.0750, JOINT_COLOR),)
 UR10_ARM = UrArm(
-    "ur10", UR10_PARAMETERS, LINKS, BASE_OUTLINE, BASE_LOOKS, 4.0, "models/generators/ur10.py"
+    "ur10",
+    UR10_PARAMETERS,
+    LINKS,
+    BASE_COLLISION_GEOMETRY,
+    BASE_VISUAL_GEOMETRY,
+    4.0,
+    "models/generators/ur10.py",
 )
 
 

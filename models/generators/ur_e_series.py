@@ -15,17 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_clutter.cell.primitives import Point, Rod
+from drake_clutter.cell.primitives import LinkPrimitive, Point
 from drake_clutter.robots.ur_kinematics import DenavitHartenberg
-from ur_family import CAP, JOINT, TUBE, Link, UrArm
+from ur_family import CAP_COLOR, JOINT_COLOR, TUBE_COLOR, UrArm, UrLink
 
-NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+LINK_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 BASE_MASS = 4.0
 """Of all bases; assumed [kg]."""
 
 
 @dataclass(frozen=True)
-class Shape:
+class VisualShape:
     """Cylinders that an arm is drawn with; all lengths in m, along z of the links unless said.
 
     Attributes:
@@ -54,45 +54,50 @@ class Shape:
     wrist_2: tuple[float, float, float]
     wrist_3: float
 
-    def looks(self, parameters: DenavitHartenberg) -> tuple[tuple[Rod, ...], ...]:
+    def visual_geometry(
+        self, parameters: DenavitHartenberg
+    ) -> tuple[tuple[LinkPrimitive, ...], ...]:
         """Return the cylinders of each moving link."""
         (_, a2, a3, *_), (d1, _, _, d4, d5, d6) = parameters.a, parameters.d
         side, w = self.shoulder[3], self.wrist[0]
         return (
-            (_upright(self.shoulder[:3]), _rod((0, 0, d1), (0, -side, d1), self.shoulder[0])),
             (
-                _upright(self.upper_arm),
-                _along(a2, self.tube),
-                _upright(self.elbow, a2),
+                _vertical_cylinder(self.shoulder[:3]),
+                _cylinder((0, 0, d1), (0, -side, d1), self.shoulder[0]),
             ),
             (
-                _upright(self.forearm),
-                _along(a3, self.thin_tube),
-                _upright(self.wrist, a3),
+                _vertical_cylinder(self.upper_arm),
+                _tube(a2, self.tube),
+                _vertical_cylinder(self.elbow, a2),
             ),
             (
-                _upright((w, *self.wrist_1[:2])),
-                _rod((0, 0, d4), (0, -self.wrist_1[2], d4), w, CAP),
+                _vertical_cylinder(self.forearm),
+                _tube(a3, self.thin_tube),
+                _vertical_cylinder(self.wrist, a3),
             ),
             (
-                _upright((w, *self.wrist_2[:2])),
-                _rod((0, 0, d5), (0, self.wrist_2[2], d5), w, CAP),
+                _vertical_cylinder((w, *self.wrist_1[:2])),
+                _cylinder((0, 0, d4), (0, -self.wrist_1[2], d4), w, CAP_COLOR),
             ),
-            (_rod((0, 0, self.wrist_3), (0, 0, d6), 0.85 * w, TUBE),),
+            (
+                _vertical_cylinder((w, *self.wrist_2[:2])),
+                _cylinder((0, 0, d5), (0, self.wrist_2[2], d5), w, CAP_COLOR),
+            ),
+            (_cylinder((0, 0, self.wrist_3), (0, 0, d6), 0.85 * w, TUBE_COLOR),),
         )
 
 
-def _rod(start: Point, end: Point, radius: float, color: str = JOINT) -> Rod:
-    return Rod(start, end, radius, color)
+def _cylinder(start: Point, end: Point, radius: float, color: str = JOINT_COLOR) -> LinkPrimitive:
+    return LinkPrimitive(start, end, radius, color)
 
 
-def _upright(extent: tuple[float, float, float], x: float = 0.0) -> Rod:
+def _vertical_cylinder(extent: tuple[float, float, float], x: float = 0.0) -> LinkPrimitive:
     radius, low, high = extent
-    return _rod((x, 0.0, low), (x, 0.0, high), radius)
+    return _cylinder((x, 0.0, low), (x, 0.0, high), radius)
 
 
-def _along(a: float, tube: tuple[float, float]) -> Rod:
-    return _rod((0.1 * a, 0.0, tube[0]), (0.95 * a, 0.0, tube[0]), tube[1], TUBE)
+def _tube(a: float, tube: tuple[float, float]) -> LinkPrimitive:
+    return _cylinder((0.1 * a, 0.0, tube[0]), (0.95 * a, 0.0, tube[0]), tube[1], TUBE_COLOR)
 
 
 def _parameters(a2: float, a3: float, *d: float) -> DenavitHartenberg:
@@ -100,29 +105,37 @@ def _parameters(a2: float, a3: float, *d: float) -> DenavitHartenberg:
     return DenavitHartenberg(a, d, (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0))
 
 
-def _arm(
+def _make_arm(
     name: str,
     parameters: DenavitHartenberg,
     masses: tuple[float, ...],
     centers: tuple[Point, ...],
     torques: tuple[float, ...],
     speeds_deg: tuple[float, ...],
-    shape: Shape,
-    base_outline: Rod,
-    outlines: tuple[tuple[Rod, ...], ...],
+    shape: VisualShape,
+    base_collision_geometry: LinkPrimitive,
+    collision_geometry: tuple[tuple[LinkPrimitive, ...], ...],
 ) -> UrArm:
-    columns = (NAMES, masses, centers, torques, speeds_deg, outlines, shape.looks(parameters))
+    columns = (
+        LINK_NAMES,
+        masses,
+        centers,
+        torques,
+        speeds_deg,
+        collision_geometry,
+        shape.visual_geometry(parameters),
+    )
     links = tuple(
-        Link(link, mass, center, torque, math.radians(speed), outline, looks)
-        for link, mass, center, torque, speed, outline, looks in zip(*columns, strict=True)
+        UrLink(link, mass, center, torque, math.radians(speed), collision, visual)
+        for link, mass, center, torque, speed, collision, visual in zip(*columns, strict=True)
     )
     radius, height = shape.base
-    base_looks = (_rod((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),)
+    base_looks = (_cylinder((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),)
     this = "models/generators/ur_e_series.py"
-    return UrArm(name, parameters, links, (base_outline,), base_looks, BASE_MASS, this)
+    return UrArm(name, parameters, links, (base_collision_geometry,), base_looks, BASE_MASS, this)
 
 
-UR3E = _arm(
+UR3E = _make_arm(
     "ur3e",
     _parameters(-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
     (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
@@ -136,7 +149,7 @@ UR3E = _arm(
     ),
     (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
     (180.0, 180.0, 180.0, 360.0, 360.0, 360.0),
-    Shape(
+    VisualShape(
         base=(0.053, 0.0890),
         shoulder=(0.045, 0.0960, 0.200, 0.061),
         upper_arm=(0.045, 0.066, 0.170),
@@ -149,26 +162,26 @@ UR3E = _arm(
         wrist_2=(0.0499, 0.115, 0.050),
         wrist_3=0.0504,
     ),
-    Rod((0.0, 0.0, 0.0280), (-0.0001, -0.0008, 0.0419), 0.071),
+    LinkPrimitive((0.0, 0.0, 0.0280), (-0.0001, -0.0008, 0.0419), 0.071),
     (
-        (Rod((-0.0008, -0.0005, 0.1467), (-0.0018, -0.0123, 0.1524), 0.070),),
+        (LinkPrimitive((-0.0008, -0.0005, 0.1467), (-0.0018, -0.0123, 0.1524), 0.070),),
         (
-            Rod((-0.0143, 0.0, 0.1199), (-0.001, 0.0004, 0.1144), 0.070),
-            Rod((-0.1847, 0.0, 0.1198), (-0.0887, 0.0, 0.1199), 0.039),
-            Rod((-0.2426, -0.0003, 0.115), (-0.2401, 0.0001, 0.1215), 0.063),
+            LinkPrimitive((-0.0143, 0.0, 0.1199), (-0.001, 0.0004, 0.1144), 0.070),
+            LinkPrimitive((-0.1847, 0.0, 0.1198), (-0.0887, 0.0, 0.1199), 0.039),
+            LinkPrimitive((-0.2426, -0.0003, 0.115), (-0.2401, 0.0001, 0.1215), 0.063),
         ),
         (
-            Rod((-0.0434, 0.0, 0.027), (0.0007, 0.0001, 0.0563), 0.040),
-            Rod((-0.1503, 0.0, 0.0272), (-0.0828, -0.0001, 0.0269), 0.029),
-            Rod((-0.2077, -0.0011, 0.0422), (-0.2032, -0.0004, 0.0192), 0.051),
+            LinkPrimitive((-0.0434, 0.0, 0.027), (0.0007, 0.0001, 0.0563), 0.040),
+            LinkPrimitive((-0.1503, 0.0, 0.0272), (-0.0828, -0.0001, 0.0269), 0.029),
+            LinkPrimitive((-0.2077, -0.0011, 0.0422), (-0.2032, -0.0004, 0.0192), 0.051),
         ),
-        (Rod((-0.0001, -0.0064, 0.1284), (0.0, 0.0004, 0.1227), 0.056),),
-        (Rod((0.0, 0.0172, 0.0851), (0.0, -0.0081, 0.0819), 0.046),),
-        (Rod((-0.0002, 0.0003, 0.0709), (0.0014, -0.0016, 0.0705), 0.038),),
+        (LinkPrimitive((-0.0001, -0.0064, 0.1284), (0.0, 0.0004, 0.1227), 0.056),),
+        (LinkPrimitive((0.0, 0.0172, 0.0851), (0.0, -0.0081, 0.0819), 0.046),),
+        (LinkPrimitive((-0.0002, 0.0003, 0.0709), (0.0014, -0.0016, 0.0705), 0.038),),
     ),
 )
 
-UR5E = _arm(
+UR5E = _make_arm(
     "ur5e",
     _parameters(-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
     (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
@@ -182,7 +195,7 @@ UR5E = _arm(
     ),
     (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
     (180.0, 180.0, 180.0, 180.0, 180.0, 180.0),
-    Shape(
+    VisualShape(
         base=(0.062, 0.0950),
         shoulder=(0.056, 0.1010, 0.216, 0.0730),
         upper_arm=(0.056, 0.076, 0.198),
@@ -195,35 +208,35 @@ UR5E = _arm(
         wrist_2=(0.0536, 0.137, 0.053),
         wrist_3=0.0560,
     ),
-    Rod((0.0003, 0.0003, 0.0466), (0.0, 0.0, 0.0214), 0.079),
+    LinkPrimitive((0.0003, 0.0003, 0.0466), (0.0, 0.0, 0.0214), 0.079),
     (
-        (Rod((-0.0002, -0.0032, 0.1553), (0.0, -0.0144, 0.162), 0.084),),
+        (LinkPrimitive((-0.0002, -0.0032, 0.1553), (0.0, -0.0144, 0.162), 0.084),),
         (
-            Rod((0.0001, 0.0, 0.1342), (-0.0231, 0.0, 0.1379), 0.084),
-            Rod((-0.3189, 0.0, 0.1378), (-0.1024, 0.0, 0.1378), 0.044),
-            Rod((-0.4036, 0.0, 0.1378), (-0.4243, 0.0, 0.1246), 0.087),
+            LinkPrimitive((0.0001, 0.0, 0.1342), (-0.0231, 0.0, 0.1379), 0.084),
+            LinkPrimitive((-0.3189, 0.0, 0.1378), (-0.1024, 0.0, 0.1378), 0.044),
+            LinkPrimitive((-0.4036, 0.0, 0.1378), (-0.4243, 0.0, 0.1246), 0.087),
         ),
         (
-            Rod((-0.0478, -0.0011, 0.0082), (0.0007, 0.0, 0.048), 0.060),
-            Rod((-0.1011, 0.0, 0.0065), (-0.3342, 0.0, 0.0067), 0.039),
-            Rod((-0.3885, 0.0, 0.0047), (-0.3904, 0.0002, 0.0124), 0.062),
+            LinkPrimitive((-0.0478, -0.0011, 0.0082), (0.0007, 0.0, 0.048), 0.060),
+            LinkPrimitive((-0.1011, 0.0, 0.0065), (-0.3342, 0.0, 0.0067), 0.039),
+            LinkPrimitive((-0.3885, 0.0, 0.0047), (-0.3904, 0.0002, 0.0124), 0.062),
         ),
-        (Rod((0.0, 0.0001, 0.1116), (0.0, -0.0014, 0.1324), 0.065),),
-        (Rod((-0.0007, 0.0119, 0.0977), (0.0004, -0.0094, 0.0951), 0.057),),
-        (Rod((-0.0038, -0.0026, 0.0733), (0.0025, 0.0023, 0.0715), 0.043),),
+        (LinkPrimitive((0.0, 0.0001, 0.1116), (0.0, -0.0014, 0.1324), 0.065),),
+        (LinkPrimitive((-0.0007, 0.0119, 0.0977), (0.0004, -0.0094, 0.0951), 0.057),),
+        (LinkPrimitive((-0.0038, -0.0026, 0.0733), (0.0025, 0.0023, 0.0715), 0.043),),
     ),
 )
 
-_LARGE_BASE = Rod((0.0, 0.0, 0.026), (0.0, 0.0, 0.066), 0.099)
-_LARGE_SHOULDER = (Rod((-0.0001, -0.0006, 0.1656), (-0.0001, -0.0121, 0.1821), 0.109),)
+_LARGE_BASE = LinkPrimitive((0.0, 0.0, 0.026), (0.0, 0.0, 0.066), 0.099)
+_LARGE_SHOULDER = (LinkPrimitive((-0.0001, -0.0006, 0.1656), (-0.0001, -0.0121, 0.1821), 0.109),)
 _LARGE_WRISTS = (
-    (Rod((-0.0006, -0.0009, 0.1551), (0.0, -0.009, 0.172), 0.077),),
-    (Rod((0.0, -0.0002, 0.1118), (-0.001, 0.0127, 0.1194), 0.072),),
-    (Rod((-0.0004, -0.0009, 0.0811), (0.0, -0.001, 0.0813), 0.051),),
+    (LinkPrimitive((-0.0006, -0.0009, 0.1551), (0.0, -0.009, 0.172), 0.077),),
+    (LinkPrimitive((0.0, -0.0002, 0.1118), (-0.001, 0.0127, 0.1194), 0.072),),
+    (LinkPrimitive((-0.0004, -0.0009, 0.0811), (0.0, -0.001, 0.0813), 0.051),),
 )
 """Of UR10e and UR16e alike."""
 
-UR10E = _arm(
+UR10E = _make_arm(
     "ur10e",
     _parameters(-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
     (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
@@ -237,7 +250,7 @@ UR10E = _arm(
     ),
     (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
     (120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
-    Shape(
+    VisualShape(
         base=(0.090, 0.0917),
         shoulder=(0.070, 0.0917, 0.260, 0.083),
         upper_arm=(0.075, 0.086, 0.255),
@@ -254,20 +267,20 @@ UR10E = _arm(
     (
         _LARGE_SHOULDER,
         (
-            Rod((-0.0018, 0.0, 0.1635), (-0.0188, 0.0, 0.1761), 0.119),
-            Rod((-0.1242, 0.0, 0.1761), (-0.5066, 0.0, 0.1761), 0.065),
-            Rod((-0.6121, 0.0001, 0.1726), (-0.5799, -0.0001, 0.1762), 0.093),
+            LinkPrimitive((-0.0018, 0.0, 0.1635), (-0.0188, 0.0, 0.1761), 0.119),
+            LinkPrimitive((-0.1242, 0.0, 0.1761), (-0.5066, 0.0, 0.1761), 0.065),
+            LinkPrimitive((-0.6121, 0.0001, 0.1726), (-0.5799, -0.0001, 0.1762), 0.093),
         ),
         (
-            Rod((-0.0029, 0.0006, 0.0501), (-0.0224, 0.0001, 0.0395), 0.088),
-            Rod((-0.5168, 0.0, 0.0394), (-0.1152, 0.0, 0.0395), 0.051),
-            Rod((-0.5722, -0.0006, 0.0572), (-0.566, -0.0002, 0.0342), 0.068),
+            LinkPrimitive((-0.0029, 0.0006, 0.0501), (-0.0224, 0.0001, 0.0395), 0.088),
+            LinkPrimitive((-0.5168, 0.0, 0.0394), (-0.1152, 0.0, 0.0395), 0.051),
+            LinkPrimitive((-0.5722, -0.0006, 0.0572), (-0.566, -0.0002, 0.0342), 0.068),
         ),
         *_LARGE_WRISTS,
     ),
 )
 
-UR16E = _arm(
+UR16E = _make_arm(
     "ur16e",
     _parameters(-0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
     (7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
@@ -281,7 +294,7 @@ UR16E = _arm(
     ),
     (330.0, 330.0, 150.0, 54.0, 54.0, 54.0),
     (120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
-    Shape(
+    VisualShape(
         base=(0.090, 0.0917),
         shoulder=(0.070, 0.0917, 0.260, 0.083),
         upper_arm=(0.075, 0.086, 0.255),
@@ -298,14 +311,14 @@ UR16E = _arm(
     (
         _LARGE_SHOULDER,
         (
-            Rod((0.0013, 0.0, 0.1622), (-0.0194, -0.0005, 0.1762), 0.119),
-            Rod((-0.1269, 0.0, 0.1759), (-0.3698, 0.0, 0.1758), 0.065),
-            Rod((-0.4777, 0.0, 0.1725), (-0.4457, -0.0001, 0.176), 0.093),
+            LinkPrimitive((0.0013, 0.0, 0.1622), (-0.0194, -0.0005, 0.1762), 0.119),
+            LinkPrimitive((-0.1269, 0.0, 0.1759), (-0.3698, 0.0, 0.1758), 0.065),
+            LinkPrimitive((-0.4777, 0.0, 0.1725), (-0.4457, -0.0001, 0.176), 0.093),
         ),
         (
-            Rod((-0.0021, 0.0, 0.0503), (-0.0217, 0.0002, 0.0401), 0.088),
-            Rod((-0.3012, 0.0001, 0.0401), (-0.1117, 0.0, 0.0402), 0.051),
-            Rod((-0.3599, -0.0023, 0.0603), (-0.3539, 0.0001, 0.0338), 0.068),
+            LinkPrimitive((-0.0021, 0.0, 0.0503), (-0.0217, 0.0002, 0.0401), 0.088),
+            LinkPrimitive((-0.3012, 0.0001, 0.0401), (-0.1117, 0.0, 0.0402), 0.051),
+            LinkPrimitive((-0.3599, -0.0023, 0.0603), (-0.3539, 0.0001, 0.0338), 0.068),
         ),
         *_LARGE_WRISTS,
     ),

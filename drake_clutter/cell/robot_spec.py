@@ -6,7 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.model_file import ModelFile
-from drake_clutter.cell.pose import PoseSpec
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.validation import (
     Finite,
     InRange,
@@ -62,7 +62,7 @@ class RobotSpec(StrictModel):
 
     @field_validator("limits")
     @classmethod
-    def _one_per_joint(cls, limits: JointLimits, info: ValidationInfo) -> JointLimits:
+    def _check_limit_lengths(cls, limits: JointLimits, info: ValidationInfo) -> JointLimits:
         """Refuse limits of another number of joints than `home` has."""
         joints = len(info.data.get("home", ()))
         for name, values in limits:

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 
 @lru_cache(maxsize=256)
-def sdf_text(path: Path, *, visuals: bool) -> str:
+def read_sdf_text(path: Path, *, visuals: bool) -> str:
     """The SDF model at `path` with or without its visuals, URIs made absolute.
 
     Drake parses the text in a millisecond or two, the file it came from in sixty.
