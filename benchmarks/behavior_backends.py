@@ -25,7 +25,7 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
-from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
+from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
 from drake_clutter.tasks.episode import BackendFactory, run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
 
@@ -140,12 +140,12 @@ def _closed_loop(case: Case, perception: str) -> list[Line]:
     scenario, scene = _scenario(case, perception), _scene(case)
     loop = ClosedLoop(
         scene,
-        perceive=perception_of(scenario, scene.support),
+        perceive=make_perception(scenario, scene.support),
         seed=scenario.seed,
         world=scenario.world,
-        record=True,
+        record_motion=True,
     )
-    policy = policy_of(scenario.agent, scenario.world)
+    policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(loop, policy, max_moves=scenario.max_moves)
     return _episode(task, loop.belief.objects, "nothing feasible")
 
@@ -163,10 +163,10 @@ def closed_loop_depth(case: Case) -> list[Line]:
 def images(case: Case) -> list[Line]:
     """The loop without an arm, which sees depth images."""
     scenario, scene = _scenario(case, "depth"), _scene(case)
-    perceive = perception_of(scenario, scene.support)
+    perceive = make_perception(scenario, scene.support)
     assert perceive is not None
     backend = ImageBackend(scene, perceive, seed=scenario.seed, world=scenario.world)
-    policy = policy_of(scenario.agent, scenario.world)
+    policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(backend, policy, max_moves=scenario.max_moves)
     return _episode(task, backend.belief.objects)
 

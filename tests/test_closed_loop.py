@@ -31,9 +31,9 @@ from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanRespons
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.planner_system import PlannerSystem
-from drake_clutter.systems.policy_system import Phase, PolicyState, PolicySystem
-from drake_clutter.systems.scenario import Scenario, policy_of
-from drake_clutter.systems.station_camera import empty_depth
+from drake_clutter.systems.policy_system import PolicyPhase, PolicyState, PolicySystem
+from drake_clutter.systems.scenario import Scenario, make_policy
+from drake_clutter.systems.station_camera import render_empty_depth
 from drake_clutter.tasks.belief import Belief, Decision, legal_moves
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
@@ -94,14 +94,14 @@ def a_plan() -> PickPlacePlan:
 def test_it_looks_waits_rests_and_looks_again() -> None:
     bench = Bench()
     state = bench.after(0.1)
-    assert state.phase is Phase.WAITING
+    assert state.phase is PolicyPhase.WAITING
     assert (state.request.number, state.request.move) == (1, Move("cracker_box"))
     assert [o.name for o in state.belief.objects] == ["cracker_box"]
     bench.give(AFTER, PlanResponse(1, a_plan()), 0)
-    assert bench.after(5.0).phase is Phase.WAITING, "the arm has not come home"
+    assert bench.after(5.0).phase is PolicyPhase.WAITING, "the arm has not come home"
     bench.give(AFTER, PlanResponse(1, a_plan()), 1)
     state = bench.after(0.1)
-    assert state.phase is Phase.LOOKING
+    assert state.phase is PolicyPhase.OBSERVING
     assert state.belief.history == (Move("cracker_box"),)
     assert [o.name for o in state.belief.objects] == ["cracker_box"], "it has not looked yet"
     state = bench.after(0.6)
@@ -114,7 +114,7 @@ def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
     bench.after(0.1)
     bench.give(BEFORE, PlanResponse(1, NO_SEAL), 0)
     state = bench.after(0.2)
-    assert (state.phase, state.belief.invalid_moves) == (Phase.DONE, (Move("cracker_box"),))
+    assert (state.phase, state.belief.invalid_moves) == (PolicyPhase.DONE, (Move("cracker_box"),))
 
 
 def test_what_the_cup_did_not_get_is_left_alone() -> None:
@@ -124,7 +124,7 @@ def test_what_the_cup_did_not_get_is_left_alone() -> None:
     state = bench.after(0.8)
     assert state.belief.history == (Move("cracker_box"),)
     assert state.belief.invalid_moves == (Move("cracker_box"),), "it is seen where it was"
-    assert state.phase is Phase.DONE
+    assert state.phase is PolicyPhase.DONE
 
 
 def test_what_is_lost_is_forgotten() -> None:
@@ -138,7 +138,7 @@ def test_what_is_lost_is_forgotten() -> None:
         seed=0,
         tracker=lambda known, observation: (observation, ("gelatin_box",)),
     )
-    after = agent.decided(PolicyState(belief=belief), BEFORE).belief
+    after = agent.after_observation(PolicyState(belief=belief), BEFORE).belief
     assert [o.name for o in after.objects] == ["cracker_box"]
     assert after.invalid_moves == (Move("cracker_box"),)
 
@@ -174,7 +174,7 @@ def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) 
 
     planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
     monkeypatch.setattr(planner, "plan", answer)
-    empty = empty_depth(DEFAULT_CELL)
+    empty = render_empty_depth(DEFAULT_CELL)
     system = PlannerSystem(planner=planner, empty_depth=empty, latency=0.2)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -220,7 +220,7 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
             return Decision(Move("large_marker"))
         return largest_clear(belief, observation, rng)
 
-    loop = ClosedLoop(scene, seed=0, world=config, record=True)
+    loop = ClosedLoop(scene, seed=0, world=config, record_motion=True)
     task = run_episode(loop, marker_first, max_moves=4)
     timing = loop.timing
     results = [step.outcome.result for step in task.transitions]
@@ -232,7 +232,7 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert max(frame.time for frame in placed.outcome.motion) > 2
     assert task.termination is TerminationReason.ALL_FOUND
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
-    assert 3 < timing.robot < 15
+    assert 3 < timing.simulated < 15
     fields = write_scenario_results(
         tmp_path, Scenario(agent="largest-clear"), task, timing, "A test"
     )
@@ -249,7 +249,7 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
 def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfig) -> None:
     cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
-    loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record=True)
+    loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record_motion=True)
     task = run_episode(loop, largest_clear, max_moves=1)
     (step,) = task.transitions
     assert (step.outcome.result, task.termination) == (
@@ -278,17 +278,17 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
         0.015,
     )
     with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
-        policy_of("full-knowledge", config)
+        make_policy("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):
         scenario_scene(Scenario(scene=str(tmp_path / "none.yaml")))
-    move = policy_of("largest-clear", config)(Belief(), BEFORE, rng(0)).move
+    move = make_policy("largest-clear", config)(Belief(), BEFORE, rng(0)).move
     assert move == Move("cracker_box")
 
 
 def test_a_random_explorer_plays(config: ClutterConfig) -> None:
     task, timing = run_closed_loop(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
     assert len(task.transitions) == 1
-    assert timing.robot > 0
+    assert timing.simulated > 0
 
 
 @pytest.mark.parametrize("descent", [0.08, 0.0])
@@ -297,12 +297,12 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
 ) -> None:
     monkeypatch.setattr(
         closed_loop,
-        "GUARDED",
+        "GUARDED_PLANNER_CONFIG",
         PlannerConfig(max_guarded_descent=descent, descent_start_offset=0.007),
     )
     loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
     loop.policy_system.policy = first_allowed
-    request = loop.policy_system.decided(PolicyState(), BEFORE).request
+    request = loop.policy_system.after_observation(PolicyState(), BEFORE).request
     assert request.command is not None
     plan = loop.planner_system._plan(request)
     assert isinstance(plan, PickPlacePlan)
@@ -327,6 +327,8 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
     loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
     loop.policy_system.policy = policy
     observation = loop.perception.observation
-    assert loop.policy_system.decided(PolicyState(), observation).phase is Phase.DONE
+    assert (
+        loop.policy_system.after_observation(PolicyState(), observation).phase is PolicyPhase.DONE
+    )
     allowed = set(legal_moves(observation)) - set(given[0].invalid_moves)
     assert allowed == {Move(can.name)}

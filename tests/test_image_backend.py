@@ -16,7 +16,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.image_backend import ImageBackend
-from drake_clutter.systems.tracking import recognised
+from drake_clutter.systems.tracking import match_to_ground_truth
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
@@ -55,7 +55,7 @@ def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: fl
     assert step.outcome.X_TO_released is not None
     off = task.scene["cracker_box"].X_TO.p - step.outcome.X_TO_released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
-    assert recognised(known, COVERED.objects) == ("cracker_box",), (
+    assert match_to_ground_truth(known, COVERED.objects) == ("cracker_box",), (
         "it has looked again, and was shown the same"
     )
 

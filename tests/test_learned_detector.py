@@ -11,12 +11,12 @@ from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.systems.scenario import DETECTORS
+from drake_clutter.systems.scenario import PRETRAINED_DETECTORS
 
 
-@pytest.fixture(scope="module", params=DETECTORS)
+@pytest.fixture(scope="module", params=PRETRAINED_DETECTORS)
 def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDetector:
-    network = SegmentationNetwork.load(resource_path(DETECTORS[request.param]))
+    network = SegmentationNetwork.load(resource_path(PRETRAINED_DETECTORS[request.param]))
     return LearnedDetector(
         network, CATALOG.object_set("ycb7"), config.cell.camera, config.cell.support
     )

@@ -30,7 +30,7 @@ from drake_clutter.perception.segmentation_training import (
 )
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose
-from drake_clutter.systems.scenario import DETECTORS
+from drake_clutter.systems.scenario import PRETRAINED_DETECTORS
 from drake_clutter.validation import validate
 
 CAMERA = Camera.overhead(1.6, width=160, height=120)
@@ -227,7 +227,7 @@ def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path
 
 @pytest.mark.parametrize(("name", "use_color"), [("depth", False), ("depth-color", True)])
 def test_shipped_checkpoints_load_under_their_earlier_names(name: str, use_color: bool) -> None:
-    path = resource_path(DETECTORS[name])
+    path = resource_path(PRETRAINED_DETECTORS[name])
     stored = load_checkpoint(path)
     assert stored.metadata["looks_at_color"] is use_color
     network = SegmentationNetwork.load(path)

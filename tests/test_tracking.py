@@ -10,7 +10,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.systems.tracking import recognised, tracked
+from drake_clutter.systems.tracking import associate_detections, match_to_ground_truth
 
 CLASSES, CAMERA = load_catalog().classes, DEFAULT_CELL.camera
 CAN = "tomato_soup_can"
@@ -33,7 +33,7 @@ def image(*objects: SceneObject, top: float = 0.1) -> Observation:
 
 
 def names(known: list[SceneObject], observation: Observation) -> dict[str, tuple[float, float]]:
-    found, _ = tracked(known, observation)
+    found, _ = associate_detections(known, observation)
     return {d.name: d.X_TO.translation[:2] for d in found.detections}
 
 
@@ -78,28 +78,28 @@ def test_what_is_gone_from_its_place_and_seen_elsewhere_has_moved() -> None:
 
 def test_what_is_gone_and_not_in_view_is_lost() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
-    assert tracked(known, image(at(0.2, 0.2), top=0.0)).lost == (f"{CAN}_1",)
-    assert tracked(known, image(at(0.2, 0.2), top=0.1)).lost == ()
+    assert associate_detections(known, image(at(0.2, 0.2), top=0.0)).lost == (f"{CAN}_1",)
+    assert associate_detections(known, image(at(0.2, 0.2), top=0.1)).lost == ()
 
 
 def test_each_object_is_recognised_once_and_as_what_it_is() -> None:
     there = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
     box = replace(at(0.2, 0.2), name="box", object_class=CLASSES["sugar_box"])
-    assert recognised([at(0.01, 0), at(0.02, 0), box], there) == (f"{CAN}_1",)
-    assert recognised([], there) == ()
+    assert match_to_ground_truth([at(0.01, 0), at(0.02, 0), box], there) == (f"{CAN}_1",)
+    assert match_to_ground_truth([], there) == ()
 
 
 def test_what_was_taken_for_something_else_is_lost() -> None:
     """A box known where a can is now recognised, by its pixels; without that, it may only have been missed."""
     box = SceneObject("sugar_box_1", CLASSES["sugar_box"], Pose((0.0, 0.0, 0.1 - 0.175 / 2)))
     seen = image(at(0.0, 0.0))
-    assert tracked([box], seen).lost == ()
+    assert associate_detections([box], seen).lost == ()
     (can,) = seen.detections
     claimed = np.zeros(seen.depth.shape, bool)
     claimed[200:280, 280:360] = True
-    assert tracked([box], replace(seen, detections=(replace(can, mask=claimed),))).lost == (
-        "sugar_box_1",
-    )
+    assert associate_detections(
+        [box], replace(seen, detections=(replace(can, mask=claimed),))
+    ).lost == ("sugar_box_1",)
 
 
 def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
@@ -126,7 +126,7 @@ def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
 
 def test_what_is_known_stands_until_something_explains_more() -> None:
     known, _, across = side_by_side()
-    observation, lost = tracked(known, across)
+    observation, lost = associate_detections(known, across)
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
     assert lost == ()
     (whole,) = across.detections[:1]
@@ -135,7 +135,7 @@ def test_what_is_known_stands_until_something_explains_more() -> None:
         mask=np.any([d.mask for d in across.detections], axis=0),
         object_class=CLASSES["cracker_box"],
     )
-    observation, lost = tracked(known[:1], replace(across, detections=(larger,)))
+    observation, lost = associate_detections(known[:1], replace(across, detections=(larger,)))
     assert [d.object_class.name for d in observation.detections] == ["cracker_box"]
     assert lost == ("sugar_box_1",)
 
@@ -145,14 +145,14 @@ def test_what_is_known_gives_way_to_what_a_detector_is_sure_of() -> None:
     sure = replace(
         across, detections=tuple(replace(d, is_confident=True) for d in across.detections)
     )
-    observation, lost = tracked(known, sure)
+    observation, lost = associate_detections(known, sure)
     assert {d.X_TO for d in observation.detections} == {d.X_TO for d in across.detections}
     assert lost == ()
 
 
 def test_what_was_missed_once_but_looks_the_same_is_still_in_view() -> None:
     known, seen, _ = side_by_side()
-    observation, _ = tracked(known, replace(seen, detections=seen.detections[:1]))
+    observation, _ = associate_detections(known, replace(seen, detections=seen.detections[:1]))
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
     second = next(d for d in observation.detections if d.name == "sugar_box_2")
     assert (second.mask & seen.detections[1].mask).sum() > 0.9 * seen.detections[1].mask.sum()
@@ -162,7 +162,7 @@ def test_what_is_in_the_place_of_something_seen_is_lost() -> None:
     known, seen, _ = side_by_side()
     ghost = resting("gelatin_box", xy=known[0].X_TO.translation[:2], name="gelatin_box_1")
     hidden = resting("gelatin_box", xy=(0.25, 0.25), name="gelatin_box_2")
-    observation, lost = tracked(
+    observation, lost = associate_detections(
         [*known, ghost, hidden], replace(seen, depth=np.where(seen.depth > 0, np.float32(1.0), 0))
     )
     assert len(observation.detections) == 2

@@ -38,8 +38,13 @@ from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import mean_interval, wilson_interval
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
-from drake_clutter.systems.scenario import DETECTORS, Scenario, perception_of, policy_of
-from drake_clutter.systems.tracking import recognised
+from drake_clutter.systems.scenario import (
+    PRETRAINED_DETECTORS,
+    Scenario,
+    make_perception,
+    make_policy,
+)
+from drake_clutter.systems.tracking import match_to_ground_truth
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
@@ -108,7 +113,7 @@ class Player:
         self._set = cache(
             lambda name: load_scene_dataset(HERE / "scenes" / f"{name}.json", self._catalog)
         )
-        self._policy = cache(lambda agent: policy_of(agent, Scenario().world))
+        self._policy = cache(lambda agent: make_policy(agent, Scenario().world))
         self._ceiling = ArmReachabilityBound(Scenario().world)
 
     def __call__(self, asked: Asked) -> dict[str, Any]:
@@ -142,7 +147,7 @@ class Player:
         scenario: Scenario,
         motion: str,
     ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float]:
-        perceive, policy = perception_of(scenario, scene.support), self._policy(scenario.agent)
+        perceive, policy = make_perception(scenario, scene.support), self._policy(scenario.agent)
         seed, world = scenario.seed, scenario.world
         backend: ClosedLoop | ImageBackend
         if motion == "arm":
@@ -151,7 +156,7 @@ class Player:
             assert perceive is not None, "labels with settle are not in the rows"
             backend = ImageBackend(scene, perceive, seed=seed, world=world)
         task = run_episode(backend, policy, max_moves=scenario.max_moves)
-        robot = backend.timing.robot if isinstance(backend, ClosedLoop) else 0.0
+        robot = backend.timing.simulated if isinstance(backend, ClosedLoop) else 0.0
         return task, backend.belief.objects, robot
 
 
@@ -164,7 +169,7 @@ def episodes_of(row: Row, count: int, workers: int, path: Path) -> list[dict[str
     scenes = load_scene_dataset(HERE / "scenes" / f"{row.scenes}.json", load_catalog())
     networks = [checkpoint_path(row.agent, PRETRAINED_EXPLORERS)]
     if row.perception != "labels":
-        networks.append(checkpoint_path(row.perception, DETECTORS))
+        networks.append(checkpoint_path(row.perception, PRETRAINED_DETECTORS))
     scenario = to_plain(
         Scenario(agent=row.agent, perception=row.perception, objects=scenes.metadata["objects"])
     )
@@ -206,7 +211,7 @@ def told_of(task: ExplorationTask, known: Sequence[SceneObject]) -> dict[str, An
         "moves": len(task.transitions),
         "objects": len(task.scene.objects),
         "known": len(known),
-        "recognised": len(recognised(known, task.scene.objects)),
+        "recognised": len(match_to_ground_truth(known, task.scene.objects)),
         "results": {result.value: count for result, count in results.items()},
         "not_planned": dict(reasons),
         "collapse": f"{task.transitions[-1].move}: {worst.instability}; {worst.detail}"

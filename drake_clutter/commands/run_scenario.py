@@ -12,7 +12,7 @@ from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
-from drake_clutter.systems.scenario import Scenario, perception_of, policy_of
+from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
@@ -65,14 +65,14 @@ def run_closed_loop(
     scenario: Scenario, scene: Scene, on_transition: TransitionCallback
 ) -> tuple[ExplorationTask, Timing]:
     """Plays a scenario on a scene at rest."""
-    policy = policy_of(scenario.agent, scenario.world)
-    perceive = perception_of(scenario, scene.support)
+    policy = make_policy(scenario.agent, scenario.world)
+    perceive = make_perception(scenario, scene.support)
     closed_loop = ClosedLoop(
         scene,
         perceive=perceive,
         seed=scenario.seed,
         world=scenario.world,
-        record=True,
+        record_motion=True,
     )
     task = run_episode(
         closed_loop, policy, max_moves=scenario.max_moves, on_transition=on_transition

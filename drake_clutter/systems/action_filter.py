@@ -13,12 +13,12 @@ from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.tasks.belief import Belief, legal_moves
 
-Pickable = Callable[[Sequence[SceneObject]], Collection[str]]
+PickableFn = Callable[[Sequence[SceneObject]], Collection[str]]
 """From K_t, the names of objects that carry nothing known, and that can be held."""
 
 
 @dataclass(frozen=True, eq=False)
-class InfeasibleMoves:
+class InfeasibleMoveFilter:
     """Finds the moves of what cannot be picked, and those without a free place (an `ActionFilter`).
 
     Also those of what may carry something that was not recognized, as long as others are left.
@@ -29,7 +29,7 @@ class InfeasibleMoves:
         config: Of the task.
     """
 
-    pickable: Pickable
+    pickable: PickableFn
     empty_depth: NDArray[np.float32]
     config: ExplorationConfig
 

@@ -28,23 +28,23 @@ from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlanResponse
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
 from drake_clutter.station.station_simulation import StationSimulation
-from drake_clutter.systems.action_filter import InfeasibleMoves
+from drake_clutter.systems.action_filter import InfeasibleMoveFilter
 from drake_clutter.systems.perception_system import (
     LabelPerception,
-    Perceive,
+    PerceptionFn,
     PerceptionSystem,
-    for_who_sees,
+    with_min_release_height,
 )
 from drake_clutter.systems.planner_system import PlannerSystem
-from drake_clutter.systems.policy_system import Phase, PolicyState, PolicySystem
-from drake_clutter.systems.station_camera import add_camera, empty_depth
-from drake_clutter.systems.tracking import in_true_names, tracked
+from drake_clutter.systems.policy_system import PolicyPhase, PolicyState, PolicySystem
+from drake_clutter.systems.station_camera import add_overhead_camera, render_empty_depth
+from drake_clutter.systems.tracking import associate_detections, to_ground_truth_names
 from drake_clutter.tasks.belief import Belief, Policy
 from drake_clutter.tasks.exploration_task import MoveAttempt
 
-LATENCY = 1.15
+OBSERVATION_TO_PLAN_LATENCY = 1.15
 """From an observation to the plan [s]: 0.15 for perception, 1 for planning."""
-GUARDED = PlannerConfig(max_guarded_descent=0.08, descent_start_offset=0.007)
+GUARDED_PLANNER_CONFIG = PlannerConfig(max_guarded_descent=0.08, descent_start_offset=0.007)
 """For objects known from images: of a box in a pile they show the top, and with a wrong class its
 height is wrong; what it is to stand on may be a little higher, too."""
 
@@ -54,12 +54,12 @@ class Timing:
     """How long an episode took.
 
     Attributes:
-        robot: Simulated [s].
+        simulated: Simulated [s].
         wall: On the computer [s].
         planning: Of `wall`, for all plans [s].
     """
 
-    robot: float
+    simulated: float
     wall: float
     planning: float
 
@@ -79,10 +79,10 @@ class ClosedLoop:
         self,
         scene: Scene,
         *,
-        perceive: Perceive | None = None,
+        perceive: PerceptionFn | None = None,
         seed: int,
         world: ClutterConfig,
-        record: bool = False,
+        record_motion: bool = False,
     ) -> None:
         """Build the diagram around a scene at rest.
 
@@ -91,23 +91,23 @@ class ClosedLoop:
             perceive: The detector; None: the perfect one.
             seed: Of all chances.
             world: The config.
-            record: Whether outcomes have motions.
+            record_motion: Whether outcomes have motions.
         """
-        self.scene, self._record, self._perceive = scene, record, perceive
+        self.scene, self._record, self._perceive = scene, record_motion, perceive
         world = replace(world, cell=world.cell.with_support(scene.support))
-        self._world = world if perceive is None else for_who_sees(world)
+        self._world = world if perceive is None else with_min_release_height(world)
         self._detector = LabelDetector(world.cell.camera)
         self.perception = self._detector.perceive(scene)
-        ways = PlannerConfig() if perceive is None else GUARDED
-        self._planner, empty = PickPlacePlanner(world.cell, ways), empty_depth(world.cell)
+        ways = PlannerConfig() if perceive is None else GUARDED_PLANNER_CONFIG
+        self._planner, empty = PickPlacePlanner(world.cell, ways), render_empty_depth(world.cell)
         self.policy_system = PolicySystem(
             config=self.config,
             seed=seed,
-            tracker=None if perceive is None else tracked,
-            action_filter=InfeasibleMoves(self._pickable, empty, self.config),
+            tracker=None if perceive is None else associate_detections,
+            action_filter=InfeasibleMoveFilter(self._pickable, empty, self.config),
         )
         self.planner_system = PlannerSystem(
-            planner=self._planner, empty_depth=empty, latency=LATENCY
+            planner=self._planner, empty_depth=empty, latency=OBSERVATION_TO_PLAN_LATENCY
         )
         self.simulation = StationSimulation(
             world.cell, scene, visuals=True, add_systems=self._add_systems
@@ -121,7 +121,7 @@ class ClosedLoop:
     def _add_systems(
         self, builder: DiagramBuilder, station: ClutterStation, executor: PickPlaceExecutor
     ) -> None:
-        camera = add_camera(builder, station)
+        camera = add_overhead_camera(builder, station)
         perceive = self._perceive or LabelPerception(self.scene, station, self._world)
         perception = PerceptionSystem.AddToBuilder(
             builder, perceive=perceive, camera=station.cell.camera
@@ -171,13 +171,13 @@ class ClosedLoop:
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
         motion, state = list[MotionSample](), self._state
-        while state.phase is not Phase.DONE:
+        while state.phase is not PolicyPhase.DONE:
             is_moving = self.simulation.is_executing
             self.simulation.step()
             if self._record and is_moving:
                 motion.append(self.simulation.sample())
             before, state = state, self._state
-            done = state.phase is Phase.DONE or state.request.number != before.request.number
+            done = state.phase is PolicyPhase.DONE or state.request.number != before.request.number
             if done and before.request.number:
                 yield self._attempt(before, tuple(motion))
                 motion.clear()
@@ -197,7 +197,7 @@ class ClosedLoop:
             observation = state.request.observation
             assert observation is not None
             known = state.request.objects
-            decision = in_true_names(decision, known, observation, before.objects)
+            decision = to_ground_truth_names(decision, known, observation, before.objects)
         if isinstance(plan, PlanningFailure):
             no_spot = plan.reason is PlanningFailureReason.NO_FREE_SPOT
             result = MoveResult.NO_FREE_PLACEMENT if no_spot else MoveResult.NOT_PLANNED

@@ -19,9 +19,9 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.simulation.executor import SettleExecutor
 from drake_clutter.station.body_sleep import nearest_object
-from drake_clutter.systems.action_filter import InfeasibleMoves
-from drake_clutter.systems.perception_system import Perceive, for_who_sees
-from drake_clutter.systems.tracking import in_true_names, tracked
+from drake_clutter.systems.action_filter import InfeasibleMoveFilter
+from drake_clutter.systems.perception_system import PerceptionFn, with_min_release_height
+from drake_clutter.systems.tracking import associate_detections, to_ground_truth_names
 from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import SteppedBackend
 
@@ -36,7 +36,7 @@ class ImageBackend(SteppedBackend):
     def __init__(
         self,
         scene: Scene,
-        perceive: Perceive,
+        perceive: PerceptionFn,
         *,
         seed: int,
         world: ClutterConfig,
@@ -49,7 +49,7 @@ class ImageBackend(SteppedBackend):
             seed: Of all chances.
             world: The config.
         """
-        world = for_who_sees(world)
+        world = with_min_release_height(world)
         self._perceive, self._seed = perceive, seed
         self._camera = OverheadCamera(world.cell.camera)
         empty_depth = self._camera.render(replace(scene, objects=())).depth
@@ -59,8 +59,8 @@ class ImageBackend(SteppedBackend):
             world.exploration,
             scene,
             item_rng(seed),
-            tracker=tracked,
-            action_filter=InfeasibleMoves(_bare, empty_depth, world.exploration),
+            tracker=associate_detections,
+            action_filter=InfeasibleMoveFilter(_unloaded_objects, empty_depth, world.exploration),
         )
 
     @property
@@ -92,9 +92,11 @@ class ImageBackend(SteppedBackend):
 
     def to_ground_truth(self, decision: Decision) -> Decision:
         """See `SteppedBackend.to_ground_truth`."""
-        return in_true_names(decision, self.belief.objects, self.observation, self.scene.objects)
+        return to_ground_truth_names(
+            decision, self.belief.objects, self.observation, self.scene.objects
+        )
 
 
-def _bare(known: Sequence[SceneObject]) -> set[str]:
+def _unloaded_objects(known: Sequence[SceneObject]) -> set[str]:
     """Return the names of objects on which nothing rests."""
     return {o.name for o in known if not objects_resting_on(o, known)}

@@ -22,20 +22,22 @@ from drake_clutter.simulation.plant import pose_of
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import empty_observation
 
-Perceive = Callable[[NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation]
+PerceptionFn = Callable[
+    [NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation
+]
 """From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned
 one leaves alone."""
-Detect = Callable[[NDArray[np.float32], NDArray[np.uint8]], Observation]
+DetectorFn = Callable[[NDArray[np.float32], NDArray[np.uint8]], Observation]
 """Depth and colour alone, as `LearnedDetector.detect`."""
 
 
-RELEASE_HEIGHT = 0.003
+MIN_RELEASE_HEIGHT = 0.003
 """m; what is seen of a support is a millimetre or two off, and an arm that goes on down pushes stacks over."""
 
 
-def for_who_sees(world: ClutterConfig) -> ClutterConfig:
+def with_min_release_height(world: ClutterConfig) -> ClutterConfig:
     """The world of an agent that knows its objects from images: it lets go a little higher."""
-    higher = max(world.exploration.release_height, RELEASE_HEIGHT)
+    higher = max(world.exploration.release_height, MIN_RELEASE_HEIGHT)
     return replace(world, exploration=replace(world.exploration, release_height=higher))
 
 
@@ -61,7 +63,7 @@ class PerceptionSystem(LeafSystem):
         observation: `Observation`, computed once for a state of the inputs.
     """
 
-    def __init__(self, *, perceive: Perceive, camera: Camera) -> None:
+    def __init__(self, *, perceive: PerceptionFn, camera: Camera) -> None:
         """Make a system.
 
         Args:
@@ -85,7 +87,7 @@ class PerceptionSystem(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, *, perceive: Perceive, camera: Camera
+        builder: DiagramBuilder, *, perceive: PerceptionFn, camera: Camera
     ) -> "PerceptionSystem":
         """Add a system to a diagram; arguments as of the constructor."""
         made = PerceptionSystem(perceive=perceive, camera=camera)
@@ -101,7 +103,7 @@ class PerceptionSystem(LeafSystem):
 class LearnedPerception:
     """A detector in the loop that is given images as a depth camera takes them."""
 
-    def __init__(self, detect: Detect, *, noise: DepthNoise | None, seed: int) -> None:
+    def __init__(self, detect: DetectorFn, *, noise: DepthNoise | None, seed: int) -> None:
         """`noise`: what the rendered depth gets, by a seed."""
         self._detect, self._noise, self._seed = detect, noise, seed
 

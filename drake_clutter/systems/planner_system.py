@@ -14,7 +14,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.scenes.occlusion import occluded_boxes
 from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 
-PERIOD = 0.05
+REQUEST_POLL_PERIOD = 0.05
 """Between two looks for a new request [s]."""
 
 
@@ -54,7 +54,9 @@ class PlannerSystem(LeafSystem):
         self._response = self.DeclareAbstractState(AbstractValue.Make(PlanResponse()))
         # Number of the latest request, and when it came [s].
         self._received = self.DeclareDiscreteState([0.0, 0.0])
-        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, PERIOD / 2, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            REQUEST_POLL_PERIOD, REQUEST_POLL_PERIOD / 2, self._update
+        )
         of = {self.all_state_ticket()}
         self.DeclareAbstractOutputPort(
             "response", lambda: AbstractValue.Make(PlanResponse()), self._calc_response, of

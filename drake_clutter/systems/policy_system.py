@@ -22,14 +22,14 @@ from drake_clutter.tasks.belief import (
     update_belief,
 )
 
-PERIOD = 0.05
+UPDATE_PERIOD = 0.05
 """Between two looks at the responses [s]."""
 
 
-class Phase(Enum):
+class PolicyPhase(Enum):
     """What the agent is doing."""
 
-    LOOKING = "waits for things to come to rest, then looks"
+    OBSERVING = "waits for things to come to rest, then looks"
     WAITING = "waits for a plan, or for its end"
     DONE = "has no move left"
 
@@ -40,14 +40,14 @@ class PolicyState:
 
     Attributes:
         phase: What it is doing.
-        look_at: When it looks next [s].
+        observation_time: When it looks next [s].
         belief: What it knows.
         request: The latest.
         decision: Of which the request's move is part.
     """
 
-    phase: Phase = Phase.LOOKING
-    look_at: float = 0.0
+    phase: PolicyPhase = PolicyPhase.OBSERVING
+    observation_time: float = 0.0
     belief: Belief = field(default_factory=Belief)
     request: PlanRequest = field(default_factory=PlanRequest)
     decision: Decision | None = None
@@ -93,7 +93,7 @@ class PolicySystem(LeafSystem):
         policy: Policy | None = None,
         tracker: Tracker | None = None,
         action_filter: ActionFilter | None = None,
-        rest: float = 0.5,
+        post_motion_wait: float = 0.5,
     ) -> None:
         """Begin an episode.
 
@@ -103,10 +103,10 @@ class PolicySystem(LeafSystem):
             policy: Chooses the moves; None: it is set later.
             tracker: Gives detections names that last; None: they have them.
             action_filter: Adds to the invalid moves; None: every legal move may be tried.
-            rest: For which it lets things come to rest before it looks [s].
+            post_motion_wait: For which it lets things come to rest before it looks [s].
         """
         super().__init__()
-        self.policy, self._config, self._seed, self._rest = policy, config, seed, rest
+        self.policy, self._config, self._seed, self._rest = policy, config, seed, post_motion_wait
         self._tracker, self._action_filter = tracker, action_filter
         self._observation = self.DeclareAbstractInputPort(
             "observation", AbstractValue.Make(empty_observation())
@@ -116,7 +116,7 @@ class PolicySystem(LeafSystem):
         )
         self._finished = self.DeclareVectorInputPort("finished", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(PolicyState()))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(UPDATE_PERIOD, 0.0, self._update)
         of = {self.all_state_ticket()}
         self.DeclareAbstractOutputPort(
             "request", lambda: AbstractValue.Make(PlanRequest()), self._calc_request, of
@@ -132,16 +132,16 @@ class PolicySystem(LeafSystem):
 
     def _update(self, context: Context, state: State) -> EventStatus:
         before = self.state(context)
-        after = self._next(context, before)
+        after = self._next_state(context, before)
         if after is not before:
             state.get_mutable_abstract_state(int(self._state)).set_value(after)
         return EventStatus.Succeeded()
 
-    def _next(self, context: Context, now: PolicyState) -> PolicyState:
+    def _next_state(self, context: Context, now: PolicyState) -> PolicyState:
         time = context.get_time()
-        if now.phase is Phase.LOOKING and time >= now.look_at:
-            return self.decided(now, self._observation.Eval(context))
-        if now.phase is not Phase.WAITING:
+        if now.phase is PolicyPhase.OBSERVING and time >= now.observation_time:
+            return self.after_observation(now, self._observation.Eval(context))
+        if now.phase is not PolicyPhase.WAITING:
             return now
         move, response = now.request.move, self._response.Eval(context)
         assert move is not None
@@ -149,15 +149,17 @@ class PolicySystem(LeafSystem):
             return now
         if not isinstance(response.plan, PickPlacePlan):
             belief = now.belief.record(move, MoveResult.NOT_PLANNED)
-            return replace(now, phase=Phase.LOOKING, look_at=time, belief=belief)
+            return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
         finished, lowered = self._finished.Eval(context)
         if finished != now.request.number:
             return now
         X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered))
         belief = now.belief.record(move, MoveResult.PLACED, X_TO)
-        return replace(now, phase=Phase.LOOKING, look_at=time + self._rest, belief=belief)
+        return replace(
+            now, phase=PolicyPhase.OBSERVING, observation_time=time + self._rest, belief=belief
+        )
 
-    def decided(self, now: PolicyState, observation: Observation) -> PolicyState:
+    def after_observation(self, now: PolicyState, observation: Observation) -> PolicyState:
         """Return the state after a look: with a request for a move, or done."""
         assert self.policy is not None, "the policy is set before a simulation"
         belief, observation = update_belief(now.belief, observation, self._tracker)
@@ -165,11 +167,11 @@ class PolicySystem(LeafSystem):
         rng = item_rng(self._seed, number)
         decision = select_move(self.policy, belief, observation, rng, self._action_filter)
         if decision.move is None:
-            return replace(now, belief=belief, phase=Phase.DONE)
+            return replace(now, belief=belief, phase=PolicyPhase.DONE)
         rng = item_rng(self._seed, number)
         command = resolve_placement(decision.move, observation, self._config, rng)
         request = PlanRequest(number, decision.move, command, observation, belief.objects)
-        return PolicyState(Phase.WAITING, now.look_at, belief, request, decision)
+        return PolicyState(PolicyPhase.WAITING, now.observation_time, belief, request, decision)
 
     def _calc_request(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self.state(context).request)

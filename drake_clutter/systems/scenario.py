@@ -11,7 +11,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
-from drake_clutter.systems.perception_system import LearnedPerception, Perceive
+from drake_clutter.systems.perception_system import LearnedPerception, PerceptionFn
 from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import InRange, config_class, renamed_fields
 
@@ -45,14 +45,14 @@ class Scenario:
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
 
-DETECTORS = {
+PRETRAINED_DETECTORS = {
     "depth": "training/checkpoints/detector_depth.safetensors",
     "depth-color": "training/checkpoints/detector_color.safetensors",
 }
 """The shipped detectors, by name."""
 
 
-def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
+def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None:
     """What a scenario sees with; None: the perfect detector.
 
     Raises:
@@ -60,10 +60,12 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     """
     if scenario.perception == "labels":
         return None
-    if scenario.perception not in DETECTORS and not scenario.perception.endswith(".safetensors"):
-        allowed = f"labels, {', '.join(DETECTORS)}, or a .safetensors file"
+    if scenario.perception not in PRETRAINED_DETECTORS and not scenario.perception.endswith(
+        ".safetensors"
+    ):
+        allowed = f"labels, {', '.join(PRETRAINED_DETECTORS)}, or a .safetensors file"
         raise InputError(f"perception: {scenario.perception}; allowed are {allowed}")
-    path = checkpoint_path(scenario.perception, DETECTORS)
+    path = checkpoint_path(scenario.perception, PRETRAINED_DETECTORS)
     from drake_clutter.perception.learned_detector import LearnedDetector  # takes PyTorch
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
@@ -76,7 +78,7 @@ def perception_of(scenario: Scenario, support: Support) -> Perceive | None:
     return LearnedPerception(detector.detect, noise=noise, seed=scenario.seed)
 
 
-def policy_of(name: str, config: ClutterConfig) -> Policy:
+def make_policy(name: str, config: ClutterConfig) -> Policy:
     """Return an explorer that knows no more than the camera shows.
 
     Raises:

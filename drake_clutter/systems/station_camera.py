@@ -14,7 +14,7 @@ from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.station_simulation import TIME_STEP
 
 
-def add_camera(builder: DiagramBuilder, station: ClutterStation) -> RgbdSensor:
+def add_overhead_camera(builder: DiagramBuilder, station: ClutterStation) -> RgbdSensor:
     """Add the cell's camera to a diagram, connected to a station that has visuals."""
     seen = station.camera_scene_graph
     assert seen is not None
@@ -27,11 +27,11 @@ def add_camera(builder: DiagramBuilder, station: ClutterStation) -> RgbdSensor:
 
 
 @lru_cache(maxsize=8)
-def empty_depth(cell: WorkCell) -> NDArray[np.float32]:
+def render_empty_depth(cell: WorkCell) -> NDArray[np.float32]:
     """Return the depth image of a cell without objects, the arm at home [m]. Shape (h, w)."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ClutterStation(cell, [], time_step=TIME_STEP, visuals=True))
-    sensor = add_camera(builder, station)
+    sensor = add_overhead_camera(builder, station)
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
     station.set_state(root, np.array(cell.robot.home), [])

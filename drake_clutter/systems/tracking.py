@@ -15,24 +15,24 @@ from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.tasks.belief import Decision
 
-NEAR = 0.04
+GATING_DISTANCE = 0.04
 """m; an object that is seen so near to where one of its class is known to be is that one."""
-SEEN_PAST = 0.3
+MAX_SEE_THROUGH_FRACTION = 0.3
 """Of the pixels in which a known object should be seen, the share in which the camera sees past it if it is no longer there."""
-TAKEN = 0.5
+REASSIGNED_FRACTION = 0.5
 """Of the pixels in which it seems to be in view, the share that is recognised as something else if it never was there."""
 
-NO_BETTER = 0.9
+DUPLICATE_OVERLAP = 0.9
 """Of the pixels of a detection, the share in known objects that were not recognised, if it explains nothing that they do not."""
-MORE = 1.1
+EVIDENCE_RATIO = 1.1
 """What a known object explains, over what a detection does that takes most of its pixels from it, if that is no better."""
-IN_EACH_OTHER = 0.015
+MAX_PENETRATION = 0.015
 """m; what is known but out of view, and is deeper in something that is seen, cannot be there."""
-STILL = 0.97
+SUPPORT_FRACTION = 0.97
 """Of the pixels that speak for or against a known object, the share that speaks for it if it is still where it was."""
 
 
-class Tracked(NamedTuple):
+class AssociationResult(NamedTuple):
     """An image, told in the names of what is known.
 
     Attributes:
@@ -44,7 +44,9 @@ class Tracked(NamedTuple):
     lost: tuple[str, ...]
 
 
-def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
+def associate_detections(
+    known: Sequence[SceneObject], observation: Observation
+) -> AssociationResult:
     """Gives the detections of an image names that last.
 
     Objects of a class are matched with the least sum of distances. What is far from all that is known of its class is an object
@@ -54,18 +56,18 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
         known: K_t, each object where it was seen last, or where a move was to put it.
         observation: whose detections' names mean nothing.
     """
-    observation = _steadied(known, observation)
+    observation = _restore_missed_objects(known, observation)
     named: dict[str, Detection] = {}
     lost = list[str]()
     classes = [o.object_class for o in known] + [d.object_class for d in observation.detections]
     for object_class in dict.fromkeys(classes):
         of_class = [o for o in known if o.object_class is object_class]
         seen = [d for d in observation.detections if d.object_class is object_class]
-        pairs = _matched(of_class, seen, NEAR)
-        left = [o for k, o in enumerate(of_class) if k not in pairs and _gone(o, observation)]
+        pairs = _assign(of_class, seen, GATING_DISTANCE)
+        left = [o for k, o in enumerate(of_class) if k not in pairs and _is_gone(o, observation)]
         unnamed = [d for k, d in enumerate(seen) if k not in pairs.values()]
         named |= {of_class[k].name: seen[d] for k, d in pairs.items()}
-        moved = _matched(left, unnamed, np.inf)
+        moved = _assign(left, unnamed, np.inf)
         named |= {left[k].name: unnamed[d] for k, d in moved.items()}
         lost += [o.name for k, o in enumerate(left) if k not in moved]
         taken = {o.name for o in of_class}
@@ -81,12 +83,12 @@ def tracked(known: Sequence[SceneObject], observation: Observation) -> Tracked:
     lost += [
         o.name
         for o in unseen
-        if any(penetration_depth(o, other) > IN_EACH_OTHER for other in there)
+        if any(penetration_depth(o, other) > MAX_PENETRATION for other in there)
     ]
-    return Tracked(replace(observation, detections=detections), tuple(lost))
+    return AssociationResult(replace(observation, detections=detections), tuple(lost))
 
 
-def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observation:
+def _restore_missed_objects(known: Sequence[SceneObject], observation: Observation) -> Observation:
     """An image with the known objects that are still where they were, also those that were not recognised in it.
 
     A detector in doubt may say one thing now and another then: two boxes side by side may be two that lie across them. What is
@@ -96,7 +98,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
     for object_class in {o.object_class for o in known}:
         of_class = [o for o in known if o.object_class is object_class]
         seen = [d for d in observation.detections if d.object_class is object_class]
-        for k, d in _matched(of_class, seen, NEAR).items():
+        for k, d in _assign(of_class, seen, GATING_DISTANCE).items():
             recognised_now.add(of_class[k].name)
             familiar.add(seen[d].name)
     shape = observation.depth.shape
@@ -108,7 +110,7 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         for_it = np.count_nonzero(e.consistent)
         if for_it >= max(
             1, observation.camera.visibility_threshold * e.unoccluded_pixels
-        ) and for_it >= STILL * (for_it + e.free_space_violations):
+        ) and for_it >= SUPPORT_FRACTION * (for_it + e.free_space_violations):
             still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
 
@@ -117,10 +119,11 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         within = (
             np.count_nonzero(d.mask & detection.mask)
             for d in still.values()
-            if np.count_nonzero(d.mask) > MORE * size
+            if np.count_nonzero(d.mask) > EVIDENCE_RATIO * size
         )
         return bool(size) and (
-            explained[detection.mask].mean() >= NO_BETTER or any(n > TAKEN * size for n in within)
+            explained[detection.mask].mean() >= DUPLICATE_OVERLAP
+            or any(n > REASSIGNED_FRACTION * size for n in within)
         )
 
     kept = [
@@ -129,23 +132,25 @@ def _steadied(known: Sequence[SceneObject], observation: Observation) -> Observa
         if d.name in familiar or d.is_confident or not no_better(d)
     ]
     taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
-    steady = (d for d in still.values() if taken[d.mask].mean() <= TAKEN)
+    steady = (d for d in still.values() if taken[d.mask].mean() <= REASSIGNED_FRACTION)
     return replace(
         observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady))
     )
 
 
-def recognised(known: Sequence[SceneObject], objects: Sequence[SceneObject]) -> tuple[str, ...]:
+def match_to_ground_truth(
+    known: Sequence[SceneObject], objects: Sequence[SceneObject]
+) -> tuple[str, ...]:
     """The names of those objects that are among the known: each is one of its class, not far from where it is known to be."""
     found = set[str]()
     for name in {o.object_class.name for o in known}:
         there = [o for o in objects if o.object_class.name == name]
-        pairs = _matched([o for o in known if o.object_class.name == name], there, NEAR)
+        pairs = _assign([o for o in known if o.object_class.name == name], there, GATING_DISTANCE)
         found |= {there[k].name for k in pairs.values()}
     return tuple(o.name for o in objects if o.name in found)
 
 
-def in_true_names(
+def to_ground_truth_names(
     decision: Decision,
     known: Sequence[SceneObject],
     observation: Observation,
@@ -169,7 +174,7 @@ def in_true_names(
     )
 
 
-def _matched(
+def _assign(
     known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float
 ) -> dict[int, int]:
     """Indices of the seen by those of the known, no further apart than `within`, m."""
@@ -181,17 +186,17 @@ def _matched(
     return {int(k): int(d) for k, d in zip(rows, columns, strict=True) if apart[k, d] <= within}
 
 
-def _gone(known: SceneObject, observation: Observation) -> bool:
+def _is_gone(known: SceneObject, observation: Observation) -> bool:
     """Whether an object that was not recognised is not where it was: the camera sees past it, or sees something else there."""
     e = evaluate_pose(known.object_class, known.X_TO, observation.depth, observation.camera)
     as_expected = np.count_nonzero(e.consistent)
-    if e.free_space_violations > SEEN_PAST * (e.free_space_violations + as_expected):
+    if e.free_space_violations > MAX_SEE_THROUGH_FRACTION * (e.free_space_violations + as_expected):
         return True
     others = np.zeros(observation.depth.shape, bool)
     for detection in observation.detections:
         others |= detection.mask
     taken = np.count_nonzero(e.consistent & others[e.window])
     return bool(
-        taken > TAKEN * as_expected
+        taken > REASSIGNED_FRACTION * as_expected
         and as_expected >= observation.camera.visibility_threshold * e.unoccluded_pixels
     )
