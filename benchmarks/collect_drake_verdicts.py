@@ -148,7 +148,7 @@ def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterat
     """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch."""
     path = (
         folder
-        / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl"
+        / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl.gz"
     )
     head = asdict(batch) | {"config": config_yaml(config_of(batch))}
     yield from _records(path, head, _Factory(batch), range(count), pool)
@@ -235,7 +235,7 @@ def drake_moves(
     ]
     head = asdict(batch) | {"config": config_yaml(config_of(batch)), "scenes": scenes}
     yield from _records(
-        folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl",
+        folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl.gz",
         head,
         DrakeMoves,
         items,

@@ -1,63 +1,132 @@
-"""Files of JSON lines that a long run adds to: what is there is not made again."""
+"""Record files: JSON lines that a long computation appends to and resumes.
+
+The first line is a header, which holds everything that determines the records; each later line is
+one record. A file whose name ends in `.gz` is compressed. While records are appended to it, they
+are in an uncompressed file beside it, the journal, so that an interrupted run loses at most the
+line that it was writing. The journal is compressed and removed when the computation ends.
+"""
 
 import fcntl
+import gzip
 import json
-from collections.abc import Callable, Generator, Iterable, Mapping
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, atomic_write
 from drake_clutter.resources import git_commit
+
+
+def read_jsonl(path: Path) -> list[Any]:
+    """Return the header and the records of a record file; an empty list if there is none.
+
+    Args:
+        path: The file. Of a compressed file, the journal of an interrupted run is read, if it
+            holds more records.
+    """
+    journal = _journal_path(path)
+    lines = _complete_lines(journal.read_text(encoding="utf-8")) if journal.exists() else []
+    return [json.loads(line) for line in max(lines, _compressed_lines(path), key=len)]
 
 
 def resume_jsonl(
     path: Path,
     header: Mapping[str, Any],
     make_records: Callable[[int], Iterable[Any]],
-    upgrade_header: Callable[[Any], Any] = lambda head: head,
+    upgrade_header: Callable[[Any], Any] = lambda header: header,
 ) -> Generator[Any, None, None]:
-    """The head of a file, its records, and then those that it lacks, each added to it as soon as it is made.
+    """Yield the header of a record file, its records, and the records that it lacks.
 
-    The head, the first line, says what was asked and at which `commit` the file was begun. A line that was cut off
-    when a run was killed is made again.
+    Each new record is appended to the file as soon as it is computed. It is yielded as it will be
+    read from the file.
 
     Args:
-        path: the file; made, with its folders, if it is not there.
-        header: all that decides what the records are.
-        make_records: told how many records are there, makes those that follow.
-        upgrade_header: Turns the head that an older version wrote into today's form.
+        path: The file; created, with its folders, if it does not exist.
+        header: Everything that determines the records. The file's header holds it, and the
+            `commit` at which the file was created.
+        make_records: Receives the number of records in the file; yields those that follow.
+        upgrade_header: Converts a header written by an earlier version to today's form.
 
     Raises:
-        InputError: the file holds records of something else, or another run is adding to it.
+        InputError: The file has another header, or another process is appending to it.
     """
     header = json.loads(json.dumps(header))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                f"{path}: another run is adding to it; wait for it, or give another folder"
-            ) from error
-        file.seek(0)
-        lines = file.readlines()
-        if lines and not lines[-1].endswith("\n"):
-            lines.pop()
-            file.truncate(len("".join(lines).encode()))
-        if not lines:
-            lines = [json.dumps({**header, "commit": git_commit()}) + "\n"]
-            file.write(lines[0])
-            file.flush()
+    with _open_journal(path) as journal:
+        text = journal.read()
+        lines, compressed = _complete_lines(text), _compressed_lines(path)
+        if len(lines) < len(compressed) or not lines:
+            lines = compressed or [json.dumps({**header, "commit": git_commit()}) + "\n"]
+        if text != "".join(lines):
+            journal.truncate(0)
+            journal.write("".join(lines))
+            journal.flush()
         written_header, *records = map(json.loads, lines)
         upgraded = upgrade_header(written_header)
         differing = ", ".join(key for key, value in header.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(
-                f"{path}: holds records of something else ({differing}); give the same options or another folder"
+                f"{path}: holds records of something else ({differing}); give the same options or"
+                " another folder"
             )
         yield written_header
         yield from records
         for record in make_records(len(records)):
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            yield record
+            line = json.dumps(record)
+            journal.write(f"{line}\n")
+            journal.flush()
+            yield json.loads(line)
+
+
+def _journal_path(path: Path) -> Path:
+    """Return the file that records are appended to."""
+    return path.with_suffix("") if path.suffix == ".gz" else path
+
+
+def _complete_lines(text: str) -> list[str]:
+    """Return the lines of a text without a last line that was cut off."""
+    return [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _compressed_lines(path: Path) -> list[str]:
+    """Return the lines of a compressed file; an empty list for any other file."""
+    if path.suffix != ".gz" or not path.exists():
+        return []
+    return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
+
+
+@contextmanager
+def _open_journal(path: Path) -> Iterator[TextIO]:
+    """Open and lock the journal of a record file; at the end, compress and remove it."""
+    journal_path = _journal_path(path)
+    with _open_locked(journal_path, path) as journal:
+        try:
+            yield journal
+        finally:
+            if journal_path != path:
+                journal.seek(0)
+                lines = _complete_lines(journal.read())
+                if len(lines) > len(_compressed_lines(path)):
+                    with atomic_write(path) as temporary:
+                        temporary.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+                journal_path.unlink()
+
+
+def _open_locked(journal_path: Path, path: Path) -> TextIO:
+    """Return the journal at its start, locked against other processes."""
+    while True:
+        journal = journal_path.open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            journal.close()
+            raise InputError(
+                f"{path}: another run is adding to it; wait for it, or give another folder"
+            ) from error
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(journal.fileno()), journal_path.stat()):
+                journal.seek(0)
+                return journal
+        journal.close()  # The process that held the lock before has removed this file.

@@ -18,10 +18,10 @@ def results() -> ModuleType:
 def test_a_table_of_one_row(
     results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(results, "TABLE", [results.Row("random", 9, 5)])
-    monkeypatch.setattr(results, "TRADE", [])
+    monkeypatch.setattr(results, "TABLE", [results.GeneratorEvaluation("random", 9, 5)])
+    monkeypatch.setattr(results, "TEMPERATURES", [])
     out = tmp_path / "table.json"
-    results.main(tmp_path / "scenes", seed=3, out=out, at_most=3)
+    results.main(tmp_path / "scenes", seed=3, out=out, max_scenes=3)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["count"] == row["row"]["count"] == 3
     results.main(tmp_path / "scenes", seed=3, out=out)
@@ -45,7 +45,7 @@ def test_a_table_of_one_row(
     before = out.stat().st_mtime_ns
     results.main(tmp_path / "scenes", seed=3, out=out)
     assert out.stat().st_mtime_ns == before, "what is there is not measured again"
-    with pytest.raises(InputError, match="seed 3"):
+    with pytest.raises(InputError, match="holds results of another seed"):
         results.main(tmp_path / "scenes", seed=4, out=out)
 
 
@@ -58,7 +58,7 @@ def test_the_picture_of_the_temperature(results: ModuleType, tmp_path: Path) -> 
         "distinct_share": 1.0,
     }
     figures |= {"balanced_share": 0.5, "class_entropy": 2.0, "objects": "ycb7"}
-    results.draw_trade(
+    results.draw_temperature_effect(
         [{"temperature": 0.1} | figures, {"temperature": 0.4} | figures], tmp_path / "trade.png"
     )
     assert (tmp_path / "trade.png").stat().st_size > 10_000

@@ -21,6 +21,7 @@ from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
+from training import results_file
 
 COVERED = scene_of(
     resting("gelatin_box", xy=(0.05, 0.0)), resting("cracker_box", xy=(0.05, 0.0), floor=0.028)
@@ -88,16 +89,16 @@ def test_rows_of_the_results() -> None:
         episode | {"ended": "gave up", "found": 0, "arm_can": False},
         {"ended": "exception", "wall": 1.0, "arm_can": True, "commit": "def"},
     ]
-    row = script.row_of(script.ROWS[0], episodes)
+    row = script.summarize(script.EVALUATIONS[0], episodes)
     assert (row["success"], row["arm_can"], row["success_of_arm_can"]) == (2 / 6, 4 / 6, 1 / 4)
     assert (row["found_of_hidden"], row["moves_of_successes"], row["robot_minutes"]) == (0.5, 4, 1)
     assert (row["list_recall"], row["list_precision"]) == (8 / 10, 8 / 12)
     assert (row["dropped"], row["not_planned"]) == (1, {"no seal": 3})
-    held, refused = "what is left lies behind what no cup holds", "moves that the arm cannot plan"
+    held, refused = "remaining objects unreachable by suction", "most moves not plannable"
     assert row["failed_of"] == {"collapsed": 1, refused: 1, held: 1, "exception": 1}
     assert row["commits"] == ["abc", "def"]
     assert json.dumps(row)
-    nothing = script.row_of(script.ROWS[0], episodes[-1:])
+    nothing = script.summarize(script.EVALUATIONS[0], episodes[-1:])
     assert (
         nothing["success"],
         nothing["found"],
@@ -109,30 +110,30 @@ def test_rows_of_the_results() -> None:
         None,
         {"exception": 1},
     )
-    script.table_of([row, nothing])
+    assert script.table_row(nothing)["moves"] == ""
 
 
-def test_an_episode_is_played_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And one of other networks is not taken for it."""
-    script, path = training_script("evaluate_closed_loop"), tmp_path / "row.jsonl"
-    made = list[int]()
+def test_an_episode_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The record of an episode with other networks is not taken for it."""
+    script, path = training_script("evaluate_closed_loop"), tmp_path / "row.jsonl.gz"
+    numbers = list[int]()
 
-    def play(asked: Any) -> dict[str, int]:
-        made.append(asked.number)
-        return {"number": asked.number}
+    def run(request: Any) -> dict[str, int]:
+        numbers.append(request.number)
+        return {"number": request.number}
 
-    monkeypatch.setattr(script, "map_ordered", lambda _, items, **options: map(play, items))
-    row = script.ROWS[0]
-    assert [e["number"] for e in script.episodes_of(row, 2, 1, path)] == [row.first, row.first + 1]
-    assert (
-        [e["number"] for e in script.episodes_of(row, 3, 1, path)]
-        == made
-        == [row.first + k for k in range(3)]
-    )
+    monkeypatch.setattr(results_file, "map_ordered", lambda _, items, **options: map(run, items))
+    evaluation = script.EVALUATIONS[0]
+    first = evaluation.first
+    records = script.collect_episodes(evaluation, 2, 1, path)
+    assert [record["number"] for record in records] == [first, first + 1]
+    records = script.collect_episodes(evaluation, 3, 1, path)
+    assert [record["number"] for record in records] == numbers == [first, first + 1, first + 2]
     with pytest.raises(
-        InputError, match=r"row\.jsonl: holds records of something else \(row, scenario, weights\)"
+        InputError,
+        match=r"row\.jsonl\.gz: holds records of something else \(row, scenario, weights\)",
     ):
-        script.episodes_of(replace(row, agent="student-dagger"), 3, 1, path)
+        script.collect_episodes(replace(evaluation, agent="student-dagger"), 3, 1, path)
 
 
 def test_what_the_arm_can() -> None:

@@ -39,9 +39,10 @@ def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
 def images(camera: OverheadCamera) -> list[LabeledImage]:
     """Two images of the scene, the second without what lies on top."""
     known: dict[SceneObject, int] = {}
-    photograph, generator = training_script("render_image_dataset").photograph, rng()
+    render_image = training_script("render_image_dataset").render_image
+    generator = rng()
     scenes = (SCENE, scene_of(*(o for o in SCENE.objects if o.name != "over")))
-    return [photograph(camera, scene, known, generator) for scene in scenes]
+    return [render_image(camera, scene, known, generator) for scene in scenes]
 
 
 @pytest.mark.parametrize(("distance", "expected"), [(1.0, 0.0010), (1.6, 0.0025)])
@@ -178,9 +179,9 @@ def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.Mo
     script = training_script("render_image_dataset")
     monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
     monkeypatch.setattr(script, "NODES", 10)
-    monkeypatch.setattr(script, "AGENTS", {"random": ""})
+    monkeypatch.setattr(script, "GENERATORS", {"random": ""})
     for out in ("one", "other"):
-        script.main(tmp_path / out, count=2, dropped_share=0.0, seed=3, objects="ycb7")
+        script.main(tmp_path / out, count=2, heap_fraction=0.0, seed=3, objects="ycb7")
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
     assert len(files) == 1 + 4 + 6
     for file in files:
@@ -188,9 +189,9 @@ def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.Mo
             file
         )
     before = (tmp_path / "one" / "000000").stat().st_mtime_ns
-    script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=3, objects="ycb7")
+    script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=3, objects="ycb7")
     assert (tmp_path / "one" / "000000").stat().st_mtime_ns == before, (
         "what is there is not made again"
     )
     with pytest.raises(InputError, match="of another job"):
-        script.main(tmp_path / "one", count=2, dropped_share=0.0, seed=4, objects="ycb7")
+        script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=4, objects="ycb7")

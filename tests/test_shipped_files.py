@@ -11,6 +11,7 @@ from conftest import CATALOG, DEFAULT_CELL, training_script
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_head
 from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.records import read_jsonl
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import load_config_as, override_config
@@ -86,8 +87,8 @@ def configs_in(document: Any) -> Iterator[tuple[str, Any]]:
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_results(path: Path) -> None:
-    lines = path.read_text().splitlines()
-    document = json.loads(lines[0]) if path.suffix == ".jsonl" else json.loads("\n".join(lines))
+    is_record_file = path.name.endswith(".jsonl.gz")
+    document = read_jsonl(path)[0] if is_record_file else json.loads(path.read_text())
     upgrade_head(document)
     for key, value in configs_in(document):
         if isinstance(value, str):  # YAML, or the name of a config

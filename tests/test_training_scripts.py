@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -14,10 +13,10 @@ from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.agents.generators import GenerationJob
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
-from drake_clutter.records import resume_jsonl
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.simulation.judge import DrakeJudge
+from training.results_file import ResultsFile
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
 
@@ -45,7 +44,7 @@ def test_a_row_of_the_table() -> None:
         result(ALL, 4, (4,)),
         result("gave up", 1, ()),
     ]
-    row = training_script("evaluate_explorers").row_of(results, {"ceiling": ceiling})
+    row = training_script("evaluate_explorers").summarize(results, {"ceiling": ceiling})
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
     assert (row["within_10"]["found"], row["within_20"]["found"]) == (3 / 4, 6 / 4)
@@ -63,7 +62,7 @@ def test_a_row_of_the_table() -> None:
 @pytest.mark.parametrize(("moves", "in_10", "in_20"), [(10, 0.5, 0.5), (11, 0, 0.5), (20, 0, 0.5)])
 def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
     results = [result(ended, 1, (0,) * (moves - 1) + (1,)) for ended in (ALL, COLLAPSED)]
-    row = training_script("evaluate_explorers").row_of(results, {})
+    row = training_script("evaluate_explorers").summarize(results, {})
     told = {
         limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")]
         for limit in (10, 20)
@@ -71,23 +70,22 @@ def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
     assert told == {10: [in_10, in_10, 2 * in_10], 20: [in_20, in_20, 2 * in_20]}
 
 
-def test_episodes_are_played_once(tmp_path: Path) -> None:
-    """And those that are there are not taken for others."""
+def test_episodes_are_run_once(tmp_path: Path) -> None:
+    """Records of other options are not taken for these."""
     script = training_script("evaluate_explorers")
     scenes = load_scene_dataset(script.SCENES / "sg_star_25.json", CATALOG)
-    path = tmp_path / "random.jsonl"
-    played = script.played(scenes, "random", 1, "equilibrium", 0, 1, path)
+    path = tmp_path / "random.jsonl.gz"
+    options = {"fidelity": "equilibrium", "seed": 0, "workers": 1}
+    records = script.collect_episodes(path, scenes, "random", 1, **options)
     before = path.read_bytes()
-    assert script.played(scenes, "random", 1, "equilibrium", 0, 1, path) == played
+    assert script.collect_episodes(path, scenes, "random", 1, **options) == records
     assert path.read_bytes() == before
-    assert script.played(scenes, "random", 2, "equilibrium", 0, 1, path)[:1] == played, (
-        "others are added to it"
-    )
-    assert played[0].hidden == scenes.scenes[0].num_hidden
+    assert script.collect_episodes(path, scenes, "random", 2, **options)[:1] == records
+    assert script.to_result(records[0]).hidden == scenes.scenes[0].num_hidden
     with pytest.raises(
-        InputError, match=r"random\.jsonl: holds records of something else \(agent, seed\)"
+        InputError, match=r"random\.jsonl\.gz: holds records of something else \(agent, seed\)"
     ):
-        script.played(scenes, "largest-clear", 1, "equilibrium", 1, 1, path)
+        script.collect_episodes(path, scenes, "largest-clear", 1, **options | {"seed": 1})
     with pytest.raises(InputError, match="--out: is missing"):
         script.main(tmp_path, only="sg_star_25", agents=["random"])
     with pytest.raises(InputError, match="--out: is missing"):
@@ -105,18 +103,17 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=told):
             script.main(tmp_path / "episodes", only="sg_14", count=1, agents=agents, out=out)
     out.write_text('{"rows": []}')
-    with pytest.raises(InputError, match=r"--out .*table\.json: is no file of results \('seed'\)"):
+    with pytest.raises(InputError, match=r"--out .*table\.json: is no results file \('seed'\)"):
         script.main(tmp_path / "episodes", only="sg_14", count=1, agents=["random"], out=out)
     assert list((tmp_path / "episodes").iterdir()) == []
 
 
-def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -> None:
+def test_an_explorer_is_compared_with_the_records_of_a_baseline(tmp_path: Path) -> None:
     script, out = training_script("evaluate_explorers"), tmp_path / "table.json"
     options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "equilibrium", "out": out}
     script.main(tmp_path, agents=["largest-clear"], count=1, **options)
-    yardstick = tmp_path / "sg_star_10_largest-clear.jsonl"
-    whole = yardstick.read_text()
-    yardstick.write_text(whole + '{"scene": ')  # it was killed while it wrote the second
+    baseline = tmp_path / "sg_star_10_largest-clear.jsonl.gz"
+    content = baseline.read_bytes()
     script.main(tmp_path, agents=["student"], count=2, **options)
     clear, student = json.loads(out.read_text())["rows"]
     assert (
@@ -125,58 +122,53 @@ def test_an_agent_is_compared_with_what_a_yardstick_has_played(tmp_path: Path) -
         clear["episodes"],
     ) == (1, 1, 1)
     assert (student["both_with_largest_clear"], student["episodes"]) == (1, 2)
-    assert "moves_to_ceiling" not in student, "nobody has played that"
-    assert yardstick.read_text() == whole, "and nothing is played for it"
+    assert "moves_to_ceiling" not in student, "there are no records of the oracle"
+    assert baseline.read_bytes() == content, "no episode of the baseline is run for a comparison"
 
 
-def test_rows_take_the_place_of_their_own(tmp_path: Path) -> None:
-    add_rows, path = training_script("evaluate_explorers").add_rows, tmp_path / "table.json"
-    add_rows(
-        path,
-        {"seed": 1},
-        [
-            {"set": "b", "agent": "student", "episodes": 1},
-            {"set": "b", "agent": "random", "episodes": 1},
-        ],
+def test_a_row_replaces_the_row_of_the_same_keys(tmp_path: Path) -> None:
+    path = tmp_path / "table.json"
+    results = ResultsFile(path, {"seed": 1}, ("set", "agent"))
+    results.add(
+        {"set": "b", "agent": "student", "episodes": 1},
+        {"set": "b", "agent": "random", "episodes": 1},
     )
-    add_rows(
-        path,
-        {"seed": 1},
-        [
-            {"set": "b", "agent": "random", "episodes": 2},
-            {"set": "a", "agent": "random", "episodes": 2},
-        ],
+    results.add(
+        {"set": "b", "agent": "random", "episodes": 2},
+        {"set": "a", "agent": "random", "episodes": 2},
     )
     rows = json.loads(path.read_text())["rows"]
     assert [(row["set"], row["agent"], row["episodes"]) for row in rows] == [
-        ("a", "random", 2),
         ("b", "student", 1),
         ("b", "random", 2),
+        ("a", "random", 2),
     ]
-    with pytest.raises(InputError, match=r"table\.json: holds rows of other chances"):
-        add_rows(path, {"seed": 2}, [])
+    assert results.find({"set": "b", "agent": "random"}) == rows[1]
+    assert results.find({"set": "c", "agent": "random"}) is None
+    with pytest.raises(InputError, match=r"table\.json: holds results of another seed"):
+        ResultsFile(path, {"seed": 2}, ("set", "agent")).read()
 
 
-@pytest.mark.parametrize("frozen", [False, True])
-def test_a_set_of_scenes(frozen: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("with_poses", [False, True])
+def test_a_set_of_scenes(with_poses: bool, tmp_path: Path) -> None:
     script = training_script("generate_scene_dataset")
     options = {
         "agent": "random",
         "nodes": 10,
         "seed": 1,
         "work": tmp_path / "work",
-        "frozen": frozen,
+        "with_poses": with_poses,
     }
     script.main(tmp_path / "first.json", count=2, **options)
     first = load_scene_dataset(tmp_path / "first.json", CATALOG)
     assert first.metadata["judge"] == "drake"
     assert len({scene.canonical_form for scene in first.scenes}) == 2
     assert all(
-        scene.num_hidden > 0 and (scene.settled_poses is not None) == frozen
+        scene.num_hidden > 0 and (scene.settled_poses is not None) == with_poses
         for scene in first.scenes
     )
     again = tmp_path / "again.json"
-    script.main(again, count=1, not_in=[tmp_path / "first.json"], **options)
+    script.main(again, count=1, exclude=[tmp_path / "first.json"], **options)
     (other,) = load_scene_dataset(again, CATALOG).scenes
     assert other.canonical_form not in {scene.canonical_form for scene in first.scenes}
 
@@ -195,15 +187,16 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
     record = judge(index)
     assert record == {"fast": True, "fell": "toppled"}
     fell = Counter[str]()
-    assert list(script.graphs_of([record], fell)) == []
+    assert list(script.select_graphs([record], fell)) == []
     assert fell == {"toppled": 1}
 
 
 @pytest.mark.parametrize(
-    ("frozen", "told"), [(False, r"something else \(weights\)"), (True, "scenes of other options")]
+    ("with_poses", "message"),
+    [(False, r"something else \(weights\)"), (True, "scenes of other options")],
 )
 def test_a_set_goes_on_with_the_weights_that_it_began_with(
-    frozen: bool, told: str, tmp_path: Path
+    with_poses: bool, message: str, tmp_path: Path
 ) -> None:
     script, agent = training_script("generate_scene_dataset"), tmp_path / "agent.safetensors"
     options = {
@@ -211,7 +204,7 @@ def test_a_set_goes_on_with_the_weights_that_it_began_with(
         "nodes": 10,
         "work": tmp_path / "work",
         "count": 1,
-        "frozen": frozen,
+        "with_poses": with_poses,
     }
 
     checkpoints = Path(__file__).parents[1] / "training" / "checkpoints"
@@ -223,7 +216,7 @@ def test_a_set_goes_on_with_the_weights_that_it_began_with(
     take("sg")
     script.main(tmp_path / "set.json", **options)
     take("sg_star")
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         script.main(tmp_path / "set.json", **options)
 
 
@@ -232,28 +225,3 @@ def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
         training_script("generate_scene_dataset").main(
             tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1
         )
-
-
-def test_records_are_made_once(tmp_path: Path) -> None:
-    """Also after a run was killed while it wrote one; and none is taken for what it is not."""
-    path, made = tmp_path / "folder" / "records.jsonl", list[int]()
-
-    def make(done: int) -> Iterator[int]:
-        for k in range(done, 3):
-            made.append(k)
-            yield k
-
-    first = resume_jsonl(path, {"seed": 1}, make)
-    assert next(first)["seed"] == 1
-    assert [next(first), next(first)] == [0, 1]
-    with pytest.raises(InputError, match="another run is adding to it"):
-        next(resume_jsonl(path, {"seed": 1}, make))
-    first.close()
-    path.write_text(path.read_text()[:-1])
-    assert list(resume_jsonl(path, {"seed": 1}, make))[1:] == [0, 1, 2]
-    assert list(resume_jsonl(path, {"seed": 1}, make))[1:] == [0, 1, 2]
-    assert made == [0, 1, 1, 2]
-    with pytest.raises(
-        InputError, match=r"records\.jsonl: holds records of something else \(seed\)"
-    ):
-        next(resume_jsonl(path, {"seed": 2}, make))

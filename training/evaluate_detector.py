@@ -1,11 +1,12 @@
-"""How well a trained detector sees: in scenes of a frozen set, and in images held out of its training.
+r"""Evaluate a trained detector on shipped scene sets and on rendered images.
 
-    python training/evaluate_detector.py --detector training/checkpoints/detector_depth.safetensors --count 100 \
-        --images runs/images --out training/results/detector_depth.json
+    python training/evaluate_detector.py --scenes training/scenes/sg_star_25.json \
+        --detector training/checkpoints/detector_depth.safetensors --out detector.json
 """
 
 import time
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,189 +16,255 @@ import torch
 import typer
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
 from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.catalog import Catalog, load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import cli_error_handler, write_json
+from drake_clutter.files import write_json
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.perception.depth_noise import add_depth_noise
 from drake_clutter.perception.image_dataset import ImageDataset, LabeledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
-from drake_clutter.resources import git_commit
+from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera import OverheadCamera
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
+from training.results_file import provenance
+from training.script import SeedOption, progress, run_script
 
-SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
-"""Bounds between which recall is told apart: how much of an object is seen."""
+VISIBILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
+"""Bounds of the visible fractions for which recall is given separately."""
+MIN_IOU = 0.5
+"""Least intersection over union of a detection's mask with the object that it detects."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """An object that is at least partly in view, and what became of it.
+class ObjectDetection:
+    """How an object, of which at least a part is in view, was detected.
 
     Attributes:
-        share: of its pixels that are seen. found: whether a detection covers it with an IoU of 0.5 or more.
-        named: whether that is of its class. translation: m; turn: rad; errors of its pose, NaN if it is not.
+        visible_fraction: Fraction of its pixels that are in view.
+        is_found: Whether a detection's mask covers it, see `MIN_IOU`.
+        is_recognized: Whether that detection has its class, too.
+        translation_error: Error of the detected position [m]; NaN if it is not recognized.
+        rotation_error: Error of the detected rotation [rad]; NaN if it is not recognized.
     """
 
-    share: float
-    found: bool
-    named: bool
-    translation: float
-    turn: float
+    visible_fraction: float
+    is_found: bool
+    is_recognized: bool
+    translation_error: float
+    rotation_error: float
 
 
-def compared(
+@dataclass(frozen=True)
+class DetectionMetrics:
+    """How the objects of some images were detected.
+
+    Attributes:
+        objects: The objects of the images that are in view.
+        num_false_positives: Number of detections that detect none of them.
+        seconds: Time that the detector took for each image [s].
+    """
+
+    objects: Sequence[ObjectDetection]
+    num_false_positives: int
+    seconds: Sequence[float]
+
+    def fields(self) -> dict[str, Any]:
+        """Return the metrics for a results file."""
+        found = [o for o in self.objects if o.is_found]
+        recognized = [o for o in self.objects if o.is_recognized]
+        threshold = ClutterConfig().cell.camera.visibility_threshold
+        by_visibility = defaultdict[str, list[ObjectDetection]](list)
+        for o in self.objects:
+            k = int(np.searchsorted(VISIBILITY_BINS[:-1], o.visible_fraction, side="right"))
+            name = f"{VISIBILITY_BINS[k - 1]:g} to {min(1, VISIBILITY_BINS[k]):g}"
+            by_visibility[name].append(o)
+        translation_errors = [o.translation_error for o in recognized]
+        rotation_errors = [o.rotation_error for o in recognized]
+        num_detections = len(found) + self.num_false_positives
+        return {
+            "in_view": recall([o for o in self.objects if o.visible_fraction >= threshold]),
+            "recall_by_visible_share": {
+                name: recall(by_visibility[name]) for name in sorted(by_visibility)
+            },
+            "precision": len(recognized) / max(1, num_detections),
+            "class_accuracy_of_found": len(recognized) / max(1, len(found)),
+            "translation_mm": [
+                1000 * float(q) for q in np.nanquantile(translation_errors, (0.5, 0.95))
+            ],
+            "rotation_deg": [
+                float(np.degrees(q)) for q in np.nanquantile(rotation_errors, (0.5, 0.95))
+            ],
+            "ms_per_frame": [1000 * float(q) for q in np.quantile(self.seconds, (0.5, 0.95))],
+            "images": len(self.seconds),
+        }
+
+
+def recall(objects: Sequence[ObjectDetection]) -> dict[str, Any]:
+    """Return the fraction of objects that are recognized, with its 95 % interval."""
+    count = sum(o.is_recognized for o in objects)
+    return {
+        "objects": len(objects),
+        "recall": count / len(objects),
+        "ci95": wilson_interval(count, len(objects)),
+    }
+
+
+def detect_objects(
     image: LabeledImage, detector: LearnedDetector, catalog: Catalog, rng: np.random.Generator
-) -> tuple[list[Seen], int, float]:
-    """The objects of an image, how many detections are none of them, and s that the detector took."""
+) -> DetectionMetrics:
+    """Detect the objects of an image, with the noise of a depth camera, and compare with truth.
+
+    Args:
+        image: The image with its ground truth.
+        detector: The detector.
+        catalog: Catalog of the objects in the image.
+        rng: Random generator of the noise.
+    """
     depth = add_depth_noise(image.depth, rng)
-    begun = time.perf_counter()
-    said = detector.detect(depth, image.color).detections
-    spent = time.perf_counter() - begun
+    start = time.perf_counter()
+    detections = detector.detect(depth, image.color).detections
+    seconds = time.perf_counter() - start
     masks = [image.label == k for k in range(len(image.classes))]
-    overlap = np.array([[_iou(mask, d.mask) for d in said] for mask in masks]).reshape(
-        len(masks), len(said)
-    )
+    overlap = np.array([[mask_iou(mask, d.mask) for d in detections] for mask in masks])
+    overlap = overlap.reshape(len(masks), len(detections))
     rows, columns = linear_sum_assignment(-overlap)
-    pairs = {int(k): said[d] for k, d in zip(rows, columns, strict=True) if overlap[k, d] >= 0.5}
+    detection_of = {
+        int(k): detections[d]
+        for k, d in zip(rows, columns, strict=True)
+        if overlap[k, d] >= MIN_IOU
+    }
     objects = []
-    for k, (name, share) in enumerate(zip(image.classes, image.visible_fractions, strict=True)):
+    for k, (name, fraction) in enumerate(zip(image.classes, image.visible_fractions, strict=True)):
         if not masks[k].any():
             continue
-        detection = pairs.get(k)
-        named = detection is not None and detection.object_class.name == name
+        detection = detection_of.get(k)
         errors = (np.nan, np.nan)
-        if named and detection is not None:
+        is_recognized = detection is not None and detection.object_class.name == name
+        if is_recognized and detection is not None:
             errors = pose_error(catalog.classes[name], detection.X_TO, image.X_TO[k])
-        objects.append(Seen(float(share), detection is not None, named, *errors))
-    return objects, len(said) - len(pairs), spent
+        objects.append(
+            ObjectDetection(float(fraction), detection is not None, is_recognized, *errors)
+        )
+    return DetectionMetrics(objects, len(detections) - len(detection_of), [seconds])
 
 
-def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Return the intersection over union of two masks (H, W)."""
     return int(np.count_nonzero(a & b)) / max(1, int(np.count_nonzero(a | b)))
 
 
-def summarised(objects: list[Seen], false: int, seconds: list[float]) -> dict[str, Any]:
-    """Figures of many images."""
-    by_share: dict[str, list[Seen]] = defaultdict(list)
-    for o in objects:
-        low = max(bound for bound in SHARES[:-1] if bound <= o.share)
-        by_share[f"{low:g} to {min(1, SHARES[SHARES.index(low) + 1]):g}"].append(o)
-    found = [o for o in objects if o.found]
-    named = [o for o in objects if o.named]
+def render_image(camera: OverheadCamera, scene: Scene) -> LabeledImage:
+    """Return an image of a scene with its ground truth."""
+    images = camera.render(scene)
+    visible_fraction = camera.visible_shares(scene, images.label)
+    num_pixels = np.bincount(images.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
+    unoccluded_pixels = np.array(
+        [
+            round(n / visible_fraction[o.name]) if visible_fraction[o.name] > 0 else 1
+            for n, o in zip(num_pixels, scene.objects, strict=True)
+        ]
+    )
+    return LabeledImage(
+        images.color,
+        images.depth,
+        images.label,
+        tuple(o.object_class.name for o in scene.objects),
+        tuple(o.X_TO for o in scene.objects),
+        unoccluded_pixels,
+    )
 
-    def recall(of: list[Seen]) -> dict[str, Any]:
-        count = sum(o.named for o in of)
-        return {
-            "objects": len(of),
-            "recall": count / len(of),
-            "ci95": wilson_interval(count, len(of)),
-        }
 
-    in_view = [o for o in objects if o.share >= ClutterConfig().cell.camera.visibility_threshold]
-    return {
-        "in_view": recall(in_view),
-        "recall_by_visible_share": {name: recall(by_share[name]) for name in sorted(by_share)},
-        "precision": len(named) / max(1, len(found) + false),
-        "class_accuracy_of_found": len(named) / max(1, len(found)),
-        "translation_mm": [
-            1000 * float(q) for q in np.nanquantile([o.translation for o in named], (0.5, 0.95))
-        ],
-        "rotation_deg": [
-            float(np.degrees(q)) for q in np.nanquantile([o.turn for o in named], (0.5, 0.95))
-        ],
-        "ms_per_frame": [1000 * float(q) for q in np.quantile(seconds, (0.5, 0.95))],
-        "images": len(seconds),
-    }
+def evaluate_images(
+    network: SegmentationNetwork,
+    class_names: Iterable[str],
+    images: Sequence[LabeledImage],
+    catalog: Catalog,
+    seed: int,
+) -> dict[str, Any]:
+    """Return the metrics of a network on images.
+
+    Args:
+        network: The network.
+        class_names: Object classes that the detector may find.
+        images: The images with their ground truth.
+        catalog: Catalog of the object classes.
+        seed: Seed of the camera's noise.
+    """
+    cell = ClutterConfig().cell
+    classes = [catalog.classes[name] for name in class_names]
+    detector = LearnedDetector(network, classes, cell.camera, cell.support)
+    detector.detect(images[0].depth, images[0].color)  # The first call compiles code.
+    parts = [
+        detect_objects(image, detector, catalog, item_rng(seed, k))
+        for k, image in enumerate(images)
+    ]
+    return DetectionMetrics(
+        [o for part in parts for o in part.objects],
+        sum(part.num_false_positives for part in parts),
+        [s for part in parts for s in part.seconds],
+    ).fields()
 
 
 def main(
-    detector: Annotated[Path, typer.Option(help="A checkpoint of train_detector.py.")],
-    out: Annotated[Path, typer.Option(help="JSON to write.")],
-    scenes: Annotated[list[Path], typer.Option(help="Frozen sets.")],
-    count: Annotated[int, typer.Option(help="Scenes of each.")] = 100,
+    detector: Annotated[
+        Path, typer.Option(metavar="FILE", help="Checkpoint that train_detector.py wrote.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")],
+    scenes: Annotated[
+        list[Path], typer.Option(metavar="FILE", help="Scene set with poses. May be repeated.")
+    ],
+    count: Annotated[int, typer.Option(min=1, help="Only the first N scenes of each set.")] = 100,
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of render_image_dataset.py, of another seed than the training's."
+            metavar="DIR",
+            help="Folder that render_image_dataset.py wrote with another seed than the training's.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the camera's noise.")] = 0,
-    threads: Annotated[int, typer.Option(help="Of PyTorch.")] = 2,
+    seed: SeedOption = 0,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch.")] = 2,
 ) -> None:
-    """Compares detections with the truth."""
+    """Evaluate a detector, and print and write its metrics."""
     torch.set_num_threads(threads)
-    config, catalog, console = ClutterConfig(), load_catalog(), Console(stderr=True)
-    network, camera, rows = (
-        SegmentationNetwork.load(detector),
-        OverheadCamera(config.cell.camera),
-        dict[str, Any](),
-    )
-
-    def shown(path: Path) -> tuple[list[str], list[LabeledImage]]:
-        held = load_scene_dataset(path, catalog)
-        found = []
-        for k in track(range(min(count, len(held.scenes))), path.stem, console=console):
-            scene = held.settled_scene(k, held.grammar, config)
-            image = camera.render(scene)
-            share = camera.visible_shares(scene, image.label)
-            seen = np.bincount(image.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
-            alone = np.array(
-                [
-                    round(n / share[o.name]) if share[o.name] > 0 else 1
-                    for n, o in zip(seen, scene.objects, strict=True)
-                ]
-            )
-            names = tuple(o.object_class.name for o in scene.objects)
-            found.append(
-                LabeledImage(
-                    image.color,
-                    image.depth,
-                    image.label,
-                    names,
-                    tuple(o.X_TO for o in scene.objects),
-                    alone,
-                )
-            )
-        return [c.name for c in held.classes], found
-
-    def told(names: list[str], given: list[LabeledImage]) -> dict[str, Any]:
-        eye = LearnedDetector(
-            network, [catalog.classes[n] for n in names], config.cell.camera, config.cell.support
-        )
-        eye.detect(given[0].depth, given[0].color)  # compiles
-        objects, false, seconds = list[Seen](), 0, list[float]()
-        for k, image in enumerate(given):
-            more, wrong, spent = compared(image, eye, catalog, item_rng(seed, k))
-            objects, false, seconds = objects + more, false + wrong, [*seconds, spent]
-        return summarised(objects, false, seconds)
-
+    config = ClutterConfig()
+    catalog = load_catalog()
+    network = SegmentationNetwork.load(detector)
+    camera = OverheadCamera(config.cell.camera)
+    rows = dict[str, Any]()
     for path in scenes:
-        rows[path.stem] = told(*shown(path))
+        scene_set = load_scene_dataset(path, catalog)
+        numbers = range(min(count, len(scene_set.scenes)))
+        rendered = [
+            render_image(camera, scene_set.settled_scene(k, scene_set.grammar, config))
+            for k in progress(numbers, path.stem)
+        ]
+        class_names = [c.name for c in scene_set.classes]
+        rows[path.stem] = evaluate_images(network, class_names, rendered, catalog, seed)
     if images is not None:
-        held_out = ImageDataset(images)
-        rows["images"] = told(
-            list(network.classes), [held_out[k] for k in range(min(count, len(held_out)))]
-        )
-    fields = {
-        "detector": detector.name,
-        "trained": load_checkpoint(detector).metadata["metrics"],
-        "commit": git_commit(),
-        "seed": seed,
-        "rows": rows,
-    }
-    write_json(out, fields | {"config": to_plain(config)})
-    console.print_json(data=rows)
+        dataset = ImageDataset(images)
+        held_out = [dataset[k] for k in range(min(count, len(dataset)))]
+        rows["images"] = evaluate_images(network, network.classes, held_out, catalog, seed)
+    write_json(
+        out,
+        {
+            "detector": detector.name,
+            "trained": load_checkpoint(detector).metadata["metrics"],
+            **provenance(),
+            "seed": seed,
+            "count": count,
+            "rows": rows,
+            "config": to_plain(config),
+        },
+    )
+    Console().print_json(data=rows)
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,13 +1,13 @@
-"""Table I: every generation agent at every size, judged by Drake; how temperature trades what is hidden for variety; pictures.
+"""Evaluate scene generators in Drake (Table I of the paper), and the effect of the temperature.
 
     python training/evaluate_generators.py runs/table1 --workers 2
 
-Scenes stay in the folder; a run that was stopped goes on with what is missing.
+The scenes stay in the folder. An interrupted run is resumed by the same command.
 """
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,26 +18,37 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from drake_clutter.agents.generators import PRETRAINED_GENERATORS, GenerationJob
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, cli_error_handler, write_json
-from drake_clutter.resources import git_commit, resource_path
-from drake_clutter.scenes.interfaces import InconclusiveVerdict
+from drake_clutter.resources import resource_path
+from drake_clutter.scenes.interfaces import InconclusiveVerdict, Instability
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.judge import FastJudge
-
-RESULTS = Path(__file__).parent / "results"
+from training.results_file import ResultsFile, Row, provenance
+from training.script import (
+    RESULTS,
+    WorkersOption,
+    format_number,
+    print_table,
+    progress,
+    run_script,
+)
 
 
 @dataclass(frozen=True)
-class Row:
-    """Scenes of an agent at a size; `agent` as for `drake-clutter generate`."""
+class GeneratorEvaluation:
+    """One row of the table: scenes of one generator and size.
+
+    Attributes:
+        agent: Name of the generator, or file of a checkpoint relative to the checkout.
+        nodes: Number of nodes of the scene graphs.
+        count: Number of scenes.
+        objects: Name of the object set.
+        temperature: Temperature of the policy; None for that of the checkpoint.
+    """
 
     agent: str
     nodes: int
@@ -46,114 +57,146 @@ class Row:
     temperature: float | None = None
 
     @property
-    def folder(self) -> str:
-        """Its name."""
-        warmth = "" if self.temperature is None else f"_at_{self.temperature:g}"
-        return f"{Path(self.agent).stem}_{self.objects}_{self.nodes}{warmth}"
+    def name(self) -> str:
+        """Name of the folder that holds the scenes."""
+        suffix = "" if self.temperature is None else f"_at_{self.temperature:g}"
+        return f"{Path(self.agent).stem}_{self.objects}_{self.nodes}{suffix}"
 
 
-SIZES = {10: 300, 15: 300, 20: 300, 25: 1000, 40: 300}
+SCENES_BY_NODES = {10: 300, 15: 300, 20: 300, 25: 1000, 40: 300}
+"""Number of scenes of each size."""
 TABLE = [
-    Row(agent, nodes, count)
-    for agent in ("random", "hill-climbing", "sg", "sg-star")
-    for nodes, count in SIZES.items()
+    *(
+        GeneratorEvaluation(agent, nodes, count)
+        for agent in ("random", "hill-climbing", "sg", "sg-star")
+        for nodes, count in SCENES_BY_NODES.items()
+    ),
+    *(GeneratorEvaluation(agent, 25, 300, "pantry14") for agent in ("random", "sg-14")),
+    # SG* trained with other seeds, and with the paper's reward.
+    *(
+        GeneratorEvaluation(f"training/checkpoints/sg_star_{name}.safetensors", 25, 300)
+        for name in ("seed_1", "seed_2", "paper")
+    ),
 ]
-TABLE += [Row(agent, 25, 300, "pantry14") for agent in ("random", "sg-14")]
-# As files, from the top folder: other seeds of SG*, and the paper's reward.
-TABLE += [
-    Row(f"training/checkpoints/sg_star_{name}.safetensors", 25, 300)
-    for name in ("seed_1", "seed_2", "paper")
-]
-TRADE = [
-    Row("sg-star", 25, 300, temperature=temperature)
+"""Rows of Table I."""
+TEMPERATURES = [
+    GeneratorEvaluation("sg-star", 25, 300, temperature=temperature)
     for temperature in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 ]
+"""Rows that show the effect of the temperature."""
+STACK_HEIGHT_BIN = 0.05
+"""Width of the bins of the histogram of stack heights [m]."""
+NUM_STACK_HEIGHT_BINS = 10
+"""Bins of that histogram: stacks are at most 0.5 m high."""
 
 
-def measured(row: Row, folder: Path, workers: int, seed: int) -> dict[str, Any]:
-    """Generates a row's scenes and says all that is to be said of them."""
+def verdict_name(verdict: Instability | InconclusiveVerdict | None) -> str:
+    """Return a judge's verdict as it is named in results files.
+
+    Args:
+        verdict: How the scene is unstable; None if it is stable.
+    """
+    if isinstance(verdict, InconclusiveVerdict):
+        return "cannot judge"
+    return "stable" if verdict is None else "falls"
+
+
+def evaluate_generator(
+    evaluation: GeneratorEvaluation, folder: Path, workers: int, seed: int
+) -> Row:
+    """Generate the scenes of a row and return the row.
+
+    Args:
+        evaluation: The row.
+        folder: Folder for the scenes; scenes that it already holds are kept.
+        workers: Number of processes.
+        seed: Seed of the scenes.
+    """
     job = GenerationJob(
-        row.agent, row.objects, None, row.nodes, seed, ClutterConfig(), row.temperature
+        evaluation.agent,
+        evaluation.objects,
+        None,
+        evaluation.nodes,
+        seed,
+        ClutterConfig(),
+        evaluation.temperature,
     )
 
-    def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-        return track(made, row.folder, total=total, completed=done, console=Console(stderr=True))
+    def show_progress(scenes: Iterable[Any], done: int, total: int) -> Iterable[Any]:
+        return progress(scenes, evaluation.name, total, done)
 
-    summary = generate_scenes(job, row.count, folder, workers, progress)
-    catalog, judge = load_catalog(), FastJudge(job.config)
-    confusion: Counter[str] = Counter()
-    heights: Counter[int] = Counter()
-    for path in sorted((folder / SCENES_FOLDER).iterdir())[: row.count]:
+    summary = generate_scenes(job, evaluation.count, folder, workers, show_progress)
+    catalog = load_catalog()
+    static_judge = FastJudge(job.config)
+    confusion = Counter[str]()
+    heights = Counter[int]()
+    for path in sorted((folder / SCENES_FOLDER).iterdir())[: evaluation.count]:
         file = load_scene(path, catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None
-        found = judge.stability(file.scene)
-        fast = (
-            "cannot judge"
-            if isinstance(found, InconclusiveVerdict)
-            else "stable"
-            if found is None
-            else "falls"
-        )
-        confusion[f"fast {fast}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
+        static = verdict_name(static_judge.stability(file.scene))
+        confusion[f"fast {static}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
         top = {o.node: o.top_height for o in file.scene.objects}
         for nodes in file.scene.graph.stack_objects():
-            heights[int(max(top[node] for node in nodes) // 0.05)] += 1
-    called = confusion["fast stable, drake stable"] + confusion["fast stable, drake falls"]
-    summary |= {
-        "row": asdict(row),
+            heights[int(max(top[node] for node in nodes) // STACK_HEIGHT_BIN)] += 1
+    false_stable = confusion["fast stable, drake falls"]
+    called_stable = confusion["fast stable, drake stable"] + false_stable
+    return summary | {
+        "row": asdict(evaluation),
         "fast_judge": dict(confusion),
-        "false_stable_of_called_stable": confusion["fast stable, drake falls"] / called
-        if called
-        else None,
-        "stack_heights_5cm": [heights[k] for k in range(10)],
-        "commit": git_commit(),
+        "false_stable_of_called_stable": false_stable / called_stable if called_stable else None,
+        "stack_heights_5cm": [heights[k] for k in range(NUM_STACK_HEIGHT_BINS)],
+        **provenance(),
     }
-    return summary
 
 
-def show(rows: list[dict[str, Any]], console: Console) -> None:
-    """Prints the table."""
+def table_row(row: Row) -> dict[str, str]:
+    """Return a row of the results as cells of the printed table."""
+    agent = Path(row["agent"]).stem
     columns = {
         "stable": "stability_rate",
         "hidden": "hidden_mean",
         "solvable": "solvable_share",
         "distinct": "distinct_share",
+        "stacks": "mean_stacks",
+        "balanced": "balanced_share",
+        "class entropy (bits)": "class_entropy",
     }
-    columns |= {"stacks": "mean_stacks", "balanced": "balanced_share", "bits": "class_entropy"}
-    table = Table("agent", "objects", "nodes", "scenes", *columns)
-    for row in rows:
-        agent = (
-            row["agent"]
-            if row["temperature"] is None
-            else f"{row['agent']} at {row['temperature']:g}"
-        )
-        values = ["" if row[key] is None else f"{row[key]:.3g}" for key in columns.values()]
-        table.add_row(agent, row["objects"], str(row["nodes"]), str(row["count"]), *values)
-    console.print(table)
+    return {
+        "agent": agent if row["temperature"] is None else f"{agent} at {row['temperature']:g}",
+        "objects": row["objects"],
+        "nodes": str(row["nodes"]),
+        "scenes": str(row["count"]),
+    } | {title: format_number(row[key], 3) for title, key in columns.items()}
 
 
-def of_temperatures(found: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of SG* at 25 nodes in the order of their temperatures; Table I's is at that of the checkpoint."""
-    rows = [found[row.folder] for row in TRADE if row.folder in found]
-    if (as_shipped := found.get(Row("sg-star", 25, 1000).folder)) is not None:
-        about = json.loads(
-            resource_path(PRETRAINED_GENERATORS["sg-star"]).with_suffix(".json").read_text()
-        )
-        rows.append(as_shipped | {"temperature": about["temperature"]})
+def temperature_rows(results: ResultsFile) -> list[Row]:
+    """Return the rows of SG* at 25 nodes in the order of their temperatures.
+
+    The row of Table I is one of them, with the temperature that is stored in the checkpoint.
+    """
+    rows = [row for e in TEMPERATURES if (row := results.find(asdict(e))) is not None]
+    if (default := results.find(asdict(GeneratorEvaluation("sg-star", 25, 0)))) is not None:
+        checkpoint = resource_path(PRETRAINED_GENERATORS["sg-star"]).with_suffix(".json")
+        rows.append(default | {"temperature": json.loads(checkpoint.read_text())["temperature"]})
     return sorted(rows, key=lambda row: float(row["temperature"]))
 
 
-def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
-    """Hidden objects, stability and variety over the temperature."""
+def draw_temperature_effect(rows: Sequence[Row], path: Path) -> None:
+    """Plot hidden objects, stability and diversity over the temperature.
+
+    Args:
+        rows: See `temperature_rows`.
+        path: Image file to write.
+    """
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
-    warmth = [row["temperature"] for row in rows]
+    temperatures = [row["temperature"] for row in rows]
     hidden = np.array(
         [[row["hidden_mean"], *(row["hidden_ci95"] or (np.nan, np.nan))] for row in rows]
     )
     left.errorbar(
-        warmth, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6
+        temperatures, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6
     )
     left.set(
         xscale="log",
@@ -167,66 +210,59 @@ def draw_trade(rows: list[dict[str, Any]], path: Path) -> None:
         ("distinct_share", "distinct", "D"),
         ("balanced_share", "balanced", "^"),
     ):
-        right.plot(warmth, [row[key] for row in rows], marker=marker, label=name)
-    even = [
+        right.plot(temperatures, [row[key] for row in rows], marker=marker, label=name)
+    relative_entropy = [
         row["class_entropy"] / np.log2(len(load_catalog().object_set(row["objects"])))
         for row in rows
     ]
-    right.plot(warmth, even, marker="v", label="classes, of the\ngreatest entropy")
+    right.plot(temperatures, relative_entropy, marker="v", label="class entropy,\nrelative")
     right.set(
         xscale="log",
         xlabel="temperature of the policy",
-        ylabel="share of the scenes",
+        ylabel="fraction of the scenes",
         ylim=(0, 1.03),
     )
     right.legend(loc="lower right", fontsize=16)
     for panel in (left, right):
         panel.grid(alpha=0.4)
-        panel.set_xticks(warmth, [f"{value:g}" for value in warmth], rotation=45)
+        panel.set_xticks(temperatures, [f"{value:g}" for value in temperatures], rotation=45)
         panel.minorticks_off()
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the scenes go.")],
-    workers: int = 1,
-    seed: Annotated[int, typer.Option(help="Of the scenes; trainings have others.")] = 1000,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the scenes.")],
+    workers: WorkersOption = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the scenes.")] = 1000,
     only: Annotated[
-        str | None, typer.Option(help="Of rows whose folder's name contains this.")
+        str | None, typer.Option(metavar="TEXT", help="Only rows whose name contains this text.")
     ] = None,
-    at_most: Annotated[
-        int | None, typer.Option(help="Scenes of a row for now; a later run adds the others.")
+    max_scenes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Scenes per row at most; a later run adds the remaining ones."),
     ] = None,
-    out: Annotated[Path, typer.Option(help="JSON to write.")] = RESULTS / "table1.json",
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG to write: the temperature's trade-off.")
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")
+    ] = RESULTS / "table1.json",
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Plot of the temperature's effect (PNG).")
     ] = None,
 ) -> None:
-    """Measures what is missing and prints the table."""
-    console = Console()
-    found: dict[str, dict[str, Any]] = {}
-    if out.exists():
-        earlier = json.loads(out.read_text())
-        if earlier["seed"] != seed:
-            raise InputError(
-                f"--out {out}: holds results of seed {earlier['seed']}; give the same seed or another file"
-            )
-        found = {Row(**row["row"]).folder: row for row in earlier["rows"]}
-    for row in TABLE + TRADE:
-        count = min(row.count, at_most or row.count)
-        held = found[row.folder]["count"] if row.folder in found else 0
-        if held < count and (only is None or only in row.folder):
-            found[row.folder] = measured(
-                replace(row, count=count), folder / row.folder, workers, seed
-            )
-            out.parent.mkdir(parents=True, exist_ok=True)
-            write_json(out, {"seed": seed, "rows": list(found.values())})
-    show(list(found.values()), console)
-    if picture is not None:
-        draw_trade(of_temperatures(found), picture)
+    """Evaluate the generators, as far as it has not been done, and print the table."""
+    results = ResultsFile(out, {"seed": seed}, ("agent", "objects", "nodes", "temperature"))
+    for evaluation in TABLE + TEMPERATURES:
+        count = min(evaluation.count, max_scenes or evaluation.count)
+        row = results.find(asdict(evaluation))
+        has_all = row is not None and row["count"] >= count
+        if has_all or (only is not None and only not in evaluation.name):
+            continue
+        part = replace(evaluation, count=count)
+        results.add(evaluate_generator(part, folder / evaluation.name, workers, seed))
+    print_table([table_row(row) for row in results.read()])
+    if figure is not None:
+        draw_temperature_effect(temperature_rows(results), figure)
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

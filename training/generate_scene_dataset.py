@@ -1,34 +1,37 @@
-"""Makes a set of stable scenes for explorers, drawn by a generation agent and judged by Drake, in one small file.
+"""Generate a dataset of stable scenes for explorers: one small scene-set file.
 
-    python training/generate_scene_dataset.py --seed 100 --work runs/train_sg_star --out train_sg_star.json
-    python training/generate_scene_dataset.py --frozen --count 300 --seed 9000 --work runs/sg_star_25 --out sg_star_25.json
+    python training/generate_scene_dataset.py --seed 100 --work runs/train --out train.json
+    python training/generate_scene_dataset.py --with-poses --count 300 --seed 9000 \\
+        --work runs/test --out test.json
 
-A set to learn from holds graphs, to be laid out anew. The fast judge chooses among the scenes, with the margin that generators
-learn with, and Drake has the last word. A frozen set, of all scenes that Drake calls stable, also holds where the objects came to
-rest. What has been judged stays in the --work folder, so that a run that was stopped goes on. No graph is taken twice, nor one of
-the sets given as --not-in, up to symmetry.
+Every scene is stable and hides at least one object, by Drake's verdict. No scene graph is repeated,
+nor one of the sets given by `--exclude`, up to symmetry.
+
+A training set (the default) holds graphs, which an environment lays out anew in every episode. Its
+scenes are also stable by the static model, and can be disassembled. A test set (`--with-poses`)
+also holds the poses in which the objects came to rest.
+
+The verdicts are kept in the folder `--work`. An interrupted run is resumed by the same command.
 """
 
 import itertools
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import track
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, cli_error_handler
+from drake_clutter.files import InputError
 from drake_clutter.grammar import canonical_form
 from drake_clutter.records import resume_jsonl
-from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene_dataset import SceneRecord, load_scene_dataset, save_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
@@ -37,17 +40,19 @@ from drake_clutter.simulation.judge import DrakeJudge
 from drake_clutter.stability.judge import FastJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.workers.parallel_map import map_ordered
+from training.results_file import provenance
+from training.script import SeedOption, WorkersOption, progress, run_script
 
-MOST_DRAWS = 20
-"""Scenes that are drawn at most, for each that is to be collected."""
-MORE = 1.1
-"""Times as many scenes are drawn as are still missing."""
-JUDGED = "judged.jsonl"
-"""In the --work folder: what was said of each scene."""
+MAX_GENERATED_PER_SCENE = 20
+"""Number of scenes that are generated at most for each scene of the dataset."""
+OVERSAMPLING = 1.1
+"""Factor by which more scenes are generated than are missing."""
+VERDICTS_FILE = "judged.jsonl"
+"""Record file of a training set's verdicts, in the folder `--work`."""
 
 
-def judged_by_drake(folder: Path) -> Iterator[SceneRecord]:
-    """The stable scenes of a folder that hide something."""
+def read_stable_scenes(folder: Path) -> Iterator[SceneRecord]:
+    """Yield the stable scenes with hidden objects of a folder that `generate` wrote."""
     catalog = load_catalog()
     solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
     for index, answer in enumerate(solvable):
@@ -63,129 +68,155 @@ def judged_by_drake(folder: Path) -> Iterator[SceneRecord]:
 
 
 class GraphJudge:
-    """Draws scene after scene of a job; a worker for the runner."""
+    """Generates and judges the scenes of a training set; a worker for `map_ordered`."""
 
     def __init__(self, job: GenerationJob) -> None:
-        self._job, self._generator = job, SceneGenerator(job)
-        self._fast, self._drake = (
-            FastJudge(job.config, margin=GenerationTaskConfig().contact_margin),
-            DrakeJudge(job.config),
-        )
+        """Create the generator and the judges.
+
+        Args:
+            job: What is generated.
+        """
+        self._job = job
+        self._generator = SceneGenerator(job)
+        self._static_judge = FastJudge(job.config, margin=GenerationTaskConfig().contact_margin)
+        self._drake_judge = DrakeJudge(job.config)
         self._classes = load_catalog().classes
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """What is said of the scene of an index: `fast`, whether it stands, comes apart and hides something as the fast judge
-        sees it; if so `fell`, how it fell in Drake; and if it stayed, its rules, form and how many it hides."""
+        """Return the record of the scene of an index.
+
+        Returns:
+            fast: Whether the static model calls the scene stable, and the scene can be
+                disassembled and has hidden objects. If so:
+            fell: Reason of the instability in Drake; None if the scene is stable. Then:
+            rules: The rules that derive the scene graph.
+            form: Canonical form of the scene graph.
+            hidden: Number of hidden objects.
+        """
         rng = item_rng(self._job.seed, index)
         scene, _ = self._generator.lay_out(rng)
-        verdict = self._fast.judge(scene, rng)
+        static_verdict = self._static_judge.judge(scene, rng)
         if (
-            isinstance(verdict, InconclusiveVerdict)
-            or not verdict.hidden
-            or self._fast.comes_apart(scene) is not True
+            isinstance(static_verdict, InconclusiveVerdict)
+            or not static_verdict.hidden
+            or self._static_judge.comes_apart(scene) is not True
         ):
             return {"fast": False}
-        drake = self._drake.judge(scene, rng)
-        if drake.instability is not None:
-            return {"fast": True, "fell": drake.instability.reason.value}
+        drake_verdict = self._drake_judge.judge(scene, rng)
+        if drake_verdict.instability is not None:
+            return {"fast": True, "fell": drake_verdict.instability.reason.value}
         assert scene.graph is not None
-        form = canonical_form(scene.graph, self._classes)
         return {
             "fast": True,
             "fell": None,
             "rules": scene.derivation,
-            "form": form,
-            "hidden": len(drake.hidden),
+            "form": canonical_form(scene.graph, self._classes),
+            "hidden": len(drake_verdict.hidden),
         }
 
 
-def graphs_of(records: Iterable[dict[str, Any]], fell: Counter[str]) -> Iterator[SceneRecord]:
-    """The graphs of what `GraphJudge` said that are stable and hide something; counts in `fell` how others fell in Drake."""
+def select_graphs(
+    records: Iterable[dict[str, Any]], instabilities: Counter[str]
+) -> Iterator[SceneRecord]:
+    """Yield the scene graphs that are stable and have hidden objects.
+
+    Args:
+        records: Records of `GraphJudge`.
+        instabilities: Receives the number of scenes that are unstable in Drake, by reason.
+    """
     for record in records:
         if record.get("fell"):
-            fell[record["fell"]] += 1
+            instabilities[record["fell"]] += 1
         if record.get("hidden"):
             yield SceneRecord(tuple(record["rules"]), record["form"], record["hidden"])
 
 
-def without_repeats(scenes: Iterable[SceneRecord], taken: set[str]) -> Iterator[SceneRecord]:
-    """Those whose form is not taken, each form once."""
-    taken = set(taken)
+def drop_duplicates(
+    scenes: Iterable[SceneRecord], excluded_forms: Iterable[str]
+) -> Iterator[SceneRecord]:
+    """Yield one scene of each canonical form that is not excluded."""
+    known_forms = set(excluded_forms)
     for scene in scenes:
-        if scene.canonical_form not in taken:
-            taken.add(scene.canonical_form)
+        if scene.canonical_form not in known_forms:
+            known_forms.add(scene.canonical_form)
             yield scene
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="FILE", help="JSON to write.")],
-    work: Annotated[Path, typer.Option(metavar="DIR", help="Where what has been judged is kept.")],
-    agent: Annotated[str, typer.Option(help="As for `drake-clutter generate`.")] = "sg-star",
-    nodes: Annotated[int, typer.Option(min=3)] = 25,
-    objects: str = "ycb7",
-    count: Annotated[int, typer.Option(min=1, help="Stable scenes to collect.")] = 3000,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    temperature: Annotated[float | None, typer.Option(help="Of a trained agent.")] = None,
-    frozen: Annotated[
-        bool, typer.Option("--frozen", help="Hold where the objects came to rest.")
-    ] = False,
-    not_in: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="A set to leave out; may be repeated.")
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Scene set to write (JSON).")],
+    work: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the verdicts.")],
+    agent: Annotated[
+        str, typer.Option(help="Scene generator, as of `drake-clutter generate`.")
+    ] = "sg-star",
+    nodes: Annotated[int, typer.Option(min=3, help="Number of nodes of the scene graphs.")] = 25,
+    objects: Annotated[str, typer.Option(help="Name of the object set.")] = "ycb7",
+    count: Annotated[int, typer.Option(min=1, help="Number of scenes in the dataset.")] = 3000,
+    seed: SeedOption = 0,
+    temperature: Annotated[
+        float | None, typer.Option(help="Temperature of a trained generator's policy.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1)] = 1,
+    with_poses: Annotated[
+        bool, typer.Option("--with-poses", help="Write the poses in which the objects rest.")
+    ] = False,
+    exclude: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Scene set whose graphs are left out. May be repeated."),
+    ] = None,
+    workers: WorkersOption = 1,
 ) -> None:
-    """Makes a set."""
-    console = Console(stderr=True)
-    taken = {
+    """Generate a dataset of stable scenes."""
+    excluded_forms = {
         scene.canonical_form
-        for path in not_in or []
+        for path in exclude or []
         for scene in load_scene_dataset(path, load_catalog()).scenes
     }
     job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
-    about: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "objects": objects,
         "agent": agent,
         "nodes": nodes,
         "seed": seed,
         "temperature": temperature,
-    }
-    about |= {
         "judge": "drake",
-        "without": [path.name for path in not_in or []],
-        "commit": git_commit(),
+        "without": [path.name for path in exclude or []],
+        **provenance(),
     }
-    found, drawn = list[SceneRecord](), 0
-    if not frozen:
-        judged = resume_jsonl(
-            work / JUDGED,
+    max_generated = MAX_GENERATED_PER_SCENE * count
+    scenes = list[SceneRecord]()
+    if with_poses:
+        num_generated = 0
+        while len(scenes) < count and num_generated < max_generated:
+            missing = count - len(scenes)
+            num_generated = max(num_generated + 1, int(num_generated + OVERSAMPLING * missing))
+            generate_scenes(
+                job,
+                num_generated,
+                work,
+                workers,
+                lambda items, done, total: progress(items, out.stem, total, done),
+            )
+            scenes = list(drop_duplicates(read_stable_scenes(work), excluded_forms))
+    else:
+        judge = partial(GraphJudge, job)
+        records = resume_jsonl(
+            work / VERDICTS_FILE,
             job.to_dict,
-            lambda done: map_ordered(
-                partial(GraphJudge, job), range(done, MOST_DRAWS * count), workers=workers
-            ),
+            lambda done: map_ordered(judge, range(done, max_generated), workers=workers),
         )
-        about["commit"] = next(judged)["commit"]  # at which they were judged
-        fell = Counter[str]()
-        fitting = itertools.islice(without_repeats(graphs_of(judged, fell), taken), count)
-        found = list(track(fitting, out.stem, total=count, console=console))
-        about["fell_in_drake"] = dict(fell)
-        judged.close()
-    while frozen and len(found) < count and drawn < MOST_DRAWS * count:
-        drawn = max(drawn + 1, int(drawn + MORE * (count - len(found))))
-        generate_scenes(
-            job,
-            drawn,
-            work,
-            workers,
-            lambda scenes, done, total: track(scenes, out.stem, total, done, console=console),
+        with closing(records):
+            metadata["commit"] = next(records)["commit"]  # The commit of the verdicts.
+            instabilities = Counter[str]()
+            graphs = drop_duplicates(select_graphs(records, instabilities), excluded_forms)
+            scenes = list(progress(itertools.islice(graphs, count), out.stem, count))
+            metadata["fell_in_drake"] = dict(instabilities)
+    if len(scenes) < count:
+        raise InputError(
+            f"--count {count}: only {len(scenes)} of {max_generated} scenes are stable, have hidden"
+            " objects, and are no duplicates; allowed is what agent and nodes can generate"
         )
-        found = list(without_repeats(judged_by_drake(work), taken))
-    if len(found) < count:
-        told = f"only {len(found)} of {MOST_DRAWS * count} scenes are stable, hide something, and are no repeats"
-        raise InputError(f"--count {count}: {told}; allowed is what agent and nodes can make")
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_scene_dataset(out, about, found[:count], job.config.cell)
+    save_scene_dataset(out, metadata, scenes[:count], job.config.cell)
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

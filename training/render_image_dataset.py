@@ -1,19 +1,22 @@
-"""Makes a set of labelled images for networks that learn to see: heaps that were dropped, and scenes that agents generate.
+"""Render a dataset of labeled images for object detectors: dropped heaps and generated scenes.
 
     python training/render_image_dataset.py --out runs/images --count 20000 --workers 2
 
-A work item is one scene, in a folder of its own (see `drake_clutter.perception.image_dataset`):
+An item of the dataset is a sequence of scenes, each with one object less or moved, in a folder of
+its own (see `drake_clutter.perception.image_dataset`). It is one of
 
-    a heap       20 objects of random classes, turned at random, that Drake drops on the tray; at one of the last moments of the
-                 fall, and with objects taken away from the top
-    generated    a graph by `random`, or by a trained generator that knows no other classes, laid out (not settled); with objects
-                 taken away from the top, some of which are put elsewhere on the tray
+    heap       20 objects of random classes in random rotations, which Drake drops on the tray; the
+               images show late moments of the fall, and objects are removed from the top
+    generated  a scene of the random generator, or of a trained generator that knows no other
+               classes, laid out but not settled; objects are removed from the top, and some of
+               them are placed elsewhere on the tray
 
-Randomised with every item: two to four lamps (direction, strength, warmth). With every image: the colours of each instance
-(hue, contrast, brightness), more strongly those of the tray, and all that lies beyond it. The camera stays where it is.
+Randomized per item: two to four lights (direction, intensity, color temperature). Randomized per
+image: the colors of each instance and of the tray, and the background beyond it. The camera does
+not move.
 
-A run that was stopped goes on where it was; a larger count adds to what is there. The scenes come from --seed alone, by random
-generators of their own: no set of scenes that agents are evaluated on is read.
+An interrupted run is resumed by the same command; a larger count extends the dataset. The scenes
+depend on --seed alone: no scene set for evaluation is read.
 """
 
 import gc
@@ -23,21 +26,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 from PIL import Image
 from pydrake.geometry import LightParameter, RenderEngineVtkParams, Rgba
-from rich.console import Console
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, cli_error_handler, prepare_output_directory, write_json
+from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.perception.image_dataset import LabeledImage, write_images
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
@@ -45,273 +46,332 @@ from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
 from drake_clutter.simulation.drop import above_tray, dropped
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
+from training.script import SeedOption, WorkersOption, progress, run_script
 
 JOB_FILE = "job.json"
-HEAP_IMAGES, GENERATED_IMAGES = 20, 16
-"""Of one item."""
+"""File in the dataset's folder with what determines the images."""
+HEAP_IMAGES = 20
+"""Number of images of a heap."""
+GENERATED_IMAGES = 16
+"""Number of images of a generated scene."""
 HEAP_OBJECTS = 20
-MOMENTS = (0.9, 1.1, 1.3, 1.5)
-"""s after they were let go."""
+"""Number of objects of a heap."""
+DROP_TIMES = (0.9, 1.1, 1.3, 1.5)
+"""Times after the release at which a heap is rendered [s]; most objects have landed by then."""
 NODES = 25
-AGENTS = {"random": "", "sg-star": "ycb7", "sg-14": "pantry14"}
-"""Generators, and the object set that each has learned; "": any."""
-PUT_ELSEWHERE = 0.5
-"""Probability that an object of a generated scene is put elsewhere when it is taken away."""
+"""Number of nodes of the generated scene graphs."""
+GENERATORS = {"random": "", "sg-star": "ycb7", "sg-14": "pantry14"}
+"""Scene generators by name, and the object set that each was trained with; "" for any."""
+MOVE_PROBABILITY = 0.5
+"""Probability that an object removed from a generated scene is placed elsewhere."""
 _PLACEMENT_TRIES = 50
-_GAP = 0.005
-"""m, about what is put elsewhere."""
+_PLACEMENT_GAP = 0.005
+"""Distance to other objects, seen from above, that a placement keeps [m]."""
+_EARLIER_JOB_FIELDS = {"dropped_share": "heap_fraction"}
+"""Fields of `ImageJob` by the names that version 0.1 wrote."""
 
 
 @dataclass(frozen=True)
 class ImageJob:
-    """What decides how an item looks.
+    """What determines the images of an item.
 
     Attributes:
-        objects: name of an object set.
-        dropped_share: of the images, that show heaps.
-        seed: of the set.
+        objects: Name of the object set.
+        heap_fraction: Fraction of the images that show heaps.
+        seed: Seed of the dataset.
     """
 
     objects: str
-    dropped_share: float
+    heap_fraction: float
     seed: int
 
     def is_heap(self, item: int) -> bool:
-        """Whether an item is a heap, drawn so that heaps have their share of the images, not of the items."""
-        heaps, generated = (
-            self.dropped_share / HEAP_IMAGES,
-            (1 - self.dropped_share) / GENERATED_IMAGES,
-        )
+        """Return whether an item is a heap.
+
+        It is drawn so that `heap_fraction` holds for the images, not for the items.
+        """
+        heaps = self.heap_fraction / HEAP_IMAGES
+        generated = (1 - self.heap_fraction) / GENERATED_IMAGES
         return bool(item_rng(self.seed, item, 0).random() < heaps / (heaps + generated))
 
-    def images(self, item: int) -> int:
-        """How many an item has."""
+    def num_images(self, item: int) -> int:
+        """Return the number of images of an item."""
         return HEAP_IMAGES if self.is_heap(item) else GENERATED_IMAGES
 
-    def agents(self) -> list[tuple[str, str]]:
-        """Generators that know no classes but the job's, each with its object set."""
+    def generators(self) -> list[tuple[str, str]]:
+        """Return the generators that know no classes but the job's, each with its object set."""
         catalog = load_catalog()
-        own = set(catalog.object_set(self.objects))
-        named = [(agent, objects or self.objects) for agent, objects in AGENTS.items()]
+        classes = set(catalog.object_set(self.objects))
+        candidates = [(agent, objects or self.objects) for agent, objects in GENERATORS.items()]
         return [
-            (agent, objects) for agent, objects in named if set(catalog.object_set(objects)) <= own
+            (agent, objects)
+            for agent, objects in candidates
+            if set(catalog.object_set(objects)) <= classes
         ]
 
 
-class ItemMaker:
-    """Makes item after item of a job; a worker for the runner."""
+class ItemRenderer:
+    """Renders the items of a job; a worker for `map_ordered`."""
 
     def __init__(self, job: ImageJob, out: Path) -> None:
-        self._job, self._out, self._config = job, out, ClutterConfig()
+        """Load what all items share.
+
+        Args:
+            job: What is rendered.
+            out: Folder of the dataset.
+        """
+        self._job = job
+        self._out = out
+        self._config = ClutterConfig()
         self._classes = load_catalog().object_set(job.objects)
         self._generators = dict[str, SceneGenerator]()
 
     def __call__(self, item: int) -> None:
-        """Writes an item's folder."""
+        """Write the folder of an item."""
         rng = item_rng(self._job.seed, item)
-        count = self._job.images(item)
-        scenes = self._heaps(count, rng) if self._job.is_heap(item) else self._generated(count, rng)
-        camera = OverheadCamera(self._config.cell.camera, random_lamps(rng))
-        known = dict[SceneObject, int]()
-        images = (photograph(camera, scene, known, rng) for scene in scenes)
+        count = self._job.num_images(item)
+        is_heap = self._job.is_heap(item)
+        scenes = self._heaps(count, rng) if is_heap else self._generated_scenes(count, rng)
+        camera = OverheadCamera(self._config.cell.camera, sample_lights(rng))
+        unoccluded_pixels = dict[SceneObject, int]()
+        images = (render_image(camera, scene, unoccluded_pixels, rng) for scene in scenes)
         write_images(
             self._out / f"{item:06d}",
             images,
             self._config.cell.camera,
             list(load_catalog().classes),
         )
+        # The process can abort when another thread collects the renderer.
         del camera
-        gc.collect()  # in this thread: a renderer that another one collects can abort the process
+        gc.collect()
 
     def _heaps(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
-        """Heaps of all objects down to one, at any of the moments."""
+        """Yield a heap with fewer and fewer objects, down to one, at random times of the drop."""
         classes = [self._classes[k] for k in rng.integers(len(self._classes), size=HEAP_OBJECTS)]
         moments = dropped(
             above_tray(classes, self._config.cell.support, rng),
             self._config.settle.time_step,
-            MOMENTS,
+            DROP_TIMES,
         )
-        names = set(moments[-1].names)
-        left = moments[-1]
-        for most in np.linspace(len(names), 1, count).round():
-            while len(left.objects) > most:
-                left = without(left, pick_free(left, rng))
+        remaining = moments[-1]
+        for max_objects in np.linspace(len(remaining.objects), 1, count).round():
+            while len(remaining.objects) > max_objects:
+                remaining = remove_object(remaining, sample_top_object(remaining, rng))
             moment = moments[rng.integers(len(moments))]
-            yield replace(moment, objects=tuple(o for o in moment.objects if o.name in left.names))
-
-    def _generated(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
-        agents = self._job.agents()
-        agent, objects = agents[rng.integers(len(agents))]
-        if agent not in self._generators:
-            self._generators[agent] = SceneGenerator(
-                GenerationJob(agent, objects, None, NODES, self._job.seed, self._config)
+            yield replace(
+                moment, objects=tuple(o for o in moment.objects if o.name in remaining.names)
             )
+
+    def _generated_scenes(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
+        """Yield a generated scene, and what is left as objects are removed or moved."""
+        generators = self._job.generators()
+        agent, objects = generators[rng.integers(len(generators))]
+        if agent not in self._generators:
+            job = GenerationJob(agent, objects, None, NODES, self._job.seed, self._config)
+            self._generators[agent] = SceneGenerator(job)
         scene, _ = self._generators[agent].lay_out(rng)
         yield scene
         for _ in range(count - 1):
             for _ in range(rng.integers(1, 3)):
-                taken = pick_free(scene, rng)
-                rest = without(scene, taken)
-                moved = (
-                    put_elsewhere(taken, rest, rng)
-                    if rng.random() < PUT_ELSEWHERE or not rest.objects
-                    else None
-                )
+                top_object = sample_top_object(scene, rng)
+                rest = remove_object(scene, top_object)
+                moved = None
+                if rng.random() < MOVE_PROBABILITY or not rest.objects:
+                    moved = place_on_tray(top_object, rest, rng)
                 scene = rest if moved is None else replace(rest, objects=(*rest.objects, moved))
             yield scene
 
 
-def without(scene: Scene, taken: SceneObject) -> Scene:
-    """The scene with an object taken away."""
-    return replace(scene, objects=tuple(o for o in scene.objects if o is not taken))
+def remove_object(scene: Scene, removed: SceneObject) -> Scene:
+    """Return a scene without one of its objects."""
+    return replace(scene, objects=tuple(o for o in scene.objects if o is not removed))
 
 
-def pick_free(scene: Scene, rng: np.random.Generator) -> SceneObject:
-    """An object of the scene over which nothing reaches higher."""
-    free = [
+def sample_top_object(scene: Scene, rng: np.random.Generator) -> SceneObject:
+    """Return a random object of a scene that is below no higher object, seen from above."""
+    top_objects = [
         o
         for o in scene.objects
         if not any(
             over.top_height > o.top_height and _overlap(o, over, 0.0) for over in scene.objects
         )
     ]
-    return free[rng.integers(len(free))]
+    return top_objects[rng.integers(len(top_objects))]
 
 
-def put_elsewhere(taken: SceneObject, rest: Scene, rng: np.random.Generator) -> SceneObject | None:
-    """The object on the tray's floor, turned about the vertical, clear of the rest; None if no place was found."""
+def place_on_tray(
+    removed: SceneObject, rest: Scene, rng: np.random.Generator
+) -> SceneObject | None:
+    """Return an object at a random free place of the tray, with a random yaw.
+
+    Args:
+        removed: The object in its earlier pose.
+        rest: The scene without the object.
+        rng: Random generator.
+
+    Returns:
+        The object; None if no free place was found.
+    """
     for _ in range(_PLACEMENT_TRIES):
-        R_TO = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix() @ taken.X_TO.rotation
-        turned = replace(taken, X_TO=Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)))
-        lower, upper = turned.bounds_T
+        R_yaw = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
+        R_TO = R_yaw @ removed.X_TO.rotation
+        rotated = replace(removed, X_TO=Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)))
+        lower, upper = rotated.bounds_T
         half_size = rest.support.half_size
-        least, most = -half_size - lower[:2], half_size - upper[:2]
-        if (least < most).all():
-            x, y = rng.uniform(least, most)
-            placed = replace(taken, X_TO=Pose.from_rotation(R_TO, (x, y, -lower[2])))
-            if not any(_overlap(placed, other, _GAP) for other in rest.objects):
+        lowest_xy = -half_size - lower[:2]
+        highest_xy = half_size - upper[:2]
+        if (lowest_xy < highest_xy).all():
+            x, y = rng.uniform(lowest_xy, highest_xy)
+            placed = replace(removed, X_TO=Pose.from_rotation(R_TO, (x, y, -lower[2])))
+            if not any(_overlap(placed, other, _PLACEMENT_GAP) for other in rest.objects):
                 return placed
     return None
 
 
 def _overlap(one: SceneObject, other: SceneObject, gap: float) -> bool:
-    """Whether their boxes, seen from above, come closer than a gap (m)."""
-    (lower, upper), (other_lower, other_upper) = one.bounds_T, other.bounds_T
+    """Return whether the bounding boxes, seen from above, are closer than `gap` [m]."""
+    lower, upper = one.bounds_T
+    other_lower, other_upper = other.bounds_T
     return bool((np.minimum(upper, other_upper) > np.maximum(lower, other_lower) - gap)[:2].all())
 
 
-def random_lamps(rng: np.random.Generator) -> RenderEngineVtkParams:
-    """A rendering engine with two to four lamps beside the camera."""
+def sample_lights(rng: np.random.Generator) -> RenderEngineVtkParams:
+    """Return a render engine with two to four random lights beside the camera."""
     count = rng.integers(2, 5)
-    strengths = rng.dirichlet(np.full(count, 2.0)) * rng.uniform(2.0, 4.5)
+    intensities = rng.dirichlet(np.full(count, 2.0)) * rng.uniform(2.0, 4.5)
     lights = []
-    for strength in strengths:
+    for intensity in intensities:
         x, y = rng.uniform(-0.9, 0.9, 2)
         warmth = rng.uniform(-0.12, 0.12)
-        colour = Rgba(min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth))
+        color = Rgba(min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth))
         lights.append(
             LightParameter(
                 type="directional",
                 direction=[x, y, 1.0],
                 frame="camera",
-                intensity=strength,
-                color=colour,
+                intensity=intensity,
+                color=color,
             )
         )
     return RenderEngineVtkParams(backend=ENGINE.backend, lights=lights)
 
 
-def photograph(
-    camera: OverheadCamera, scene: Scene, known: dict[SceneObject, int], rng: np.random.Generator
+def render_image(
+    camera: OverheadCamera,
+    scene: Scene,
+    unoccluded_pixels: dict[SceneObject, int],
+    rng: np.random.Generator,
 ) -> LabeledImage:
-    """An image of a scene, with colours drawn anew.
+    """Return an image of a scene in random colors, with its ground truth.
 
     Args:
-        camera: the camera.
-        scene: the scene.
-        known: pixels that an object covers alone, for those that were counted; the others are added.
-        rng: of the colours.
+        camera: The camera.
+        scene: The scene.
+        unoccluded_pixels: Number of pixels that an object covers when nothing occludes it. Objects
+            that are not in it are added.
+        rng: Random generator of the colors.
     """
     images = camera.render(scene)
-    uncounted = tuple(o for o in scene.objects if o not in known)
-    # As if one pixel of each were seen: the visible share is then one over all its pixels.
-    shares = camera.visible_shares(replace(scene, objects=uncounted), np.arange(len(uncounted)))
-    known |= {o: round(1 / shares[o.name]) for o in uncounted}
-    classes = tuple(o.object_class.name for o in scene.objects)
-    alone = np.array([known[o] for o in scene.objects], np.int64)
-    color = recoloured(images, len(classes), rng)
+    # With one visible pixel of each object, the visible fraction is the inverse of its pixels.
+    uncounted = tuple(o for o in scene.objects if o not in unoccluded_pixels)
+    one_pixel_each = np.arange(len(uncounted))
+    fractions = camera.visible_shares(replace(scene, objects=uncounted), one_pixel_each)
+    unoccluded_pixels |= {o: round(1 / fractions[o.name]) for o in uncounted}
     return LabeledImage(
-        color, images.depth, images.label, classes, tuple(o.X_TO for o in scene.objects), alone
+        randomize_colors(images, len(scene.objects), rng),
+        images.depth,
+        images.label,
+        tuple(o.object_class.name for o in scene.objects),
+        tuple(o.X_TO for o in scene.objects),
+        np.array([unoccluded_pixels[o] for o in scene.objects], np.int64),
     )
 
 
-def recoloured(images: Images, count: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) the colour image with an affine change of the colours of each instance and the tray, before something else."""
+def randomize_colors(
+    images: Images, num_objects: int, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return the color image with random colors and background.
+
+    The colors of each instance and of the tray undergo a random affine map: a rotation of the hue
+    about the gray axis, a gain and an offset.
+
+    Args:
+        images: Color, depth and label image of a scene.
+        num_objects: Number of objects in the scene.
+        rng: Random generator.
+
+    Returns:
+        The color image. Shape (H, W, 3).
+    """
     color = images.color.astype(np.float32)
-    beyond = ~np.isfinite(images.depth)
-    for instance in range(-1, count):
-        mask = (images.label == instance) & ~beyond
-        hue = rng.uniform(-np.pi, np.pi) if instance < 0 else rng.normal(0, 0.15)
-        turn = Rotation.from_rotvec(np.full(3, hue / np.sqrt(3))).as_matrix()  # about grey
-        gain, shift = rng.uniform(0.75, 1.25) * rng.uniform(0.93, 1.07, 3), rng.uniform(-15, 15)
-        color[mask] = color[mask] @ (gain[:, None] * turn).T.astype(np.float32) + np.float32(shift)
+    is_background = ~np.isfinite(images.depth)
+    for instance in range(-1, num_objects):  # -1 is the tray.
+        mask = (images.label == instance) & ~is_background
+        hue_angle = rng.uniform(-np.pi, np.pi) if instance < 0 else rng.normal(0, 0.15)
+        hue_rotation = Rotation.from_rotvec(np.full(3, hue_angle / np.sqrt(3))).as_matrix()
+        gain = rng.uniform(0.75, 1.25) * rng.uniform(0.93, 1.07, 3)
+        offset = rng.uniform(-15, 15)
+        color_map = (gain[:, None] * hue_rotation).T.astype(np.float32)
+        color[mask] = color[mask] @ color_map + np.float32(offset)
     patches = rng.uniform(0, 255, 3) + rng.normal(
         0, rng.uniform(0, 50), (*rng.integers(2, 24, 2), 3)
     )
-    height, width = beyond.shape
+    height, width = is_background.shape
     background = Image.fromarray(patches.clip(0, 255).astype(np.uint8)).resize(
         (width, height), Image.Resampling.BICUBIC
     )
-    color[beyond] = np.asarray(background)[beyond]
+    color[is_background] = np.asarray(background)[is_background]
     return color.clip(0, 255).astype(np.uint8)
+
+
+def check_job(out: Path, job_fields: dict[str, Any]) -> None:
+    """Raise an InputError if a folder holds the images of another job."""
+    path = out / JOB_FILE
+    if not path.exists():
+        return
+    earlier = json.loads(path.read_text())
+    earlier = {_EARLIER_JOB_FIELDS.get(key, key): value for key, value in earlier.items()}
+    if earlier != job_fields:
+        raise InputError(
+            f"--out {out}: holds images of another job; allowed is a folder that is new or of the"
+            " same options"
+        )
 
 
 def main(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="Folder of the set; new, or an earlier run's of the same job."
+            metavar="DIR", help="Folder of the dataset. One of the same options is extended."
         ),
     ],
     count: Annotated[
-        int, typer.Option(min=1, help="Images at least; the last item is made in full.")
+        int, typer.Option(min=1, help="Number of images at least; the last item is completed.")
     ] = 20000,
-    dropped_share: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Of the images, that show dropped heaps.")
+    heap_fraction: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Fraction of the images that show heaps.")
     ] = 0.3,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    workers: Annotated[int, typer.Option(min=1)] = 1,
-    objects: str = "pantry14",
+    seed: SeedOption = 0,
+    workers: WorkersOption = 1,
+    objects: Annotated[str, typer.Option(help="Name of the object set.")] = "pantry14",
 ) -> None:
-    """Makes a set of images."""
-    job = ImageJob(objects, dropped_share, seed)
-    agents = [agent for agent, _ in job.agents()]
-    there = [path.name for path in out.iterdir()] if out.is_dir() else []
-    prepare_output_directory(
-        out,
-        allowed_entries=frozenset(
-            {JOB_FILE, *(name for name in there if re.fullmatch(r"\.?\d{6}", name))}
-        ),
-    )
-    about = {**to_plain(job), "agents": agents}
-    if JOB_FILE in there and json.loads((out / JOB_FILE).read_text()) != about:
-        raise InputError(
-            f"--out {out}: holds images of another job; allowed is a folder that is new or of the same options"
-        )
-    write_json(out / JOB_FILE, about)
-    items, images = list[int](), 0
-    while images < count:
-        images += job.images(len(items))
-        items.append(len(items))
-    missing = [item for item in items if f"{item:06d}" not in there]
-    console = Console(stderr=True)
-    made = map_ordered(partial(ItemMaker, job, out), missing, workers=workers)
-    for _ in track(
-        made, f"{images} images", len(items), len(items) - len(missing), console=console
-    ):
+    """Render a dataset of labeled images."""
+    job = ImageJob(objects, heap_fraction, seed)
+    job_fields = {**to_plain(job), "agents": [agent for agent, _ in job.generators()]}
+    present = [path.name for path in out.iterdir()] if out.is_dir() else []
+    item_folders = [name for name in present if re.fullmatch(r"\.?\d{6}", name)]
+    prepare_output_directory(out, allowed_entries=frozenset({JOB_FILE, *item_folders}))
+    check_job(out, job_fields)
+    write_json(out / JOB_FILE, job_fields)
+    num_items = num_images = 0
+    while num_images < count:
+        num_images += job.num_images(num_items)
+        num_items += 1
+    missing = [item for item in range(num_items) if f"{item:06d}" not in present]
+    rendered = map_ordered(partial(ItemRenderer, job, out), missing, workers=workers)
+    for _ in progress(rendered, f"{num_images} images", num_items, num_items - len(missing)):
         pass
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

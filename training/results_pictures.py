@@ -17,6 +17,7 @@ import typer
 from matplotlib.axes import Axes
 
 from drake_clutter.files import cli_error_handler
+from drake_clutter.records import read_jsonl
 from training.results_page import IMAGES, RESULTS, read
 
 OF_SEED = ", seed "
@@ -45,8 +46,7 @@ MOVES, FEWEST = 20, 100
 
 def episodes_of(name: str, agent: str) -> list[dict[str, Any]]:
     """Those that an agent has played on a set."""
-    path = RESULTS / f"episodes/{name}_{agent}.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()[1:]] if path.exists() else []
+    return read_jsonl(RESULTS / f"episodes/{name}_{agent}.jsonl.gz")[1:]
 
 
 def draw_curves(

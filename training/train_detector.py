@@ -1,12 +1,14 @@
-"""Trains the network that finds objects in images of `render_image_dataset.py`.
+"""Train the segmentation network of the detector on rendered images.
 
     python training/render_image_dataset.py --out runs/images --count 20000 --workers 2
     python training/train_detector.py --config training/configs/detector.yaml --out runs/detector
 
-A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+An interrupted run is resumed by the same command, and ends with the same weights as an
+uninterrupted one.
 """
 
-from dataclasses import field
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +19,6 @@ import typer
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade
-from drake_clutter.files import cli_error_handler
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.perception.image_dataset import ImageDataset
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, ImageWindow, SegmentationNetwork
@@ -28,23 +29,30 @@ from drake_clutter.perception.segmentation_training import (
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.validation import Flag, InRange, config_class, load_config_as, renamed_fields
+from training.script import ConfigOption, SettingsOption, run_script
+from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 CHECKPOINT = "detector.safetensors"
+"""File name of the trained network in the folder of the run."""
 
 
 @config_class
 @renamed_fields(catalogue="catalog", looks_at_color="use_color")
 class DetectorTrainingConfig:
-    """A training.
+    """Configuration of a detector's training.
 
     Attributes:
-        images: folder of `render_image_dataset.py`; held_out: of its last images are not learned from, but looked at as it goes.
-        objects: name of the object set; catalog: a folder with object classes of one's own, or "".
-        use_color: whether the network is given colour beside depth.
-        warm_start: a checkpoint to begin with, of other classes or without colour if need be, or "".
-        seed: same seed, same weights (on the same kind of machine).
-        evaluate_every: steps.
-        learning, cell: see there.
+        images: Folder that `render_image_dataset.py` wrote.
+        held_out: Number of images, the last of the folder, that are only used for evaluations.
+        objects: Name of the object set.
+        catalog: Folder of a catalog with further object classes; "" for none.
+        use_color: Whether the network sees color besides depth.
+        warm_start: Checkpoint whose weights the training starts from; "" for random weights. It may
+            have other object classes, and no color.
+        seed: Seed. The same seed gives the same weights on the same kind of machine.
+        evaluate_every: Steps between two evaluations.
+        learning: Hyperparameters of the training.
+        cell: Work cell, whose camera and support the images show.
     """
 
     images: str = "runs/images"
@@ -63,81 +71,114 @@ CONFIG = DetectorTrainingConfig()
 """Default configuration of the training."""
 
 
-def main(
-    out: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
-    ],
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="YAML with fields of DetectorTrainingConfig."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    threads: Annotated[int, typer.Option(min=1, help="Of PyTorch, on a CPU.")] = 2,
-) -> None:
-    """Trains, evaluates as it goes, and writes detector.safetensors."""
-    given = load_config_as(CONFIG, config, settings or [], upgrade)
-    torch.set_num_threads(threads)
-    chosen, camera, support = resolve_device(device), given.cell.camera, given.cell.support
-    classes = [
-        c.name
-        for c in load_catalog(Path(given.catalog) if given.catalog else None).object_set(
-            given.objects
-        )
-    ]
-    images = ImageDataset(Path(given.images))
-    learned = len(images) - given.held_out
-    torch.manual_seed(given.seed)
-    network = SegmentationNetwork(classes, given.use_color)
-    if given.warm_start:
-        network.warm_start(SegmentationNetwork.load(Path(given.warm_start)))
-    learner = SegmentationLearner(
-        network, images.__getitem__, learned, given.learning, camera, support, given.seed, chosen
-    )
-    run, window = (
-        TrainingRun(out, given, learner, given.learning.steps),
-        ImageWindow.around_support(camera, support),
-    )
+@dataclass(frozen=True)
+class HeldOutImages:
+    """Images that a network is evaluated on while it is trained.
 
-    def figures() -> dict[str, float]:
-        """Of the images held out: share of the pixels whose class is right, over the union, mean of classes; error of votes."""
+    Attributes:
+        images: All images.
+        numbers: Numbers of the images that are held out.
+        classes: Names of the object classes that the network distinguishes.
+        training: Configuration of the training.
+        device: Where the network is.
+    """
+
+    images: ImageDataset
+    numbers: range
+    classes: Sequence[str]
+    training: DetectorTrainingConfig
+    device: torch.device
+
+    def evaluate(self, network: SegmentationNetwork) -> Metrics:
+        """Return the mean IoU of the classes, and the median error of the center votes [mm]."""
         network.eval()
-        both, either, errors = np.zeros(len(classes)), np.zeros(len(classes)), list[float]()
-        for k in range(learned, len(images)):
+        training = self.training
+        window = ImageWindow.around_support(training.cell.camera, training.cell.support)
+        intersections = np.zeros(len(self.classes))
+        unions = np.zeros(len(self.classes))
+        vote_errors = list[float]()
+        for k in self.numbers:
             shown = make_example(
-                images[k], classes, camera, window, item_rng(given.seed, 1, k), given.use_color
+                self.images[k],
+                self.classes,
+                training.cell.camera,
+                window,
+                item_rng(training.seed, 1, k),
+                training.use_color,
             )
             with torch.inference_mode():
-                logits, votes = network(torch.from_numpy(shown.image)[None].to(chosen))
-            kind = logits[0].argmax(dim=0).cpu().numpy()
-            for c in range(len(classes)):
-                is_, said = shown.class_map == c + 1, kind == c + 1
-                both[c], either[c] = both[c] + (is_ & said).sum(), either[c] + (is_ | said).sum()
-            error = np.linalg.norm(votes[0].cpu().numpy() - shown.center_offsets, axis=0)[kind > 0]
-            errors.append(float(np.nanmedian(error)) if np.isfinite(error).any() else np.nan)
+                logits, votes = network(torch.from_numpy(shown.image)[None].to(self.device))
+            predicted = logits[0].argmax(dim=0).cpu().numpy()
+            for c in range(len(self.classes)):
+                is_class = shown.class_map == c + 1
+                is_predicted = predicted == c + 1
+                intersections[c] += (is_class & is_predicted).sum()
+                unions[c] += (is_class | is_predicted).sum()
+            errors = np.linalg.norm(votes[0].cpu().numpy() - shown.center_offsets, axis=0)[
+                predicted > 0
+            ]
+            has_error = bool(np.isfinite(errors).any())
+            vote_errors.append(float(np.nanmedian(errors)) if has_error else np.nan)
         return {
-            "iou": float(np.mean(both / np.maximum(either, 1))),
-            "median_vote_mm": 1000 * float(np.nanmean(errors)),
+            "iou": float(np.mean(intersections / np.maximum(unions, 1))),
+            "median_vote_mm": 1000 * float(np.nanmean(vote_errors)),
         }
 
-    while learner.step < given.learning.steps:
-        learner.train_iteration()
-        if learner.step == given.learning.steps or learner.step % given.evaluate_every == 0:
-            run.report(figures(), learner.losses)
-            run.save()
-    about = {
+
+def main(
+    out: OutOption,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    device: DeviceOption = "auto",
+    threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch on a CPU.")] = 2,
+) -> None:
+    """Train a detector and write detector.safetensors."""
+    training = load_config_as(CONFIG, config, settings or [], upgrade)
+    torch.set_num_threads(threads)
+    torch_device = resolve_device(device)
+    catalog = load_catalog(Path(training.catalog) if training.catalog else None)
+    classes = [c.name for c in catalog.object_set(training.objects)]
+    images = ImageDataset(Path(training.images))
+    num_training_images = len(images) - training.held_out
+    torch.manual_seed(training.seed)
+    network = SegmentationNetwork(classes, training.use_color)
+    if training.warm_start:
+        network.warm_start(SegmentationNetwork.load(Path(training.warm_start)))
+    learner = SegmentationLearner(
+        network,
+        images.__getitem__,
+        num_training_images,
+        training.learning,
+        training.cell.camera,
+        training.cell.support,
+        training.seed,
+        torch_device,
+    )
+    run = TrainingRun(out, training, learner, training.learning.steps)
+    held_out = HeldOutImages(
+        images, range(num_training_images, len(images)), classes, training, torch_device
+    )
+
+    def evaluate() -> tuple[Metrics, Metrics]:
+        return held_out.evaluate(network), learner.losses
+
+    train_to_end(
+        run,
+        learner,
+        training.learning.steps,
+        train_iteration=learner.train_iteration,
+        evaluate=evaluate,
+        evaluate_every=training.evaluate_every,
+        save_every=training.evaluate_every,
+    )
+    metadata = {
         "kind": CHECKPOINT_KIND,
         "classes": classes,
-        "use_color": given.use_color,
-        "images": learned,
+        "use_color": training.use_color,
+        "images": num_training_images,
     }
-    run.finish(CHECKPOINT, network, about)
+    run.finish(CHECKPOINT, network, metadata)
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,35 +1,37 @@
-"""Trains a student, which sees what the camera has shown, by cloning a teacher, which sees everything.
+r"""Train a student explorer by cloning a teacher: DAgger, or plain behavior cloning.
 
-    python training/train_explorer_dagger.py --config training/configs/student_dagger.yaml --out runs/student_dagger
+    python training/train_explorer_dagger.py \
+        --config training/configs/student_dagger.yaml --out runs/student_dagger
 
-A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+The student sees what the camera has shown so far, the teacher the full state. An interrupted run
+is resumed by the same command, and ends with the same weights as an uninterrupted one.
 """
 
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
 from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.config import upgrade
-from drake_clutter.files import InputError, cli_error_handler
+from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.validation import InRange, config_class, load_config_as
+from training.script import ConfigOption, SettingsOption, run_script
+from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 
 @config_class
 class DAggerTrainingConfig(ExplorerTrainingConfig):
-    """A training, see `ExplorerTraining`.
+    """Configuration of a student's training by cloning.
 
     Attributes:
-        teacher: its checkpoint.
-        evaluate_every: rounds.
-        learning: see there.
+        teacher: Checkpoint of the teacher.
+        evaluate_every: Rounds between two evaluations.
+        learning: Hyperparameters of DAgger.
     """
 
     teacher: str = "training/checkpoints/teacher.safetensors"
@@ -42,49 +44,45 @@ CONFIG = DAggerTrainingConfig()
 
 
 def main(
-    out: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
-    ],
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of DAggerTrainingConfig.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    out: OutOption,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    device: DeviceOption = "auto",
 ) -> None:
-    """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_config_as(CONFIG, config, settings or [], upgrade)
+    """Train a student by cloning a teacher and write explorer.safetensors."""
+    training = load_config_as(CONFIG, config, settings or [], upgrade)
     limit_operations_to_one_thread()
-    chosen = resolve_device(device)
-    environment = given.make_environment()
-    teacher, numbers = load_explorer(
-        load_checkpoint(Path(given.teacher)), Path(given.teacher), TEACHER
-    )
+    torch_device = resolve_device(device)
+    environment = training.make_environment()
+    path = Path(training.teacher)
+    teacher, numbers = load_explorer(load_checkpoint(path), path, TEACHER)
     if numbers != environment.node_kind_ids:
         raise InputError(
-            f"teacher: {given.teacher} knows {', '.join(numbers)}; allowed is one of the objects of {given.scenes}"
+            f"teacher: {path} knows {', '.join(numbers)}; allowed is a teacher of the object"
+            f" classes in {training.scenes}"
         )
     learner = BehaviorCloningLearner(
-        environment, teacher.to(chosen), given.learning, given.seed, chosen
+        environment, teacher.to(torch_device), training.learning, training.seed, torch_device
     )
     run = TrainingRun(
-        out, given, learner, given.learning.iterations, [Path(given.scenes), Path(given.teacher)]
+        out, training, learner, training.learning.iterations, [Path(training.scenes), path]
     )
-    while learner.step < given.learning.iterations:
-        learner.train_iteration()
-        if learner.step == given.learning.iterations or learner.step % given.evaluate_every == 0:
-            run.report(given.evaluate(environment, learner.network), learner.losses)
-            run.save()
-    about = {
-        "kind": STUDENT,
-        "network": explorer_metadata(environment.node_kind_ids, given.learning.width),
-    }
-    run.finish(CHECKPOINT_FILE, learner.network, about)
+
+    def evaluate() -> tuple[Metrics, Metrics]:
+        return training.evaluate(environment, learner.network), learner.losses
+
+    train_to_end(
+        run,
+        learner,
+        training.learning.iterations,
+        train_iteration=learner.train_iteration,
+        evaluate=evaluate,
+        evaluate_every=training.evaluate_every,
+        save_every=training.evaluate_every,
+    )
+    network_metadata = explorer_metadata(environment.node_kind_ids, training.learning.width)
+    run.finish(CHECKPOINT_FILE, learner.network, {"kind": STUDENT, "network": network_metadata})
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,37 +1,40 @@
-"""Trains explorers by actor-critic learning: the privileged teacher, or a student that goes on where it was cloned.
+"""Train an explorer by PPO: the privileged teacher, or a student that starts from a clone.
 
     python training/train_explorer_ppo.py --config training/configs/teacher.yaml --out runs/teacher
     python training/train_explorer_ppo.py --config training/configs/student.yaml --out runs/student
 
-A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+An interrupted run is resumed by the same command, and ends with the same weights as an
+uninterrupted one.
 """
 
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.agents.ppo import PPOConfig, PPOLearner
 from drake_clutter.config import upgrade
-from drake_clutter.files import InputError, cli_error_handler
+from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.validation import Flag, InRange, config_class, load_config_as
+from training.script import ConfigOption, SettingsOption, run_script
+from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 
 @config_class
 class PPOTrainingConfig(ExplorerTrainingConfig):
-    """A training, see `ExplorerTraining`.
+    """Configuration of an explorer's training by PPO.
 
     Attributes:
-        privileged: whether it sees everything, a teacher; or K_t, a student.
-        warm_start: a checkpoint of the same kind to begin with, or "".
-        evaluate_every: moves.
-        learning: see there.
+        privileged: Whether the network sees the full state (a teacher), or what has been seen so
+            far (a student).
+        warm_start: Checkpoint of the same kind whose weights the training starts from; "" for
+            random weights.
+        evaluate_every: Moves between two evaluations.
+        learning: Hyperparameters of PPO.
     """
 
     privileged: Flag = True
@@ -45,50 +48,47 @@ CONFIG = PPOTrainingConfig()
 
 
 def main(
-    out: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
-    ],
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML with fields of PPOTrainingConfig.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    out: OutOption,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    device: DeviceOption = "auto",
 ) -> None:
-    """Trains, evaluates as it goes, and writes explorer.safetensors."""
-    given = load_config_as(CONFIG, config, settings or [], upgrade)
+    """Train an explorer by PPO and write explorer.safetensors."""
+    training = load_config_as(CONFIG, config, settings or [], upgrade)
     limit_operations_to_one_thread()
-    environment = given.make_environment(privileged=given.privileged)
-    learner = PPOLearner(environment, given.learning, given.seed, resolve_device(device))
-    kind = TEACHER if given.privileged else STUDENT
-    if given.warm_start:
-        begun, numbers = load_explorer(
-            load_checkpoint(Path(given.warm_start)), Path(given.warm_start), kind
-        )
-        if (numbers, len(begun.pick_marker)) != (environment.node_kind_ids, given.learning.width):
+    environment = training.make_environment(privileged=training.privileged)
+    learner = PPOLearner(environment, training.learning, training.seed, resolve_device(device))
+    kind = TEACHER if training.privileged else STUDENT
+    if training.warm_start:
+        path = Path(training.warm_start)
+        network, numbers = load_explorer(load_checkpoint(path), path, kind)
+        if (numbers, len(network.pick_marker)) != (
+            environment.node_kind_ids,
+            training.learning.width,
+        ):
             raise InputError(
-                f"warm_start: {given.warm_start}: is of other objects or another width; allowed is one of the same"
+                f"warm_start: {path}: has other object classes or another width; allowed is a"
+                " checkpoint with the same"
             )
-        learner.network.load_state_dict(begun.state_dict())
-    files = [Path(file) for file in (given.scenes, given.warm_start) if file]
-    run = TrainingRun(out, given, learner, given.learning.total_timesteps, files)
-    while learner.step < given.learning.total_timesteps:
-        before = learner.step
-        learner.train_iteration()
-        over = learner.step >= given.learning.total_timesteps
-        if over or learner.step // given.evaluate_every > before // given.evaluate_every:
-            run.report(given.evaluate(environment, learner.network), learner.losses)
-            run.save()
-    about = {
-        "kind": kind,
-        "network": explorer_metadata(environment.node_kind_ids, given.learning.width),
-    }
-    run.finish(CHECKPOINT_FILE, learner.network, about)
+        learner.network.load_state_dict(network.state_dict())
+    input_files = [Path(file) for file in (training.scenes, training.warm_start) if file]
+    run = TrainingRun(out, training, learner, training.learning.total_timesteps, input_files)
+
+    def evaluate() -> tuple[Metrics, Metrics]:
+        return training.evaluate(environment, learner.network), learner.losses
+
+    train_to_end(
+        run,
+        learner,
+        training.learning.total_timesteps,
+        train_iteration=learner.train_iteration,
+        evaluate=evaluate,
+        evaluate_every=training.evaluate_every,
+        save_every=training.evaluate_every,
+    )
+    network_metadata = explorer_metadata(environment.node_kind_ids, training.learning.width)
+    run.finish(CHECKPOINT_FILE, learner.network, {"kind": kind, "network": network_metadata})
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,11 +1,13 @@
-"""Trains a Scene Generation agent by soft Q-learning.
+"""Train a scene generator by soft Q-learning.
 
     python training/train_generator.py --config training/configs/sg_star.yaml --out runs/sg_star
 
-A run that was stopped, at any moment, goes on with the same command, and ends with the same weights as one that was not.
+An interrupted run is resumed by the same command, and ends with the same weights as an
+uninterrupted one.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +26,6 @@ from drake_clutter.agents.soft_q import (
 )
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade
-from drake_clutter.files import cli_error_handler
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
@@ -40,23 +41,30 @@ from drake_clutter.validation import (
     load_config_as,
     renamed_fields,
 )
+from training.script import ConfigOption, SettingsOption, run_script
+from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 CHECKPOINT = "generator.safetensors"
+"""File name of the trained network in the folder of the run."""
 
 
 @config_class
 @renamed_fields(catalogue="catalog")
 class GeneratorTrainingConfig:
-    """A training.
+    """Configuration of a generator's training.
 
     Attributes:
-        objects: name of an object set; catalog: a folder with object classes of one's own, or "".
-        seed: same seed, same weights (on the same kind of machine).
-        warm_start: a checkpoint to begin with, or "".
-        evaluate_every: steps; evaluation_scenes: that are then sampled and judged by the fast judge.
-        save_every: steps, after which all that is needed to go on is written.
-        sampling_temperature: of the policy once it is trained; 0 for the one that it was trained with.
-        task, learning, world: see there.
+        objects: Name of the object set.
+        catalog: Folder of a catalog with further object classes; "" for none.
+        seed: Seed. The same seed gives the same weights on the same kind of machine.
+        warm_start: Checkpoint whose weights the training starts from; "" for random weights.
+        evaluate_every: Steps between two evaluations.
+        evaluation_scenes: Number of scenes that an evaluation samples.
+        save_every: Steps between two saved states, from which an interrupted run is resumed.
+        sampling_temperature: Temperature of the trained policy; 0 for that of the training.
+        task: The Markov decision process.
+        learning: Hyperparameters of soft Q-learning.
+        world: Layout, settling and visibility of the scenes.
     """
 
     objects: str = "ycb7"
@@ -76,99 +84,92 @@ CONFIG = GeneratorTrainingConfig()
 """Default configuration of the training."""
 
 
-def figures(episodes: list[SampledEpisode], classes: dict[str, Any]) -> dict[str, float]:
-    """What the fast judge says of sampled scenes."""
-    made = [episode.info for episode in episodes if "scene" in episode.info]
-    hidden = [len(info["verdict"].hidden) for info in made]
-    used = Counter(object_.object_class.name for info in made for object_ in info["scene"].objects)
-    graphs = [info["scene"].graph for info in made]
+def scene_metrics(episodes: Sequence[SampledEpisode], classes: dict[str, Any]) -> dict[str, float]:
+    """Return metrics of sampled scenes, by the static stability model.
+
+    Args:
+        episodes: The sampled episodes, some of which end without a scene.
+        classes: The object classes of the set by name.
+    """
+    infos = [episode.info for episode in episodes if "scene" in episode.info]
+    hidden = [len(info["verdict"].hidden) for info in infos]
+    class_counts = Counter(o.object_class.name for info in infos for o in info["scene"].objects)
+    graphs = [info["scene"].graph for info in infos]
     forms = {canonical_form(graph, classes) for graph in graphs}
+    balanced = [graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION for graph in graphs]
     return {
         "score": float(np.mean([episode.episodic_return for episode in episodes])),
-        "stable": len(made) / len(episodes),
-        "hidden": float(np.mean(hidden)) if hidden else 0.0,
-        "distinct": len(forms) / max(1, len(made)),
-        "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if made else 0.0,
-        "balanced": float(
-            np.mean(
-                [graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION for graph in graphs]
-            )
-        )
-        if made
-        else 0.0,
-        "rarest_class": min(used[name] for name in classes) / max(1, used.total()),
+        "stable": len(infos) / len(episodes),
+        "hidden": float(np.mean(hidden)) if infos else 0.0,
+        "distinct": len(forms) / max(1, len(infos)),
+        "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if infos else 0.0,
+        "balanced": float(np.mean(balanced)) if infos else 0.0,
+        "rarest_class": min(class_counts[name] for name in classes) / max(1, class_counts.total()),
     }
 
 
 def main(
-    out: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of the run; one of the same config is taken up."),
-    ],
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="YAML with fields of GeneratorTrainingConfig."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="A field over the file's."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    out: OutOption,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    device: DeviceOption = "auto",
     threads: Annotated[
         int,
         typer.Option(
-            min=1, max=NUM_GRADIENT_SHARDS, help="That work on an update; changes no result."
+            min=1, max=NUM_GRADIENT_SHARDS, help="Threads of an update; changes no result."
         ),
     ] = NUM_GRADIENT_SHARDS,
 ) -> None:
-    """Trains, evaluates as it goes, and writes generator.safetensors."""
-    given = load_config_as(CONFIG, config, settings or [], upgrade)
-    chosen = resolve_device(device)
+    """Train a scene generator and write generator.safetensors."""
+    training = load_config_as(CONFIG, config, settings or [], upgrade)
+    torch_device = resolve_device(device)
     limit_operations_to_one_thread()
-    classes = load_catalog(Path(given.catalog) if given.catalog else None).object_set(given.objects)
+    catalog = load_catalog(Path(training.catalog) if training.catalog else None)
+    classes = catalog.object_set(training.objects)
+    learning = training.learning
 
     def make_environment() -> ClutterGeneration:
-        return ClutterGeneration(classes, given.task, given.world)
+        return ClutterGeneration(classes, training.task, training.world)
 
-    example, learning = make_environment(), given.learning
-    learner = SoftQLearner(make_environment, learning, given.seed, chosen, threads)
-    if given.warm_start:
-        learner.warm_start(
-            load_rule_network(load_checkpoint(Path(given.warm_start)), example.grammar)
-        )
-    run, losses = TrainingRun(out, given, learner, learning.total_timesteps), list[float]()
+    grammar = make_environment().grammar
+    learner = SoftQLearner(make_environment, learning, training.seed, torch_device, threads)
+    if training.warm_start:
+        learner.warm_start(load_rule_network(load_checkpoint(Path(training.warm_start)), grammar))
+    run = TrainingRun(out, training, learner, learning.total_timesteps)
+    losses = list[float]()
 
-    def evaluate() -> None:
+    def train_iteration() -> None:
+        learner.train_iteration()
+        losses.extend(learner.losses)
+
+    def evaluate() -> tuple[Metrics, Metrics]:
         episodes = sample_episodes(
             learner.network,
             make_environment,
-            given.evaluation_scenes,
+            training.evaluation_scenes,
             learning.temperature,
-            given.seed,
+            training.seed,
         )
-        run.report(
-            figures(episodes, example.grammar.classes), {"loss": float(np.mean(losses or [0.0]))}
-        )
+        loss = float(np.mean(losses or [0.0]))
         losses.clear()
+        return scene_metrics(episodes, grammar.classes), {"loss": loss}
 
-    while learner.step < learning.total_timesteps:
-        before = learner.step
-        learner.train_iteration()
-        losses += learner.losses
-        if learner.step // given.evaluate_every > before // given.evaluate_every:
-            evaluate()
-        if learner.step // given.save_every > before // given.save_every:
-            run.save()
-    if not run.history or run.history[-1]["step"] < learner.step:
-        evaluate()
-    about = {
+    train_to_end(
+        run,
+        learner,
+        learning.total_timesteps,
+        train_iteration=train_iteration,
+        evaluate=evaluate,
+        evaluate_every=training.evaluate_every,
+        save_every=training.save_every,
+    )
+    metadata = {
         "kind": "generator",
-        "network": rule_network_metadata(example.grammar, learning.width),
-        "temperature": given.sampling_temperature or learning.temperature,
+        "network": rule_network_metadata(grammar, learning.width),
+        "temperature": training.sampling_temperature or learning.temperature,
     }
-    run.finish(CHECKPOINT, learner.network, about)
+    run.finish(CHECKPOINT, learner.network, metadata)
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,0 +1,84 @@
+"""Record files: computed once, resumed, and compressed when the computation ends."""
+
+import gzip
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drake_clutter.files import InputError
+from drake_clutter.records import read_jsonl, resume_jsonl
+
+NAMES = pytest.mark.parametrize("name", ["records.jsonl", "records.jsonl.gz"])
+
+
+class Maker:
+    """Makes the records 0, 1 and 2, and keeps a list of those it made."""
+
+    def __init__(self) -> None:
+        self.made: list[int] = []
+
+    def __call__(self, done: int) -> Iterator[int]:
+        for k in range(done, 3):
+            self.made.append(k)
+            yield k
+
+
+@NAMES
+def test_records_are_made_once(name: str, tmp_path: Path) -> None:
+    path, maker = tmp_path / "folder" / name, Maker()
+    first = resume_jsonl(path, {"seed": 1}, maker)
+    assert next(first)["seed"] == 1
+    assert [next(first), next(first)] == [0, 1]
+    with pytest.raises(InputError, match="another run is adding to it"):
+        next(resume_jsonl(path, {"seed": 1}, maker))
+    assert read_jsonl(path)[1:] == [0, 1]
+    first.close()
+    assert [file.name for file in path.parent.iterdir()] == [name]
+    assert read_jsonl(path)[1:] == [0, 1]
+    assert list(resume_jsonl(path, {"seed": 1}, maker))[1:] == [0, 1, 2]
+    content = path.read_bytes()
+    assert list(resume_jsonl(path, {"seed": 1}, maker))[1:] == [0, 1, 2]
+    assert path.read_bytes() == content
+    assert maker.made == [0, 1, 2]
+    with pytest.raises(InputError, match=rf"{name}: holds records of something else \(seed\)"):
+        next(resume_jsonl(path, {"seed": 2}, maker))
+    assert path.read_bytes() == content
+
+
+@NAMES
+def test_a_line_that_was_cut_off_is_made_again(name: str, tmp_path: Path) -> None:
+    path, journal, maker = tmp_path / name, tmp_path / "records.jsonl", Maker()
+    journal.write_text('{"seed": 1, "commit": "x"}\n0\n1')
+    assert read_jsonl(path)[1:] == [0]
+    assert list(resume_jsonl(path, {"seed": 1}, maker))[1:] == [0, 1, 2]
+    assert maker.made == [1, 2]
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_the_longer_of_journal_and_compressed_file_counts(tmp_path: Path) -> None:
+    """A run may be killed while it copies the compressed lines into its journal."""
+    path, maker = tmp_path / "records.jsonl.gz", Maker()
+    lines = [json.dumps(value) + "\n" for value in ({"seed": 1}, 0, 1)]
+    path.write_bytes(gzip.compress("".join(lines).encode()))
+    path.with_suffix("").write_text(lines[0])
+    assert read_jsonl(path) == [{"seed": 1}, 0, 1]
+    assert list(resume_jsonl(path, {"seed": 1}, maker)) == [{"seed": 1}, 0, 1, 2]
+    assert maker.made == [2]
+
+
+def test_records_survive_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl.gz"
+
+    def fail(done: int) -> Iterator[int]:
+        yield 0
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        list(resume_jsonl(path, {}, fail))
+    assert read_jsonl(path)[1:] == [0]
+
+
+def test_no_file_holds_no_records(tmp_path: Path) -> None:
+    assert read_jsonl(tmp_path / "records.jsonl.gz") == []

@@ -1,0 +1,124 @@
+"""Results files and record files of the scripts in `training/` and `benchmarks/`.
+
+A results file is a JSON document: what its rows have in common (seed, configuration, ...), and
+`rows`, one for each measured combination. A record file (`drake_clutter.records`) holds the single
+episodes or scenes that a row summarizes.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import drake_clutter
+from drake_clutter.config import upgrade_head
+from drake_clutter.files import InputError, write_json
+from drake_clutter.records import resume_jsonl
+from drake_clutter.resources import git_commit
+from drake_clutter.workers.parallel_map import map_ordered
+from training.script import progress
+
+Row = dict[str, Any]
+"""One row of a results file."""
+
+
+def provenance() -> dict[str, str]:
+    """Return the version and the commit of this software, for a results file."""
+    return {"software_version": drake_clutter.__version__, "commit": git_commit()}
+
+
+@dataclass(frozen=True)
+class ResultsFile:
+    """A results file whose rows are measured one after the other, in one run or several.
+
+    Attributes:
+        path: The file.
+        header: What all rows have in common. A file with another header is rejected.
+        keys: Fields that identify a row.
+    """
+
+    path: Path
+    header: Mapping[str, Any]
+    keys: tuple[str, ...]
+
+    def read(self) -> list[Row]:
+        """Return the rows in the file; an empty list if there is no file.
+
+        Raises:
+            InputError: The file is no results file, or has another header.
+        """
+        try:
+            document = upgrade_head(json.loads(self.path.read_text(encoding="utf-8")))
+            rows: list[Row] = document["rows"]
+            differing = [key for key, value in self.header.items() if document[key] != value]
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"--out {self.path}: is no results file ({error}); allowed is one, or a new file"
+            ) from error
+        if differing:
+            raise InputError(
+                f"--out {self.path}: holds results of another {', '.join(differing)}; give the same"
+                " options or another file"
+            )
+        return rows
+
+    def find(self, row: Row) -> Row | None:
+        """Return the row in the file that shares the `keys` with a row; None if there is none."""
+        return self._by_key().get(self._key(row))
+
+    def add(self, *rows: Row) -> None:
+        """Write rows into the file; each replaces the row that it shares the `keys` with."""
+        merged = self._by_key() | {self._key(row): row for row in rows}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self.path, {**self.header, "rows": list(merged.values())})
+
+    def _by_key(self) -> dict[tuple[Any, ...], Row]:
+        return {self._key(row): row for row in self.read()}
+
+    def _key(self, row: Row) -> tuple[Any, ...]:
+        return tuple(row[key] for key in self.keys)
+
+
+def collect_records(
+    path: Path,
+    header: Mapping[str, Any],
+    make_worker: Callable[[], Callable[[Any], Any]],
+    items: Sequence[Any],
+    *,
+    workers: int,
+    ray_address: str | None = None,
+    max_items_per_process: int | None = None,
+) -> list[Row]:
+    """Return the record of each item; those that a record file lacks are computed and appended.
+
+    Args:
+        path: The record file. Its name is the label of the progress bar.
+        header: Everything that determines the records, see `resume_jsonl`.
+        make_worker: See `map_ordered`. The worker returns an item's record, as a dictionary or a
+            dataclass; `provenance` is added to it.
+        items: All items, also those that are already in the file.
+        workers: See `map_ordered`.
+        ray_address: See `map_ordered`.
+        max_items_per_process: See `map_ordered`.
+    """
+    software = provenance()
+
+    def compute(done: int) -> Iterator[Row]:
+        results = map_ordered(
+            make_worker,
+            items[done:],
+            workers=workers,
+            ray_address=ray_address,
+            max_items_per_process=max_items_per_process,
+        )
+        for result in progress(results, path.name.partition(".")[0], len(items), done):
+            record = result if isinstance(result, dict) else asdict(result)
+            yield record | software
+
+    with closing(resume_jsonl(path, header, compute, upgrade_head)) as lines:
+        return list(islice(lines, 1, 1 + len(items)))

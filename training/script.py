@@ -1,0 +1,95 @@
+"""Command-line skeleton of the scripts in `training/` and `benchmarks/`.
+
+A script is a module with a function `main` of typed options and, at its end,
+
+    if __name__ == "__main__":
+        run_script(main)
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from drake_clutter.files import cli_error_handler
+
+Item = TypeVar("Item")
+
+ROOT = Path(__file__).parents[1]
+"""Folder of the checkout."""
+RESULTS = ROOT / "training/results"
+"""Published results of the trainings."""
+SCENES = ROOT / "training/scenes"
+"""Shipped scene sets."""
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="YAML file with fields of the configuration."),
+]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="FIELD=VALUE", help="Set a field, over the file's. May be repeated."
+    ),
+]
+ResultsOption = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="Results file to write (JSON).")
+]
+WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Number of processes.")]
+SeedOption = Annotated[
+    int, typer.Option("--seed", min=0, help="Seed. The same seed gives the same results.")
+]
+
+
+def run_script(*commands: Callable[..., None]) -> None:
+    """Run a script.
+
+    A misuse is reported in one line, with exit code 2.
+
+    Args:
+        commands: The functions whose parameters are the script's options. Of several, each is a
+            command of its own.
+    """
+    app = typer.Typer(add_completion=False, no_args_is_help=len(commands) > 1)
+    for command in commands:
+        app.command()(command)
+    with cli_error_handler():
+        app()
+
+
+def progress(
+    items: Iterable[Item], label: str, total: int | None = None, done: int = 0
+) -> Iterable[Item]:
+    """Yield the items, with a progress bar on standard error.
+
+    Args:
+        items: The items that remain.
+        label: Text before the bar.
+        total: Number of items with those already done. By default the length of `items`.
+        done: Number of items already done.
+    """
+    return track(items, label, total, done, console=Console(stderr=True))
+
+
+def format_number(value: float | None, digits: int = 2) -> str:
+    """Return a number with so many decimals; "" for None."""
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> None:
+    """Print a table on standard output.
+
+    Args:
+        rows: The cells by column title; all rows have the columns of the first.
+        title: Title of the table.
+    """
+    if not rows:
+        return
+    table = Table(*rows[0], title=title)
+    for row in rows:
+        table.add_row(*map(str, row.values()))
+    Console(width=max(100, Console().width)).print(table)

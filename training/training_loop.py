@@ -1,0 +1,56 @@
+"""Training loop and common options of the scripts that train networks."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_clutter.learning.training_run import Learner, TrainingRun
+
+OutOption = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the run. A run of the same configuration in it is resumed.",
+    ),
+]
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+
+Metrics = Mapping[str, float]
+"""Values of an evaluation by name."""
+
+
+def train_to_end(
+    run: TrainingRun,
+    learner: Learner,
+    total_steps: int,
+    *,
+    train_iteration: Callable[[], object],
+    evaluate: Callable[[], tuple[Metrics, Metrics]],
+    evaluate_every: int,
+    save_every: int,
+) -> None:
+    """Train, evaluate and save until the learner has made all steps.
+
+    A run that was interrupted, at any moment, is resumed from its last saved state, and ends with
+    the same weights as an uninterrupted one.
+
+    Args:
+        run: The run, which may have been resumed.
+        learner: What `train_iteration` trains. It counts its own steps.
+        total_steps: Number of steps after which the training ends.
+        train_iteration: Trains for one or more steps.
+        evaluate: Returns metrics of the network, and losses.
+        evaluate_every: Steps between two evaluations. The last step is always evaluated.
+        save_every: Steps between two saved states. The last step is always saved.
+    """
+    while learner.step < total_steps:
+        before = learner.step
+        train_iteration()
+        is_last = learner.step >= total_steps
+        if is_last or learner.step // evaluate_every > before // evaluate_every:
+            run.report(*evaluate())
+        if is_last or learner.step // save_every > before // save_every:
+            run.save()
