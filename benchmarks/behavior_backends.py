@@ -21,8 +21,8 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
@@ -172,9 +172,9 @@ def images(case: Case) -> list[Line]:
 
 
 @cache
-def _generator(agent: str) -> tuple[SceneGenerator, FastJudge, DrakeJudge]:
+def _generator(agent: str) -> tuple[SceneGenerator, StaticStabilityJudge, DrakeJudge]:
     job = GenerationJob(agent, OBJECTS, None, NODES, 0, WORLD)
-    return SceneGenerator(job), FastJudge(WORLD), DrakeJudge(WORLD)
+    return SceneGenerator(job), StaticStabilityJudge(WORLD), DrakeJudge(WORLD)
 
 
 def generation(case: Case) -> list[Line]:

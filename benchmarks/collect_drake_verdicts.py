@@ -25,8 +25,8 @@ from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outco
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import config_yaml
 from drake_clutter.workers.parallel_map import map_ordered
@@ -96,7 +96,7 @@ class DrakeVerdicts:
             groups.append(record)
         fields: dict[str, Any] = {"index": index, "groups": groups}
         if all(group["fall"] is None for group in groups):
-            shares = self._judge.look(scene.with_poses(settled)).visible_fractions
+            shares = self._judge.judge_at_rest(scene.with_poses(settled)).visible_fractions
             fields["settled"] = {
                 name: [shares[name], *pose.translation, *pose.quaternion]
                 for name, pose in settled.items()
@@ -177,7 +177,7 @@ class DrakeMoves:
     def __init__(self) -> None:
         config = ClutterConfig()
         self._executor, self._detector = (
-            SettleExecutor(config, follow_falls=False),
+            SettleExecutor(config, simulate_collapse=False),
             LabelDetector(config.cell.camera),
         )
 

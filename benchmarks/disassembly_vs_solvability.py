@@ -21,7 +21,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.oracle_search import Solvability
 
@@ -33,7 +33,7 @@ def counted(folder: Path) -> dict[str, Any]:
     job, catalog, judge = (
         json.loads((folder / JOB_FILE).read_text()),
         load_catalog(),
-        FastJudge(ClutterConfig()),
+        StaticStabilityJudge(ClutterConfig()),
     )
     counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
     answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
@@ -41,7 +41,8 @@ def counted(folder: Path) -> dict[str, Any]:
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         if file.verdict is not None and file.verdict.stable:
             counts[
-                judge.comes_apart(file.settled_scene) is True, answer == Solvability.SOLVABLE.value
+                judge.is_disassemblable(file.settled_scene) is True,
+                answer == Solvability.SOLVABLE.value,
             ] += 1
     told: dict[str, Any] = {"agent": job["agent"], "objects": job["objects"], "nodes": job["nodes"]}
     told |= {"seed": job["seed"], "scenes": len(answers)}

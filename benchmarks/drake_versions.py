@@ -31,7 +31,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.station_simulation import TIME_STEP, StationSimulation
 
 SEED, NODES = 3200, 25

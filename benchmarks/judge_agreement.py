@@ -44,8 +44,8 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.stability.executor import FastExecutor
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_executor import StaticExecutor
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
 
 MARGINS = (0.0005, 0.001, 0.0015, 0.00205, 0.0025, 0.003, 0.004)
@@ -110,7 +110,7 @@ def compare_scenes(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of a batch, and its confusions by reason and by class."""
     config = config_of(batch)
-    judge = FastJudge(config)
+    judge = StaticStabilityJudge(config)
     scenes, stacks = Confusion(), Confusion()
     by_reason: dict[str, Confusion] = defaultdict(Confusion)
     by_class: dict[str, Confusion] = defaultdict(Confusion)
@@ -128,7 +128,7 @@ def compare_scenes(
         for group in record["groups"]:
             part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
             fall = group["fall"]
-            whole = judge.stability(part)
+            whole = judge.find_instability(part)
             if (
                 isinstance(whole, InconclusiveVerdict)
                 and whole.reason is InconclusiveReason.FLOATING
@@ -140,7 +140,7 @@ def compare_scenes(
                     if not other["fall"]
                     for n in other["objects"]
                 )
-                whole = judge.stability(replace(scene, objects=part.objects + standing))
+                whole = judge.find_instability(replace(scene, objects=part.objects + standing))
             pair = said(whole), "stable" if fall is None else "falls"
             stacks.pairs[pair] += 1
             if fall is not None:
@@ -216,15 +216,15 @@ def compare_moves(
 ) -> dict[str, Any]:
     """Outcomes of random moves under the fast executor, each on its own observation, against Drake's."""
     config = config_of(batch)
-    judge = FastJudge(config)
-    executor = FastExecutor(config, judge)
+    judge = StaticStabilityJudge(config)
+    executor = StaticExecutor(config, judge)
     outcomes: Counter[tuple[str, str]] = Counter()
     by_reason: dict[str, Counter[str]] = defaultdict(Counter)
     same_place = placed = 0
     for record in track(records, "moves", console=Console(stderr=True)):
         item = RandomMove(batch, record["index"], record["draw"], scenes[record["index"]])
         scene = settled_scene(laid_out(batch, item.index)[0], item.record)
-        observation, _ = judge.rays.observe(scene)
+        observation, _ = judge.ray_caster.observe(scene)
         pick, place = record["move"]
         rng = move_rng(item)
         command = resolve_placement(Move(pick, place), observation, config.exploration, rng)
@@ -272,10 +272,10 @@ def sensitivity(batch: Batch, records: Sequence[dict[str, Any]]) -> list[dict[st
     scenes = [laid_out(batch, record["index"])[0] for record in records]
     rows = []
     for margin, friction in itertools.product(MARGINS, FRICTIONS):
-        judge, confusion = FastJudge(config_of(batch), margin, friction), Confusion()
+        judge, confusion = StaticStabilityJudge(config_of(batch), margin, friction), Confusion()
         for scene, record in zip(scenes, records, strict=True):
             confusion.pairs[
-                said(judge.stability(scene)), "stable" if "settled" in record else "falls"
+                said(judge.find_instability(scene)), "stable" if "settled" in record else "falls"
             ] += 1
         row = confusion.row()
         rates = {key: row[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}

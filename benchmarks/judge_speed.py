@@ -40,10 +40,10 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import Scene, perturb_poses, tilt_between
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.validation import config_yaml
 
@@ -59,8 +59,8 @@ BUDGET = 2000
 HIDDEN = ("0", "1", "2", "3", "4-5", "4-5", "6+")
 """Row of the search's table by hidden objects; the last for more."""
 FAST, WARM, DRAKE, ACCURATE, BULLET = (
-    "FastJudge, cold",
-    "FastJudge, warm",
+    "StaticStabilityJudge, cold",
+    "StaticStabilityJudge, warm",
     "DrakeJudge",
     "DrakeJudge, accurate",
     "PyBullet",
@@ -83,7 +83,7 @@ NOTES = {
     "with the same objects hidden; unchanged: both",
     "eyes": "640 x 480, shares: the visible shares of all objects. Every scene was drawn once before with the same engine, not "
     "timed; in PyBullet, without shadows, by a frame in the same world",
-    "repeats": f"FastJudge and ray caster: a scene's time is the median of {REPEATS} rounds; all else is timed once",
+    "repeats": f"StaticStabilityJudge and ray caster: a scene's time is the median of {REPEATS} rounds; all else is timed once",
     "search": f"budget {BUDGET} moves; the judge's memory of stacks is emptied before every scene",
 }
 AIMS = {
@@ -146,13 +146,13 @@ def generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
 
 def half_stable(size: Size, count: int, seed: int) -> tuple[list[Case], float]:
     """Scenes of a size, stable and unstable in turn by the fast judge, and the share of stable ones among all of that size."""
-    rg, judge = generator(size.nodes, size.tray_side, seed), FastJudge(CONFIG)
+    rg, judge = generator(size.nodes, size.tray_side, seed), StaticStabilityJudge(CONFIG)
     drawn: dict[bool, list[Case]] = {True: [], False: []}
     for draw in itertools.count():
         rng = item_rng(seed, size.objects, draw)
         scene, _ = rg.lay_out(rng)
         if abs(len(scene.objects) - size.objects) <= size.objects // 30:
-            drawn[judge.stability(scene) is None].append(Case(scene, rng))
+            drawn[judge.find_instability(scene) is None].append(Case(scene, rng))
         if min(len(cases) for cases in drawn.values()) >= count // 2:
             break
     pairs = itertools.islice(zip(drawn[True], drawn[False], strict=False), count // 2)
@@ -246,20 +246,23 @@ def judge_row(
 
 def ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
     """The whole label image, by one cast."""
-    _, rectangle = rays._cast(*rays._shapes.arrays(scene.objects))
+    _, rectangle = rays._cast(*rays._shapes.rows_and_positions(scene.objects))
     image = np.full(rays._hit.shape, -1, np.int16)
     image[rectangle] = rays._hit[rectangle]
     return image
 
 
 def measure(
-    what: str, cases: Sequence[Case], slow: int, judges: Mapping[str, FastJudge | DrakeJudge]
+    what: str,
+    cases: Sequence[Case],
+    slow: int,
+    judges: Mapping[str, StaticStabilityJudge | DrakeJudge],
 ) -> Row:
     """Figures by judge and by eye, those of Drake and PyBullet's judge only on the first `slow` cases."""
     found: dict[str, tuple[list[float], list[Found]]] = {}
     for name, judge in judges.items():
-        if isinstance(judge, FastJudge):
-            forget = judge._known.clear if name == FAST else lambda: None
+        if isinstance(judge, StaticStabilityJudge):
+            forget = judge._cache.clear if name == FAST else lambda: None
             seconds, verdicts = asked(
                 f"{what}: {name}", judge.judge, cases, repeats=REPEATS, before=forget
             )
@@ -279,12 +282,12 @@ def measure(
     rows = {name: judge_row(*pair, truth) for name, pair in found.items()}
     rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
 
-    rays, camera = RayCaster(CONFIG.cell.camera), OverheadCamera(CONFIG.cell.camera)
+    rays, camera = RayCaster(CONFIG.cell.camera), CameraRenderer(CONFIG.cell.camera)
     eyes: dict[str, tuple[Callable[[Scene, np.random.Generator], Any], int]] = {
         RAYS: (lambda scene, _: ray_labels(rays, scene), REPEATS),
-        VTK: (lambda scene, _: camera.label(scene), 1),
-        RAY_SHARES: (lambda scene, _: rays.visible_shares(scene.objects), REPEATS),
-        VTK_SHARES: (lambda scene, _: camera.visible_shares(scene), 1),
+        VTK: (lambda scene, _: camera.render_label(scene), 1),
+        RAY_SHARES: (lambda scene, _: rays.visible_fractions(scene.objects), REPEATS),
+        VTK_SHARES: (lambda scene, _: camera.visible_fractions(scene), 1),
     }
     seen = {TINY: figures(frames)}
     for name, (look, repeats) in eyes.items():
@@ -294,12 +297,12 @@ def measure(
 
 def searched(cases: Sequence[Case]) -> dict[str, Row]:
     """The search on the scenes that are stable and hide something, as laid out, by how much they hide."""
-    judge = FastJudge(CONFIG)
+    judge = StaticStabilityJudge(CONFIG)
     search = OracleSearch(CONFIG, judge)
     parts: dict[str, list[Case]] = {name: [] for name in HIDDEN}
     for case in cases:
-        if judge.stability(case.scene) is None:
-            shares = judge.rays.visible_shares(case.scene.objects).values()
+        if judge.find_instability(case.scene) is None:
+            shares = judge.ray_caster.visible_fractions(case.scene.objects).values()
             hidden = sum(share < CONFIG.cell.camera.visibility_threshold for share in shares)
             parts[HIDDEN[min(hidden, len(HIDDEN) - 1)]].append(case)
     del parts["0"]
@@ -312,7 +315,7 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
                 lambda scene, _: search.solve(scene, 0, BUDGET),
                 part,
                 0,
-                before=judge._known.clear,
+                before=judge._cache.clear,
             )
             rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
             rows[name]["median_moves_tried"] = float(
@@ -456,13 +459,13 @@ def main(
     }
     result |= {"versions": {"python": platform.python_version()} | packages, "notes": NOTES}
 
-    fast, drake = FastJudge(CONFIG), DrakeJudge(CONFIG)
+    fast, drake = StaticStabilityJudge(CONFIG), DrakeJudge(CONFIG)
     accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, calm_samples=NEVER)))
     rg, cases = generator(NODES, CONFIG.cell.support.size[0], seed), []
     for index in range(count):
         rng = item_rng(seed, index)
         cases.append(Case(rg.lay_out(rng)[0], rng))
-    judges: dict[str, FastJudge | DrakeJudge] = {FAST: fast, WARM: fast, DRAKE: drake}
+    judges: dict[str, StaticStabilityJudge | DrakeJudge] = {FAST: fast, WARM: fast, DRAKE: drake}
     result |= {"objects_mean": float(np.mean([len(case.scene.objects) for case in cases]))}
     result |= measure(f"{NODES} nodes", cases, count, judges | {ACCURATE: accurate})
     result["growth"] = []

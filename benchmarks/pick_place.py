@@ -37,7 +37,7 @@ from drake_clutter.resources import git_commit
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor, worst_instability
 from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
 from drake_clutter.statistics import wilson_interval

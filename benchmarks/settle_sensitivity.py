@@ -23,7 +23,7 @@ from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import SceneObject, perturb_poses
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import settle
 
 NEVER = 1_000_000

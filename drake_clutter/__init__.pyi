@@ -35,9 +35,9 @@ from .robots.robot_model import RobotModel as RobotModel, load_robot as load_rob
 
 # Judges: is a scene stable, and what does the camera see of it?
 from .scenes.interfaces import SceneJudge as SceneJudge, Verdict as Verdict
-from .simulation.fallback import FastOrDrakeJudge as FastOrDrakeJudge
-from .simulation.judge import DrakeJudge as DrakeJudge
-from .stability.judge import FastJudge as FastJudge
+from .simulation.hybrid import HybridJudge as HybridJudge
+from .simulation.drake_judge import DrakeJudge as DrakeJudge
+from .stability.static_judge import StaticStabilityJudge as StaticStabilityJudge
 
 # Scene generation.
 from .agents.generators import (

@@ -44,7 +44,9 @@ def run_checks() -> list[Check]:
             probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
         ),
         _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
-        _run_probe(probe_torch, "needed by the learned agents: pip install 'drake-clutter[learned]'"),
+        _run_probe(
+            probe_torch, "needed by the learned agents: pip install 'drake-clutter[learned]'"
+        ),
         _run_probe(
             probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"
         ),

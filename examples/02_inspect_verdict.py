@@ -5,11 +5,11 @@ import numpy as np
 from drake_clutter import (
     ClutterConfig,
     DrakeJudge,
-    FastJudge,
     Pose,
     Scene,
     SceneJudge,
     SceneObject,
+    StaticStabilityJudge,
     Verdict,
     load_catalog,
 )
@@ -25,7 +25,10 @@ def standing(name: str, x: float, bottom: float) -> SceneObject:
 
 def main() -> None:
     config = ClutterConfig()
-    judges: dict[str, SceneJudge] = {"fast": FastJudge(config), "Drake": DrakeJudge(config)}
+    judges: dict[str, SceneJudge] = {
+        "fast": StaticStabilityJudge(config),
+        "Drake": DrakeJudge(config),
+    }
     box_height = CLASSES["pudding_box"].size[2]
     pudding = standing("pudding_box", 0.0, 0.0)
     scenes = {

@@ -34,9 +34,9 @@ from drake_clutter.scenes.interfaces import (
 from drake_clutter.scenes.layout import lay_out
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.validation import load_config_as
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
@@ -174,9 +174,9 @@ def judge(config: ClutterConfig) -> DrakeJudge:
 
 
 @pytest.fixture(scope="session")
-def fast(config: ClutterConfig) -> FastJudge:
+def fast(config: ClutterConfig) -> StaticStabilityJudge:
     """One fast judge for all tests, for the same reason."""
-    return FastJudge(config)
+    return StaticStabilityJudge(config)
 
 
 @pytest.fixture(scope="session")
@@ -186,6 +186,6 @@ def detector(config: ClutterConfig) -> LabelDetector:
 
 
 @pytest.fixture(scope="session")
-def camera(detector: LabelDetector) -> OverheadCamera:
+def camera(detector: LabelDetector) -> CameraRenderer:
     """The detector's camera."""
     return detector.camera

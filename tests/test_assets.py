@@ -286,7 +286,8 @@ def test_the_tray(tmp_path: Path) -> None:
 def test_the_builder_leaves_drake_s_reader_alone() -> None:
     """CoACD, loaded before Drake, makes Drake's SDF reader throw."""
     code = (
-        "import drake_clutter.assets, drake_clutter.simulation.plant as p; from pydrake.systems.framework import DiagramBuilder;"
+        "import drake_clutter.assets, drake_clutter.simulation.scene_plant as p; "
+        "from pydrake.systems.framework import DiagramBuilder;"
         "from drake_clutter.cell.work_cell import default_cell;"
         "p.add_scene_plant(DiagramBuilder(), [], default_cell().support, 0.01, visuals=False)"
     )

@@ -9,7 +9,7 @@ import pytest
 from conftest import DEFAULT_CELL, random_scene, resting, rng, scene_of, tray, world_with
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
-from test_camera import SCATTERED, outline
+from test_camera_renderer import SCATTERED, outline
 from test_placement import carried_by, deepest_with, placed_at
 from test_rays import SCENES, labels
 
@@ -30,8 +30,8 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.occlusion import occluded_boxes
 from drake_clutter.scenes.placement import has_clear_top, is_observed_free
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import load_config_as
@@ -134,7 +134,7 @@ def test_the_floor_s_depth_and_its_horizon() -> None:
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: LabelDetector) -> None:
     """As `test_rays.py` has it for a vertical one, by the same tolerances."""
-    look, rendered = tilted.perceive(scene), tilted.camera.label(scene)
+    look, rendered = tilted.perceive(scene), tilted.camera.render_label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == pytest.approx(look.visible_fractions, abs=0.003)
     assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
@@ -167,16 +167,16 @@ def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]
         translation=tuple((np.array([0.0, 0.0, 0.1]) - 1.3 * axis).tolist()), rpy_deg=rpy_deg
     )
     config = Camera(pose=pose, width=320, height=240, visibility_threshold=1e-9)
-    scene, camera, caster = SCENES["tumbled 0"], OverheadCamera(config), RayCaster(config)
-    assert caster.visible_shares(scene.objects) == pytest.approx(
-        camera.visible_shares(scene), abs=0.02
+    scene, camera, caster = SCENES["tumbled 0"], CameraRenderer(config), RayCaster(config)
+    assert caster.visible_fractions(scene.objects) == pytest.approx(
+        camera.visible_fractions(scene), abs=0.02
     )
-    assert (labels(scene, caster) == camera.label(scene)).mean() >= 0.9995
+    assert (labels(scene, caster) == camera.render_label(scene)).mean() >= 0.9995
 
 
 def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDetector) -> None:
     """As `test_camera.py` has it; where a corner comes to a tip, no pixel's middle may be in it."""
-    label, shifts = tilted.camera.label(SCATTERED), []
+    label, shifts = tilted.camera.render_label(SCATTERED), []
     for index, o in enumerate(SCATTERED.objects):
         corners, centroid = outline(tilted.camera, o)
         rows, columns = np.nonzero(label == index)
@@ -204,7 +204,7 @@ def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
     beneath = scene_of(
         resting("sugar_box", xy=(0.0, -0.05), name="beneath"), resting("gelatin_box", xy=(0.0, 0.9))
     )
-    assert RayCaster(low).visible_shares(beneath.objects) == {"beneath": 1.0, "gelatin_box": 1.0}
+    assert RayCaster(low).visible_fractions(beneath.objects) == {"beneath": 1.0, "gelatin_box": 1.0}
     assert [d.name for d in RayCaster(low).observe(beneath)[0].detections] == ["gelatin_box"]
 
 
@@ -218,7 +218,7 @@ def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelD
         resting(name, Orientation.FLAT_30, (-0.15, 0.1), name="it"),
         resting("pudding_box", xy=(0.2, -0.1), name="another"),
     )
-    depth, label = tilted.camera.depth_and_label(scene)
+    depth, label = tilted.camera.render_depth_and_label(scene)
     true = scene["it"]
     guess = true.X_TO.p + np.array([0.006, -0.006, 0.005])
     found = PoseFitter(CAMERA).fit(true.object_class, label == 0, depth, guess)

@@ -12,7 +12,7 @@ from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, PairArrangement, Rest, Shape, load_catalog
 from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.files import InputError
-from drake_clutter.simulation.plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant
 
 BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
 

@@ -26,7 +26,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop

@@ -17,7 +17,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.tasks.belief import Belief
 from drake_clutter.tasks.exploration_graph import (
     EDGE_KINDS,

@@ -27,7 +27,7 @@ from drake_clutter.export.parts import class_inertial, class_visual
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
 MAIN_FILES = {

@@ -11,18 +11,18 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.stability.executor import FastExecutor
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.settle_executor import SettleExecutor
+from drake_clutter.stability.static_executor import StaticExecutor
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision, legal_moves
 from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.tasks.oracle_search import OracleSearch, SearchResult, Solvability
 
 CONFIG = ClutterConfig()
-JUDGE = FastJudge(CONFIG)
+JUDGE = StaticStabilityJudge(CONFIG)
 SEARCH = OracleSearch(CONFIG, JUDGE)
-EXECUTOR = FastExecutor(CONFIG, JUDGE)
+EXECUTOR = StaticExecutor(CONFIG, JUDGE)
 
 
 def covered(x: float = 0.0, y: float = 0.0, tag: str = "") -> list[SceneObject]:
@@ -96,7 +96,7 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
 @pytest.mark.parametrize(("objects", "moves", "picked"), KNOWN.values(), ids=list(KNOWN))
 def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[str]) -> None:
     scene = scene_of(*objects)
-    assert JUDGE.stability(scene) is None
+    assert JUDGE.find_instability(scene) is None
     solution = SEARCH.solve(scene)
     assert solution.solvability is Solvability.SOLVABLE
     assert (
@@ -118,14 +118,14 @@ def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[
 def replayed(scene: Scene, solution: SearchResult, seed: int) -> set[str]:
     """What has been in view when the plan is done; no move of it fails."""
     generator = item_rng(seed)
-    known = {d.name for d in JUDGE.rays.observe(scene)[0].detections}
+    known = {d.name for d in JUDGE.ray_caster.observe(scene)[0].detections}
     for move in solution.plan:
-        observation = JUDGE.rays.observe(scene)[0]
+        observation = JUDGE.ray_caster.observe(scene)[0]
         assert move in legal_moves(observation)
         outcome = executed(EXECUTOR, scene, observation, move, generator)
         assert outcome.result is MoveResult.PLACED
         scene = outcome.scene
-        known |= {d.name for d in JUDGE.rays.observe(scene)[0].detections}
+        known |= {d.name for d in JUDGE.ray_caster.observe(scene)[0].detections}
     return known
 
 
@@ -180,8 +180,8 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
     scene = scene_of(
         resting("sugar_box", name="foot"), *pair, resting("cracker_box", floor=0.076, name="load")
     )
-    assert JUDGE.stability(scene) is None
-    assert all(JUDGE.losing_support(scene, name) for name in scene.names)
+    assert JUDGE.find_instability(scene) is None
+    assert all(JUDGE.objects_losing_support(scene, name) for name in scene.names)
     solution = SEARCH.solve(scene)
     assert (solution.solvability, solution.moves_evaluated) == (Solvability.UNSOLVABLE, 0)
 
@@ -217,11 +217,11 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
         "leaning", CLASSES["gelatin_box"], Pose.from_rotation(R_TO, (0.1335, 0.0, 0.0372))
     )
     scene = scene_of(*covered(), leaning)
-    observation = JUDGE.rays.observe(scene)[0]
+    observation = JUDGE.ray_caster.observe(scene)[0]
     outcome = executed(SettleExecutor(CONFIG), scene, observation, Move("cover"), rng())
     if (
         outcome.result is not MoveResult.PLACED
-        or len(JUDGE.rays.observe(outcome.scene)[0].detections) < 3
+        or len(JUDGE.ray_caster.observe(outcome.scene)[0].detections) < 3
     ):
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
@@ -261,7 +261,7 @@ RANDOM = {seed: random_scene(seed, 4, 8) for seed in (2, 17, 22, 33, 39, 45, 67)
 
 def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
     """The least number of moves, up to `most`, of all sequences of legal moves that reveal everything without a collapse."""
-    observation = JUDGE.rays.observe(scene)[0]
+    observation = JUDGE.ray_caster.observe(scene)[0]
     known = frozenset(d.name for d in observation.detections)
     level = [(scene, observation, known, item_rng(seed).bit_generator.state)]
     for moves in range(most + 1):
@@ -274,7 +274,7 @@ def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
                 generator.bit_generator.state = state
                 outcome = executed(EXECUTOR, scene, observation, move, generator)
                 if outcome.result is MoveResult.PLACED:
-                    look = JUDGE.rays.observe(outcome.scene)[0]
+                    look = JUDGE.ray_caster.observe(outcome.scene)[0]
                     seen = known | {d.name for d in look.detections}
                     after.append((outcome.scene, look, seen, generator.bit_generator.state))
         level = after
@@ -285,7 +285,7 @@ def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
 def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
     """With the same draws, so that places agree. Two moves of four objects in view are some 270 to try."""
     scene = RANDOM[seed]
-    assert JUDGE.stability(scene) is None
+    assert JUDGE.find_instability(scene) is None
     solution = SEARCH.solve(scene, seed=2, budget=300)
     fewest = fewest_by_trying(scene, 2, 2)
     if fewest is None:

@@ -17,7 +17,7 @@ from drake_clutter.scenes.geometry import (
     transport_pose,
 )
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant
 
 CRACKER, SUGAR = np.array([0.060, 0.160, 0.230]), np.array([0.038, 0.089, 0.175])
 

@@ -18,8 +18,8 @@ from drake_clutter.perception.image_dataset import (
     write_images,
 )
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.drop import above_tray, dropped
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
 
 SCENE = scene_of(
     resting("gelatin_box", xy=(0.2, -0.2), name="under"),
@@ -36,7 +36,7 @@ def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 @pytest.fixture(scope="module")
-def images(camera: OverheadCamera) -> list[LabeledImage]:
+def images(camera: CameraRenderer) -> list[LabeledImage]:
     """Two images of the scene, the second without what lies on top."""
     known: dict[SceneObject, int] = {}
     render_image = training_script("render_image_dataset").render_image
@@ -113,10 +113,10 @@ def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabeledI
         ImageDataset(tmp_path / "000000")
 
 
-def test_shares_are_the_cameras(camera: OverheadCamera, images: list[LabeledImage]) -> None:
+def test_shares_are_the_cameras(camera: CameraRenderer, images: list[LabeledImage]) -> None:
     assert dict(
         zip(SCENE.names, images[0].visible_fractions, strict=True)
-    ) == camera.visible_shares(SCENE)
+    ) == camera.visible_fractions(SCENE)
 
 
 def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabeledImage]) -> None:
@@ -160,7 +160,7 @@ def test_run_lengths() -> None:
 
 def test_a_heap() -> None:
     classes = [CLASSES[name] for name in ("gelatin_box", "tomato_soup_can", "pudding_box")]
-    start = above_tray(classes, TRAY, rng(2))
+    start = sample_drop_scene(classes, TRAY, rng(2))
     for k, one in enumerate(start.objects):
         assert all(
             (
@@ -169,7 +169,7 @@ def test_a_heap() -> None:
             ).any()
             for o in start.objects[:k]
         ), "nothing begins within another"
-    early, late = dropped(start, 0.002, (0.1, 0.5))
+    early, late = simulate_drop(start, 0.002, (0.1, 0.5))
     assert len(early.objects) == 3
     assert all(late[o.name].X_TO.p[2] < o.X_TO.p[2] for o in start.objects if o.name in late.names)
     assert all(o.bounds_T[0][2] > -0.002 for o in late.objects)

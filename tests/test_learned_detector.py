@@ -10,7 +10,7 @@ from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.systems.scenario import PRETRAINED_DETECTORS
 
 
@@ -39,7 +39,7 @@ def test_it_sees_what_is_there_and_is_sure_of_it(
     detector: LearnedDetector, config: ClutterConfig
 ) -> None:
     scene = heap()
-    images = OverheadCamera(config.cell.camera).render(scene)
+    images = CameraRenderer(config.cell.camera).render(scene)
     seen = detector.detect(images.depth, images.color)
     assert sorted(d.object_class.name for d in seen.detections) == sorted(
         o.object_class.name for o in scene.objects
@@ -52,5 +52,5 @@ def test_it_sees_what_is_there_and_is_sure_of_it(
 
 
 def test_an_empty_tray_is_empty(detector: LearnedDetector, config: ClutterConfig) -> None:
-    images = OverheadCamera(config.cell.camera).render(scene_of())
+    images = CameraRenderer(config.cell.camera).render(scene_of())
     assert detector.detect(images.depth, images.color).detections == ()

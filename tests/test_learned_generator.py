@@ -22,7 +22,7 @@ from drake_clutter.grammar import NodeBudget, canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import (
     ClutterGeneration,
     GenerationTaskConfig,
@@ -120,7 +120,7 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
     ("name", "objects", "hidden"), [("sg-star", "ycb7", 8.0), ("sg-14", "pantry14", 7.0)]
 )
 def test_shipped_agents_hide_objects_in_stable_stacks(
-    name: str, objects: str, hidden: float, fast: FastJudge
+    name: str, objects: str, hidden: float, fast: StaticStabilityJudge
 ) -> None:
     """As the fast judge sees it; docs/generation.md has what Drake says of many more."""
     agent, grammar, generator = (

@@ -9,19 +9,19 @@ import trimesh
 from conftest import resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from test_fast_judge import STEP
 from test_settle import BELOW
+from test_static_judge import STEP
 
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.interfaces import InconclusiveReason, InconclusiveVerdict, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.fallback import FastOrDrakeJudge
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.simulation.hybrid import HybridJudge
+from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
 def hull(corners: NDArray[np.float64]) -> trimesh.Trimesh:
@@ -107,7 +107,7 @@ def test_own_meshes_near_the_edge_of_a_box(
     degrees: float,
     stable: bool,
     own: dict[str, ObjectClass],
-    fast: FastJudge,
+    fast: StaticStabilityJudge,
     judge: DrakeJudge,
 ) -> None:
     """The edge is at 115 mm."""
@@ -120,7 +120,11 @@ def test_own_meshes_near_the_edge_of_a_box(
 
 @pytest.mark.parametrize(("x", "stable"), [(0.012, True), (0.030, False)])
 def test_a_box_on_a_frustums_small_top(
-    x: float, stable: bool, own: dict[str, ObjectClass], fast: FastJudge, judge: DrakeJudge
+    x: float,
+    stable: bool,
+    own: dict[str, ObjectClass],
+    fast: StaticStabilityJudge,
+    judge: DrakeJudge,
 ) -> None:
     """Its top is a square of 42 mm on its corner; its outline would carry the box at 30 mm."""
     scene = scene_of(
@@ -132,29 +136,29 @@ def test_a_box_on_a_frustums_small_top(
     assert mine.stable is judge.judge(scene, rng(1)).stable is stable
 
 
-def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: FastJudge) -> None:
+def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: StaticStabilityJudge) -> None:
     """From the centre of mass to the nearest side: of a hexagon, its inner radius; of the wedge, 40 mm from its high end."""
     for class_name, margin in (
         ("prism", 0.050 * math.cos(math.pi / 6)),
         ("frustum", 0.060 * math.cos(math.pi / 4)),
         ("wedge", 0.03),
     ):
-        found = fast.margins(scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0)))
+        found = fast.stability_margins(scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0)))
         assert not isinstance(found, InconclusiveVerdict)
         assert found["own"] == pytest.approx(margin, abs=1.01 * STEP)
-    over = fast.margins(scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060)))
+    over = fast.stability_margins(scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060)))
     assert not isinstance(over, InconclusiveVerdict)
     assert over["own"] == pytest.approx(0.115 - (0.123 - 0.020), abs=1.01 * STEP)
 
 
 def test_a_mesh_stands_on_a_face_askew_in_its_frame(
-    own: dict[str, ObjectClass], fast: FastJudge
+    own: dict[str, ObjectClass], fast: StaticStabilityJudge
 ) -> None:
     """On each of its six faces."""
     for turn in ("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270):
         R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
         lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
-        margins = fast.margins(
+        margins = fast.stability_margins(
             scene_of(
                 SceneObject("own", own["askew"], Pose.from_rotation(R_TO, (0.0, 0.0, -lowest)))
             )
@@ -163,8 +167,8 @@ def test_a_mesh_stands_on_a_face_askew_in_its_frame(
         assert margins["own"] >= 0.025 - 1.01 * STEP, turn
 
 
-def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: FastJudge) -> None:
-    found = fast.stability(
+def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: StaticStabilityJudge) -> None:
+    found = fast.find_instability(
         scene_of(
             as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")
         )
@@ -184,9 +188,9 @@ def test_the_caster_sees_own_meshes_as_the_camera_does(
         )
     ]
     scene = scene_of(*tumbled, resting("sugar_box", xy=(0.05, 0.0), floor=0.25, name="before"))
-    shares = RayCaster(config.cell.camera).visible_shares(scene.objects)
+    shares = RayCaster(config.cell.camera).visible_fractions(scene.objects)
     assert shares == pytest.approx(
-        OverheadCamera(config.cell.camera).visible_shares(scene), abs=0.01
+        CameraRenderer(config.cell.camera).visible_fractions(scene), abs=0.01
     )
     assert sum(0.02 < share < 0.98 for share in shares.values()) >= 2
 
@@ -196,8 +200,13 @@ def test_what_is_not_convex_is_left_to_drake(
 ) -> None:
     scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
     answer = InconclusiveVerdict(InconclusiveReason.NOT_CONVEX, "bracket")
-    fast = FastJudge(config)
-    assert fast.stability(scene) == fast.supports(scene) == fast.judge(scene, rng()) == answer
-    verdict = FastOrDrakeJudge(config).judge(scene, rng(4))
+    fast = StaticStabilityJudge(config)
+    assert (
+        fast.find_instability(scene)
+        == fast.find_supports(scene)
+        == fast.judge(scene, rng())
+        == answer
+    )
+    verdict = HybridJudge(config).judge(scene, rng(4))
     assert verdict == judge.judge(scene, rng(4))
     assert verdict.stable

@@ -21,7 +21,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.validation import to_plain, validate
 
 TRAY_SIDE, ALTITUDE = 0.70, 1.60

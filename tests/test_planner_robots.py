@@ -22,7 +22,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.time_parameterization import dynamics_plant, inverse_dynamics
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 PILE = [
     resting("sugar_box", Orientation.UPRIGHT_0, (0.05, -0.05)),

@@ -14,7 +14,7 @@ from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.pose_fit import FittedPose, PoseFitter, pose_error
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 
 PANTRY = CATALOG.object_sets["pantry14"]
 
@@ -52,14 +52,14 @@ def noisy(
 
 def fitted(
     fitter: PoseFitter,
-    camera: OverheadCamera,
+    camera: CameraRenderer,
     scene: Scene,
     name: str,
     generator: np.random.Generator,
     sigma: float = 0.0,
 ) -> FittedPose:
     """The pose of an object of a scene, the guess 1 cm off."""
-    depth, label = camera.depth_and_label(scene)
+    depth, label = camera.render_depth_and_label(scene)
     true = scene[name]
     off = generator.standard_normal(3)
     guess = true.X_TO.p + 0.01 * off / np.linalg.norm(off)
@@ -80,7 +80,7 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def errors(
-    fitter: PoseFitter, camera: OverheadCamera
+    fitter: PoseFitter, camera: CameraRenderer
 ) -> dict[float, dict[tuple[str, int], tuple[float, float]]]:
     """Errors in m and rad of every class in every rest, by noise (m)."""
     camera.render(
@@ -120,7 +120,7 @@ def test_none_is_far_off(
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.0015])
-def test_half_covered(sigma: float, fitter: PoseFitter, camera: OverheadCamera) -> None:
+def test_half_covered(sigma: float, fitter: PoseFitter, camera: CameraRenderer) -> None:
     """The end that is seen tells where the box is."""
     below = resting("cracker_box", Orientation.FLAT_30, (0.05, -0.02), name="below")
     above = resting("granola_box", Orientation.FLAT_120, (0.12, 0.03), floor=0.060, name="above")
@@ -138,7 +138,7 @@ def test_half_covered(sigma: float, fitter: PoseFitter, camera: OverheadCamera) 
     [("sugar_box", (0, 1, 0)), ("cracker_box", (1, 1, 0)), ("tomato_soup_can", (1, 0, 0))],
 )
 def test_tilted(
-    name: str, axis: tuple[float, ...], sigma: float, fitter: PoseFitter, camera: OverheadCamera
+    name: str, axis: tuple[float, ...], sigma: float, fitter: PoseFitter, camera: CameraRenderer
 ) -> None:
     tilt = Rotation.from_rotvec(
         math.radians(25) * np.array(axis) / np.linalg.norm(axis)
@@ -157,11 +157,11 @@ def test_tilted(
 @pytest.mark.parametrize("fault", ["wide", "narrow", "strays"])
 @pytest.mark.parametrize("name", ["sugar_box", "tomato_soup_can", "large_marker"])
 def test_a_mask_with_faults(
-    name: str, fault: str, fitter: PoseFitter, camera: OverheadCamera
+    name: str, fault: str, fitter: PoseFitter, camera: CameraRenderer
 ) -> None:
     """Two pixels too wide, one too narrow, or with pixels far from the object."""
     o = resting(name, Orientation.FLAT_30, (0.12, -0.1))
-    depth, label = camera.depth_and_label(scene_of(o))
+    depth, label = camera.render_depth_and_label(scene_of(o))
     mask = label == 0
     if fault == "wide":
         mask = np.asarray(binary_dilation(mask, iterations=2))
@@ -181,14 +181,14 @@ def test_a_mask_with_faults(
     assert turned < math.radians(4)
 
 
-def test_a_resting_object_is_exactly_at_rest(fitter: PoseFitter, camera: OverheadCamera) -> None:
+def test_a_resting_object_is_exactly_at_rest(fitter: PoseFitter, camera: CameraRenderer) -> None:
     o = resting("sugar_box", Orientation.FLAT_60, (0.1, 0.1))
     found = fitted(fitter, camera, scene_of(o), "sugar_box", rng(3), 0.001)
     assert np.abs(found.X_TO.rotation[2, 0]) == pytest.approx(1.0, abs=1e-9)
     assert 0.8 < found.score <= 1.0
 
 
-def test_deterministic(camera: OverheadCamera) -> None:
+def test_deterministic(camera: CameraRenderer) -> None:
     scene = scene_of(resting("master_chef_can", xy=(0.1, 0.1)))
     fits = [
         fitted(PoseFitter(DEFAULT_CELL.camera), camera, scene, "master_chef_can", rng(4), 0.0015)

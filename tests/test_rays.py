@@ -16,9 +16,9 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.stability.shapes import Shapes
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.stability.shape_table import ShapeTable
 
 CAMERA = DEFAULT_CELL.camera
 RAYS = RayCaster(CAMERA)
@@ -36,7 +36,7 @@ ALL_SHAPES = (
 
 def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
     """The index of the object that each ray meets first, -1 for none."""
-    found = np.full((caster.config.height, caster.config.width), -1)
+    found = np.full((caster.camera.height, caster.camera.width), -1)
     for detection in caster.observe(scene)[0].detections:
         found[detection.mask] = scene.names.index(detection.name)
     return found
@@ -81,9 +81,9 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
     scene: Scene, detector: LabelDetector
 ) -> None:
     """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
-    look, rendered = detector.perceive(scene), detector.camera.label(scene)
+    look, rendered = detector.perceive(scene), detector.camera.render_label(scene)
     observation, shares = RAYS.observe(scene)
-    assert shares == RAYS.visible_shares(scene.objects)
+    assert shares == RAYS.visible_fractions(scene.objects)
     assert shares == pytest.approx(look.visible_fractions, abs=0.003)
     assert min(shares.values()) < 0.9 < 1.0 <= max(shares.values())
     cast = labels(scene)
@@ -107,7 +107,7 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
     look = detector.perceive(scene)
     observation, _ = RAYS.observe(scene)
-    rendered, cast = detector.camera.label(scene), labels(scene)
+    rendered, cast = detector.camera.render_label(scene), labels(scene)
     assert observation.depth.dtype == look.observation.depth.dtype == np.float32
     errors = []
     for index in range(len(scene.objects)):
@@ -133,11 +133,11 @@ def test_another_camera(config: Camera) -> None:
     """The narrow one sees 0.38 m of the tray by 0.56 m: objects are cut off by the frame, and a share is one of the pixels in it.
     Fewer pixels: one is up to a hundredth of an object."""
     scene = tumbled(2)
-    camera, caster = OverheadCamera(config), RayCaster(config)
-    assert caster.visible_shares(scene.objects) == pytest.approx(
-        camera.visible_shares(scene), abs=0.02
+    camera, caster = CameraRenderer(config), RayCaster(config)
+    assert caster.visible_fractions(scene.objects) == pytest.approx(
+        camera.visible_fractions(scene), abs=0.02
     )
-    rendered = camera.label(scene)
+    rendered = camera.render_label(scene)
     assert (
         labels(scene, RayCaster(config.model_copy(update={"visibility_threshold": 1e-9})))
         == rendered
@@ -196,9 +196,9 @@ def test_every_ray_meets_an_object_once() -> None:
             columns = [np.flatnonzero(row) for row in mask if row.any()]
             assert len(columns) > 5
             assert all(np.array_equal(row, np.arange(row[0], row[-1] + 1)) for row in columns)
-            cover = RAYS.cover(scene_of(o), o.name)
+            cover = RAYS.occluder_sets(scene_of(o), o.name)
             assert cover == {frozenset(): int(mask.sum())}
-            assert RAYS.visible_shares([o]) == {o.name: 1.0}
+            assert RAYS.visible_fractions([o]) == {o.name: 1.0}
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -206,13 +206,13 @@ def test_the_order_of_the_objects_is_no_matter(seed: int) -> None:
     scene = tumbled(seed)
     order = rng(seed).permutation(len(scene.objects))
     other = replace(scene, objects=tuple(scene.objects[k] for k in order))
-    assert RAYS.visible_shares(other.objects) == RAYS.visible_shares(scene.objects)
+    assert RAYS.visible_fractions(other.objects) == RAYS.visible_fractions(scene.objects)
     one, same = RAYS.observe(scene)[0], RAYS.observe(other)[0]
     assert np.array_equal(one.depth, same.depth)
     for detection in one.detections:
         assert np.array_equal(detection.mask, same[detection.name].mask)
     name = scene.names[seed]
-    assert RAYS.cover(other, name) == RAYS.cover(scene, name)
+    assert RAYS.occluder_sets(other, name) == RAYS.occluder_sets(scene, name)
 
 
 def test_what_was_cast_before_is_no_matter() -> None:
@@ -221,7 +221,7 @@ def test_what_was_cast_before_is_no_matter() -> None:
     before = caster.observe(scene_of(resting("gelatin_box", name="box")))
     for seed in range(2):
         caster.observe(tumbled(seed))
-        caster.cover(tumbled(seed), tumbled(seed).names[0])
+        caster.occluder_sets(tumbled(seed), tumbled(seed).names[0])
     after = caster.observe(scene_of(resting("gelatin_box", name="box")))
     assert np.array_equal(before[0].depth, after[0].depth)
     assert np.array_equal(before[0]["box"].mask, after[0]["box"].mask)
@@ -237,21 +237,25 @@ def test_other_places_than_those_of_the_poses() -> None:
             for o, offset in zip(scene.objects, offsets, strict=True)
         }
     )
-    shapes = Shapes()
+    shapes = ShapeTable()
     caster = RayCaster(CAMERA, shapes)
-    rows = shapes.rows(scene.objects)
+    rows = shapes.find_rows(scene.objects)
     p_T = np.array([o.X_TO.p for o in moved.objects])
-    assert caster.shares(rows, p_T) == list(RAYS.visible_shares(moved.objects).values())
-    assert caster.shares(rows, p_T) != list(RAYS.visible_shares(scene.objects).values())
+    assert caster.visible_fractions_of_rows(rows, p_T) == list(
+        RAYS.visible_fractions(moved.objects).values()
+    )
+    assert caster.visible_fractions_of_rows(rows, p_T) != list(
+        RAYS.visible_fractions(scene.objects).values()
+    )
 
 
 FAR = scene_of(resting("gelatin_box", name="near"), resting("sugar_box", xy=(5.0, 0.0), name="far"))
 
 
 def test_out_of_the_frame_nothing_is_hidden() -> None:
-    assert RAYS.visible_shares(FAR.objects) == {"near": 1.0, "far": 1.0}
-    assert RAYS.visible_shares([FAR["far"]]) == {"far": 1.0}
-    assert RAYS.cover(FAR, "far") == {}
+    assert RAYS.visible_fractions(FAR.objects) == {"near": 1.0, "far": 1.0}
+    assert RAYS.visible_fractions([FAR["far"]]) == {"far": 1.0}
+    assert RAYS.occluder_sets(FAR, "far") == {}
     assert (
         RAYS.observe(scene_of(FAR["far"]))[0].depth == np.float32(CAMERA.X_TC.translation()[2])
     ).all()
@@ -269,7 +273,7 @@ def test_half_covered() -> None:
         resting("cracker_box", name="below"),
         resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"),
     ]
-    shares = RAYS.visible_shares(objects)
+    shares = RAYS.visible_fractions(objects)
     assert shares["below"] == pytest.approx(0.5, abs=1 / 92)  # the box is 92 pixels long
     assert shares["above"] == 1.0
 
@@ -293,7 +297,7 @@ HEAP = scene_of(
 )
 def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> None:
     """Without a set of others, the object is met by the rays before which there are none but these; by all subsets of five."""
-    cover = RAYS.cover(scene, name)
+    cover = RAYS.occluder_sets(scene, name)
     total = sum(cover.values())
     assert total == int((labels(scene_of(scene[name])) == 0).sum())
     before_most = sorted(
@@ -307,7 +311,9 @@ def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> 
             left = scene_of(scene[name], *kept, *(o for o in others if o.name not in gone))
             met = sum(rays for before, rays in cover.items() if before <= set(gone))
             assert int((labels(left) == 0).sum()) == met
-            assert RAYS.visible_shares(left.objects)[name] == pytest.approx(met / total, abs=1e-12)
+            assert RAYS.visible_fractions(left.objects)[name] == pytest.approx(
+                met / total, abs=1e-12
+            )
             free.append(met)
     assert min(free) < max(free)
 
@@ -317,16 +323,16 @@ def test_cover_of_a_lone_cover() -> None:
         resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover")
     )
     pixels = 0.085 * 0.073 * (CAMERA.focal_length / (CAMERA.X_TC.translation()[2] - 0.028)) ** 2
-    cover = RAYS.cover(scene, "box")
+    cover = RAYS.occluder_sets(scene, "box")
     assert cover == {frozenset({"cover"}): pytest.approx(pixels, rel=0.05)}
-    assert set(RAYS.cover(scene, "cover")) == {frozenset()}
+    assert set(RAYS.occluder_sets(scene, "cover")) == {frozenset()}
 
 
 def test_cover_takes_64_objects_at_most() -> None:
     """They lie on each other like cards; the lowest is covered by all, each of which has its own bit."""
     cards = [resting("gelatin_box", floor=0.005 * k, name=f"{k}") for k in range(65)]
-    cover = RAYS.cover(scene_of(*cards[:64]), "0")
+    cover = RAYS.occluder_sets(scene_of(*cards[:64]), "0")
     assert max(cover, key=lambda before: cover[before]) == frozenset(str(k) for k in range(1, 64))
     assert math.isclose(sum(cover.values()), int((labels(scene_of(cards[0])) == 0).sum()))
     with pytest.raises(ValueError, match="65 objects; allowed are 64 at most"):
-        RAYS.cover(scene_of(*cards), "0")
+        RAYS.occluder_sets(scene_of(*cards), "0")

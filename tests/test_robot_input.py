@@ -10,7 +10,7 @@ from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
 from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.files import InputError
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.simulation.cell_plant import check_models
+from drake_clutter.simulation.cell_plant import validate_models
 
 JOINTS = ", ".join(robot("ur5e").joint_names)
 SHIPPED = "package://drake_clutter_models/FILE"
@@ -189,6 +189,6 @@ def test_an_arm_that_can_hit_nothing(tmp_path: Path) -> None:
     """Its motions would be planned through everything."""
     spec = ros_spec(tmp_path, ros_urdf())
     with pytest.raises(InputError) as raised:
-        check_models(DEFAULT_CELL.model_copy(update={"robot": spec}))
+        validate_models(DEFAULT_CELL.model_copy(update={"robot": spec}))
     found = f"robot.model: {spec.model!r}: no link has a shape for collisions"
     assert str(raised.value) == f"{found}; allowed is one that can hit something"

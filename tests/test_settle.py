@@ -13,8 +13,8 @@ from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject, perturb_poses, tilt_between
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.simulation.settle import Settled, settle
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.simulation.settle import SettleResult, settle
 
 UPRIGHT = Orientation.UPRIGHT_0
 # Cracker boxes lie 230 mm along x, 60 mm high; a sugar box is 175 mm long, so it overhangs by half when shifted by 115 mm.
@@ -245,7 +245,7 @@ def test_the_end_comes_when_all_are_calm_or_still() -> None:
     assert patient.motion[-1].time == pytest.approx(0.8)
 
 
-def check_motion(result: Settled, start: list[SceneObject]) -> None:
+def check_motion(result: SettleResult, start: list[SceneObject]) -> None:
     times = np.array([frame.time for frame in result.motion])
     assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 40), abs=0.002)
     assert result.motion[0].poses == {o.name: o.X_TO for o in start}
@@ -256,7 +256,7 @@ def test_motion_is_recorded_and_a_fall_followed_if_asked() -> None:
     falling = FALLING["overhang of more than half"][0]
     config = SettleConfig(time_step=0.005)
     stopped = settle(falling, TRAY, config, record=True)
-    followed = settle(falling, TRAY, config, record=True, follow_falls=True)
+    followed = settle(falling, TRAY, config, record=True, simulate_collapse=True)
     assert settle(falling, TRAY, config).motion == ()
     check_motion(stopped, falling)
     check_motion(followed, falling)

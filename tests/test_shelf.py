@@ -15,8 +15,8 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand, Verdict
 from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.validation import load_config_as
 
@@ -51,7 +51,7 @@ def test_the_cell(shelf: ClutterConfig) -> None:
 
 def test_both_judges_agree_on_generated_scenes(shelf: ClutterConfig) -> None:
     generate = SceneGenerator(GenerationJob("random", "ycb7", None, nodes=10, seed=0, config=shelf))
-    judge, fast = DrakeJudge(shelf), FastJudge(shelf)
+    judge, fast = DrakeJudge(shelf), StaticStabilityJudge(shelf)
     stable = []
     for number in range(4):
         scene = generate(number).scene

@@ -21,7 +21,7 @@ from drake_clutter.reports import recording
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import MotionSample, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
-from drake_clutter.simulation.plant import pose_of
+from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.station_simulation import STEP_PERIOD, StationSimulation
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
@@ -51,7 +51,7 @@ def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
     """X_TL of the arm's links by name; the cup gives way on its bellows, and is left out."""
     plant, context = simulation.station.plant, simulation.plant_context
     return {
-        f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_of(
+        f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_from_transform(
             body.EvalPoseInWorld(context)
         )
         for body in simulation.station.arm.bodies

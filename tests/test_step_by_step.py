@@ -8,8 +8,8 @@ import pytest
 from conftest import CLASSES, random_scene, resting, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from test_fast_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT
 from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
+from test_static_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
@@ -52,7 +52,7 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
     ],
 )
 def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
-    found = FAST.margins(scene_of(*objects))
+    found = FAST.stability_margins(scene_of(*objects))
     assert not isinstance(found, InconclusiveVerdict)
     assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(
         margins, abs=0.11
@@ -60,7 +60,7 @@ def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, f
 
 
 def test_what_rolls_has_no_margin() -> None:
-    margins = FAST.margins(scene_of(*TABLE["a box on a marker"][0]))
+    margins = FAST.stability_margins(scene_of(*TABLE["a box on a marker"][0]))
     assert not isinstance(margins, InconclusiveVerdict)
     assert min(margins.values()) < MARGIN
 
@@ -96,24 +96,24 @@ TWO_STACKS = scene_of(
     ids=["two stacks", "bridge", "counterweight", "pair of markers"],
 )
 def test_losing_support(scene: Scene, losing: dict[str, tuple[str, ...]]) -> None:
-    assert FAST.stability(scene) is None
-    assert {name: FAST.losing_support(scene, name) for name in scene.names} == losing
+    assert FAST.find_instability(scene) is None
+    assert {name: FAST.objects_losing_support(scene, name) for name in scene.names} == losing
 
 
 def test_losing_support_is_in_the_scenes_order_and_of_one_stack() -> None:
     """Taking the lowest of five: all fall, also those that only lie on what falls; the stack beside it stays."""
     tower = [resting("gelatin_box", floor=0.028 * k, name=f"{k}") for k in range(5)]
     scene = scene_of(*tower[::-1], resting("cracker_box", xy=(0.2, 0.2), name="beside"))
-    assert FAST.losing_support(scene, "0") == ("4", "3", "2", "1")
-    assert FAST.losing_support(scene, "3") == ("4",)
-    assert FAST.losing_support(scene, "beside") == ()
+    assert FAST.objects_losing_support(scene, "0") == ("4", "3", "2", "1")
+    assert FAST.objects_losing_support(scene, "3") == ("4",)
+    assert FAST.objects_losing_support(scene, "beside") == ()
 
 
 def test_only_an_object_of_the_scene_can_be_taken() -> None:
     with pytest.raises(KeyError, match="'ghost' is not in the scene; it holds a, b, c, d, e"):
-        FAST.losing_support(TWO_STACKS, "ghost")
+        FAST.objects_losing_support(TWO_STACKS, "ghost")
     with pytest.raises(KeyError, match="'tray'"):
-        FAST.losing_support(TWO_STACKS, TRAY)
+        FAST.objects_losing_support(TWO_STACKS, TRAY)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_only_an_object_of_the_scene_can_be_taken() -> None:
     ids=["two stacks", "bridge", "side by side", "a small step"],
 )
 def test_supports(scene: Scene, supports: dict[str, set[str]]) -> None:
-    assert FAST.supports(scene) == {name: frozenset(below) for name, below in supports.items()}
+    assert FAST.find_supports(scene) == {name: frozenset(below) for name, below in supports.items()}
 
 
 # --- What can never be moved ---
@@ -158,16 +158,16 @@ HELD_DOWN = scene_of(
 
 def test_what_only_its_load_holds_down_is_fixed() -> None:
     """Whatever is pressed onto the box beyond its load makes it fall sooner: nothing can begin."""
-    assert FAST.stability(HELD_DOWN) is None
-    assert FAST.never_movable(HELD_DOWN) == frozenset({"foot", "held", "weight"})
-    assert FAST.never_movable(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
+    assert FAST.find_instability(HELD_DOWN) is None
+    assert FAST.immovable_objects(HELD_DOWN) == frozenset({"foot", "held", "weight"})
+    assert FAST.immovable_objects(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
     beside = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.25, -0.25), name="beside"))
     on_top = scene_of(
         *HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top")
     )
     for scene in (beside, on_top):
-        assert FAST.stability(scene) is None
-        assert FAST.never_movable(scene) == frozenset({"foot", "held", "weight"})
+        assert FAST.find_instability(scene) is None
+        assert FAST.immovable_objects(scene) == frozenset({"foot", "held", "weight"})
 
 
 def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
@@ -175,9 +175,9 @@ def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
     narrower = scene_of(
         *HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight")
     )
-    assert FAST.stability(narrower) is None
-    assert FAST.losing_support(narrower, "weight") == ("held",)
-    assert FAST.never_movable(narrower) == frozenset()
+    assert FAST.find_instability(narrower) is None
+    assert FAST.objects_losing_support(narrower, "weight") == ("held",)
+    assert FAST.immovable_objects(narrower) == frozenset()
 
 
 def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
@@ -210,13 +210,13 @@ def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
     rolled = a_pair_on_a_narrow_foot(
         block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying
     )
-    assert FAST.stability(rolled) is None
-    assert FAST.never_movable(rolled) == frozenset(rolled.names)
+    assert FAST.find_instability(rolled) is None
+    assert FAST.immovable_objects(rolled) == frozenset(rolled.names)
     flat = a_pair_on_a_narrow_foot(block("bar", Shape.BOX, (0.12, 0.018, 0.018), 3.0), np.eye(3))
-    assert FAST.stability(flat) is None
-    assert FAST.never_movable(flat) == frozenset()
+    assert FAST.find_instability(flat) is None
+    assert FAST.immovable_objects(flat) == frozenset()
     assert all(
-        FAST.losing_support(flat, name) for name in flat.names
+        FAST.objects_losing_support(flat, name) for name in flat.names
     )  # though as it is, nothing can be taken
 
 
@@ -224,26 +224,26 @@ def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
     "scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())]
 )
 def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
-    assert FAST.never_movable(scene) == frozenset()
+    assert FAST.immovable_objects(scene) == frozenset()
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
     scene = random_scene(seed, 4, 17)
-    fixed = FAST.never_movable(scene)
+    fixed = FAST.immovable_objects(scene)
     if isinstance(fixed, InconclusiveVerdict):
-        assert FAST.supports(scene) == fixed
+        assert FAST.find_supports(scene) == fixed
         return
-    loose = {name for name in scene.names if FAST.losing_support(scene, name) == ()}
-    if FAST.stability(scene) is None:
+    loose = {name for name in scene.names if FAST.objects_losing_support(scene, name) == ()}
+    if FAST.find_instability(scene) is None:
         assert loose
         assert loose.isdisjoint(fixed)
 
 
 def test_a_tower_comes_apart_from_the_top() -> None:
     tower = [resting("cracker_box", floor=k * 0.060, name=f"box{k}") for k in range(4)]
-    assert FAST.comes_apart(scene_of(*tower)) is True
-    assert FAST.comes_apart(scene_of()) is True
+    assert FAST.is_disassemblable(scene_of(*tower)) is True
+    assert FAST.is_disassemblable(scene_of()) is True
 
 
 def test_what_holds_each_other_down_does_not_come_apart() -> None:
@@ -257,15 +257,15 @@ def test_what_holds_each_other_down_does_not_come_apart() -> None:
         resting("cracker_box", floor=0.101 + 0.038 + k * 0.060, name=f"load{k}") for k in (0, 1)
     ]
     held = scene_of(can, *leaning, *load)
-    assert FAST.stability(held) is None
-    assert FAST.comes_apart(held) is False
-    assert FAST.stability(scene_of(can, *leaning)) is not None
+    assert FAST.find_instability(held) is None
+    assert FAST.is_disassemblable(held) is False
+    assert FAST.find_instability(scene_of(can, *leaning)) is not None
     beside = resting("cracker_box", xy=(0.22, 0.22), name="beside")
-    assert FAST.comes_apart(scene_of(*held.objects, beside)) is False
-    assert FAST.comes_apart(scene_of(beside)) is True
+    assert FAST.is_disassemblable(scene_of(*held.objects, beside)) is False
+    assert FAST.is_disassemblable(scene_of(beside)) is True
 
 
 def test_beyond_the_model_it_does_not_say_whether_it_comes_apart() -> None:
     assert isinstance(
-        FAST.comes_apart(scene_of(resting("cracker_box", floor=0.1))), InconclusiveVerdict
+        FAST.is_disassemblable(scene_of(resting("cracker_box", floor=0.1))), InconclusiveVerdict
     )

@@ -15,7 +15,7 @@ from drake_clutter.cell.suction import (
     lip_flatness_deviation,
     payload_wrench,
 )
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 CUP = SuctionGripper()
 ALONG_MINUS_X = RotationMatrix(np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]))

@@ -15,7 +15,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from training.results_file import ResultsFile
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"

@@ -30,7 +30,7 @@ from drake_clutter.perception.segmentation import SegmentationNetwork
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
 from training.results_file import provenance
@@ -160,10 +160,10 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(a & b)) / max(1, int(np.count_nonzero(a | b)))
 
 
-def render_image(camera: OverheadCamera, scene: Scene) -> LabeledImage:
+def render_image(camera: CameraRenderer, scene: Scene) -> LabeledImage:
     """Return an image of a scene with its ground truth."""
     images = camera.render(scene)
-    visible_fraction = camera.visible_shares(scene, images.label)
+    visible_fraction = camera.visible_fractions(scene, images.label)
     num_pixels = np.bincount(images.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
     unoccluded_pixels = np.array(
         [
@@ -236,7 +236,7 @@ def main(
     config = ClutterConfig()
     catalog = load_catalog()
     network = SegmentationNetwork.load(detector)
-    camera = OverheadCamera(config.cell.camera)
+    camera = CameraRenderer(config.cell.camera)
     rows = dict[str, Any]()
     for path in scenes:
         scene_set = load_scene_dataset(path, catalog)

@@ -26,7 +26,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import InconclusiveVerdict, Instability
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from training.results_file import ResultsFile, Row, provenance
 from training.script import (
     RESULTS,
@@ -127,14 +127,14 @@ def evaluate_generator(
 
     summary = generate_scenes(job, evaluation.count, folder, workers, show_progress)
     catalog = load_catalog()
-    static_judge = FastJudge(job.config)
+    static_judge = StaticStabilityJudge(job.config)
     confusion = Counter[str]()
     heights = Counter[int]()
     for path in sorted((folder / SCENES_FOLDER).iterdir())[: evaluation.count]:
         file = load_scene(path, catalog)
         assert file.verdict is not None
         assert file.scene.graph is not None
-        static = verdict_name(static_judge.stability(file.scene))
+        static = verdict_name(static_judge.find_instability(file.scene))
         confusion[f"fast {static}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
         top = {o.node: o.top_height for o in file.scene.objects}
         for nodes in file.scene.graph.stack_objects():

@@ -36,8 +36,8 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene_dataset import SceneRecord, load_scene_dataset, save_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.workers.parallel_map import map_ordered
 from training.results_file import provenance
@@ -78,7 +78,9 @@ class GraphJudge:
         """
         self._job = job
         self._generator = SceneGenerator(job)
-        self._static_judge = FastJudge(job.config, margin=GenerationTaskConfig().contact_margin)
+        self._static_judge = StaticStabilityJudge(
+            job.config, margin=GenerationTaskConfig().contact_margin
+        )
         self._drake_judge = DrakeJudge(job.config)
         self._classes = load_catalog().classes
 
@@ -99,7 +101,7 @@ class GraphJudge:
         if (
             isinstance(static_verdict, InconclusiveVerdict)
             or not static_verdict.hidden
-            or self._static_judge.comes_apart(scene) is not True
+            or self._static_judge.is_disassemblable(scene) is not True
         ):
             return {"fast": False}
         drake_verdict = self._drake_judge.judge(scene, rng)

@@ -42,8 +42,12 @@ from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.perception.image_dataset import LabeledImage, write_images
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera import ENGINE, Images, OverheadCamera
-from drake_clutter.simulation.drop import above_tray, dropped
+from drake_clutter.simulation.camera_renderer import (
+    RENDER_ENGINE_PARAMS,
+    CameraRenderer,
+    RenderedImages,
+)
+from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import SeedOption, WorkersOption, progress, run_script
@@ -132,7 +136,7 @@ class ItemRenderer:
         count = self._job.num_images(item)
         is_heap = self._job.is_heap(item)
         scenes = self._heaps(count, rng) if is_heap else self._generated_scenes(count, rng)
-        camera = OverheadCamera(self._config.cell.camera, sample_lights(rng))
+        camera = CameraRenderer(self._config.cell.camera, sample_lights(rng))
         unoccluded_pixels = dict[SceneObject, int]()
         images = (render_image(camera, scene, unoccluded_pixels, rng) for scene in scenes)
         write_images(
@@ -148,8 +152,8 @@ class ItemRenderer:
     def _heaps(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
         """Yield a heap with fewer and fewer objects, down to one, at random times of the drop."""
         classes = [self._classes[k] for k in rng.integers(len(self._classes), size=HEAP_OBJECTS)]
-        moments = dropped(
-            above_tray(classes, self._config.cell.support, rng),
+        moments = simulate_drop(
+            sample_drop_scene(classes, self._config.cell.support, rng),
             self._config.settle.time_step,
             DROP_TIMES,
         )
@@ -253,11 +257,11 @@ def sample_lights(rng: np.random.Generator) -> RenderEngineVtkParams:
                 color=color,
             )
         )
-    return RenderEngineVtkParams(backend=ENGINE.backend, lights=lights)
+    return RenderEngineVtkParams(backend=RENDER_ENGINE_PARAMS.backend, lights=lights)
 
 
 def render_image(
-    camera: OverheadCamera,
+    camera: CameraRenderer,
     scene: Scene,
     unoccluded_pixels: dict[SceneObject, int],
     rng: np.random.Generator,
@@ -275,7 +279,7 @@ def render_image(
     # With one visible pixel of each object, the visible fraction is the inverse of its pixels.
     uncounted = tuple(o for o in scene.objects if o not in unoccluded_pixels)
     one_pixel_each = np.arange(len(uncounted))
-    fractions = camera.visible_shares(replace(scene, objects=uncounted), one_pixel_each)
+    fractions = camera.visible_fractions(replace(scene, objects=uncounted), one_pixel_each)
     unoccluded_pixels |= {o: round(1 / fractions[o.name]) for o in uncounted}
     return LabeledImage(
         randomize_colors(images, len(scene.objects), rng),
@@ -288,7 +292,7 @@ def render_image(
 
 
 def randomize_colors(
-    images: Images, num_objects: int, rng: np.random.Generator
+    images: RenderedImages, num_objects: int, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """Return the color image with random colors and background.
 

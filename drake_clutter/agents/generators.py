@@ -23,8 +23,8 @@ from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import mean_interval, wilson_interval
 from drake_clutter.tasks.generation_task import (
     MAX_BALANCED_STACK_FRACTION,
@@ -78,7 +78,7 @@ class HillClimber:
 
     def __init__(self, config: ClutterConfig) -> None:
         self._config = config
-        self._judge = FastJudge(config, margin=GenerationTaskConfig().contact_margin)
+        self._judge = StaticStabilityJudge(config, margin=GenerationTaskConfig().contact_margin)
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator

@@ -12,7 +12,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig, GraphVocabulary, PartialScene
 from drake_clutter.validation import validate
 
@@ -97,7 +97,7 @@ class LearnedGenerator:
         about = self._checkpoint.metadata
         self._temperature = about["temperature"] if temperature is None else temperature
         task = validate(GenerationTaskConfig, about["config"]["task"], str(path))
-        self._judge = FastJudge(config, margin=task.contact_margin)
+        self._judge = StaticStabilityJudge(config, margin=task.contact_margin)
         self._network: RuleQNetwork | None = None
 
     def derive(

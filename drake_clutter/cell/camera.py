@@ -86,7 +86,7 @@ class Camera(StrictModel):
         """Column and row on the optical axis; whole numbers are the middles of pixels.
 
         Drake's VTK engine draws half a pixel left of and above the principal point that it is given, (width - 1) / 2,
-        (height - 1) / 2: measured in tests/test_camera.py.
+        (height - 1) / 2: measured in tests/test_camera_renderer.py.
         """
         return self.width / 2 - 1, self.height / 2 - 1
 

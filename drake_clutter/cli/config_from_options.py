@@ -33,12 +33,12 @@ def check_cell_models(cell: "WorkCell", default: "WorkCell", file: Path | None) 
         InputError: The file, the field and what is allowed.
     """
     from drake_clutter.files import InputError
-    from drake_clutter.simulation.cell_plant import check_models
+    from drake_clutter.simulation.cell_plant import validate_models
 
     if (cell.robot, cell.fixtures) == (default.robot, default.fixtures):
         return
     try:
-        check_models(cell)
+        validate_models(cell)
     except InputError as error:
         raise InputError(f"{file or '--set'}: {error}") from error
 

@@ -22,7 +22,7 @@ from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.belief import Belief, Decision

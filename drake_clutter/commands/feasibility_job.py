@@ -26,7 +26,7 @@ from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.judge import DrakeJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility_study import (
     PLANNED,

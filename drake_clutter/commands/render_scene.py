@@ -10,7 +10,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.camera import OverheadCamera
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 
 DEPTH_UNIT = 1e-4
 """m per step of depth.png, of 16 bits; 0 where nothing is seen, or what is too far for them."""
@@ -35,14 +35,14 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
 
 def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
     """Writes what one camera sees; returns the visible share of each object."""
-    camera = OverheadCamera(config)
-    images, visible_fractions = camera.render(scene), camera.visible_shares(scene)
+    camera = CameraRenderer(config)
+    images, visible_fractions = camera.render(scene), camera.visible_fractions(scene)
     depth = np.rint(images.depth / DEPTH_UNIT)
     depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
     Image.fromarray(images.color).save(out / f"{prefix}color.png")
     Image.fromarray(depth.astype(np.uint16)).save(out / f"{prefix}depth.png")
     Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
-    hidden = list(camera.hidden(visible_fractions))
+    hidden = list(camera.hidden_objects(visible_fractions))
     write_json(
         out / f"{prefix}visible.json",
         {"visible_share": visible_fractions, "hidden": hidden, "names": list(scene.names)},

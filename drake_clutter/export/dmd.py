@@ -10,7 +10,7 @@ from pydrake.multibody.parsing import AddModel, AddWeld, ModelDirective, ModelDi
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.parts import classes_of
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 PACKAGE = "drake_clutter_scene"
 """The name of the package that an exported folder is."""

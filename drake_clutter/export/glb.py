@@ -11,7 +11,7 @@ import trimesh
 from drake_clutter.cell.support import Support
 from drake_clutter.export.parts import Z_UP_OF_Y_UP, class_visual, classes_of, tray_boxes
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 ROOT = "tray_frame"
 """The node of the tray frame T."""

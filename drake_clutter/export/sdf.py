@@ -8,7 +8,7 @@ from pydrake.math import RollPitchYaw
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.parts import classes_of, text_of, write_class_meshes, write_xml
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 _DRAKE = "drake.mit.edu"
 

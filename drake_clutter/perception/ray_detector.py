@@ -3,7 +3,7 @@
 from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.stability.visibility import RayCaster
+from drake_clutter.stability.ray_caster import RayCaster
 
 
 class RayDetector:

@@ -23,8 +23,13 @@ from drake_clutter.planning.tool_kinematics import invert_pose
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.cell_plant import Arm, add_work_cell, fixture_name, joint_numbers
-from drake_clutter.simulation.plant import add_scene_plant, rigid_transform, support_body
+from drake_clutter.simulation.cell_plant import (
+    Arm,
+    add_work_cell,
+    fixture_name,
+    joint_state_indices,
+)
+from drake_clutter.simulation.scene_plant import add_scene_plant, get_support_body, rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -82,9 +87,9 @@ class CollisionModel:
         )
         self._query_port = made.scene_graph.get_query_output_port()
         self._q = self.plant.GetPositions(self._context)
-        self._q_indices, self._v_indices = joint_numbers(self.plant, self._arm)
+        self._q_indices, self._v_indices = joint_state_indices(self.plant, self._arm)
         self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).link_depths)
-        self._fixed = (*self._arm.fixed, support_body(self.plant))
+        self._fixed = (*self._arm.fixed, get_support_body(self.plant))
         self._names = self._name_geometries()
         self._geometry_owners = {
             geometry: (name, geometry in self._geometry_depths)

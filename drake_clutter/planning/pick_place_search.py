@@ -45,7 +45,7 @@ from drake_clutter.planning.trajectory_optimization import (
     optimize_trajectory,
 )
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from drake_clutter.reports.filmstrip import render_filmstrip
 from drake_clutter.reports.scene_images import Annotations, SceneRenderer
 from drake_clutter.scenes.interfaces import ArmState, MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.plant import pose_of
+from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.feasibility_study import PLANNED
 
@@ -437,7 +437,7 @@ def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[
     for time in (0.0, carry.end_time() / 2, carry.end_time()):
         q = carry.value(time).ravel()
         X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
-        poses = {**scene.poses, plan.pick: pose_of(X_TO)}
+        poses = {**scene.poses, plan.pick: pose_from_transform(X_TO)}
         frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
     return frames
 

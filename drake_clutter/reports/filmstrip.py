@@ -20,7 +20,7 @@ from drake_clutter.reports.scene_images import RENDER_ENGINE, look_at_pose
 from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
-from drake_clutter.simulation.plant import add_scene_plant, rigid_transform
+from drake_clutter.simulation.scene_plant import add_scene_plant, rigid_transform
 
 _FRAME_SIZE = (480, 480)
 _OVERSAMPLING = 2

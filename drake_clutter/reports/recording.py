@@ -24,8 +24,12 @@ from drake_clutter.files import write_text
 from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
-from drake_clutter.simulation.plant import add_scene_plant, pose_of, rigid_transform
-from drake_clutter.simulation.quiet import drake_silent_below
+from drake_clutter.simulation.drake_log import suppress_drake_log
+from drake_clutter.simulation.scene_plant import (
+    add_scene_plant,
+    pose_from_transform,
+    rigid_transform,
+)
 from drake_clutter.tasks.exploration_task import Transition
 
 FRAMES_PER_SECOND = 40
@@ -140,7 +144,7 @@ def write_recording(
 def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
     arm_positions = [frame.arm.q for frame in frames if frame.arm]
     # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
-    with drake_silent_below(logging.WARNING):
+    with suppress_drake_log(logging.WARNING):
         meshcat, paths, arm_poses = _build_viewer(scene, cell, arm=bool(arm_positions))
     if len(frames) > 1:
         animation = MeshcatAnimation(FRAMES_PER_SECOND)
@@ -224,7 +228,10 @@ def _build_viewer(
     def arm_poses(q: Sequence[float]) -> dict[str, Pose]:
         if work_cell_model is not None:
             set_joint_angles(plant, plant_context, work_cell_model, q)
-        return {name: pose_of(body.EvalPoseInWorld(plant_context)) for name, body in links.items()}
+        return {
+            name: pose_from_transform(body.EvalPoseInWorld(plant_context))
+            for name, body in links.items()
+        }
 
     paths = {
         name: "/scene/" + inspector.GetName(id).replace("::", "/") for name, id in frame_ids.items()

@@ -16,8 +16,8 @@ from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.reports.canvas import Canvas, Rectangle, TextLabel, innermost_point
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.camera import Images, OverheadCamera
-from drake_clutter.simulation.plant import pose_of
+from drake_clutter.simulation.camera_renderer import CameraRenderer, RenderedImages
+from drake_clutter.simulation.scene_plant import pose_from_transform
 
 OVERHEAD_SIZE = (720, 720)
 OBLIQUE_SIZE = (960, 720)
@@ -126,7 +126,7 @@ class SceneRenderer:
     """Takes pictures of scenes."""
 
     def __init__(self) -> None:
-        self._latest: tuple[Scene, Images] | None = None
+        self._latest: tuple[Scene, RenderedImages] | None = None
 
     def render_overhead(self, scene: Scene) -> NDArray[np.uint8]:
         """The tray from straight above, (720, 720, 3) uint8."""
@@ -192,19 +192,21 @@ class SceneRenderer:
         return _downsample(canvas.image)
 
     @cached_property
-    def _overhead(self) -> OverheadCamera:
-        return OverheadCamera(_camera_above(default_cell().support, OVERHEAD_SIZE), RENDER_ENGINE)
+    def _overhead(self) -> CameraRenderer:
+        return CameraRenderer(_camera_above(default_cell().support, OVERHEAD_SIZE), RENDER_ENGINE)
 
     @cached_property
-    def _oblique(self) -> OverheadCamera:
-        return OverheadCamera(_camera_above(default_cell().support, OBLIQUE_SIZE), RENDER_ENGINE)
+    def _oblique(self) -> CameraRenderer:
+        return CameraRenderer(_camera_above(default_cell().support, OBLIQUE_SIZE), RENDER_ENGINE)
 
-    def _render_overhead_images(self, scene: Scene) -> Images:
+    def _render_overhead_images(self, scene: Scene) -> RenderedImages:
         # One move's picture "after" shows the same scene as the next one's "before".
         if self._latest is None or self._latest[0] is not scene:
             self._latest = (
                 scene,
-                self._overhead.render(scene, pose_of(_camera_above(scene.support).X_TC)),
+                self._overhead.render(
+                    scene, pose_from_transform(_camera_above(scene.support).X_TC)
+                ),
             )
         return self._latest[1]
 

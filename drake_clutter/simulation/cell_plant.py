@@ -46,10 +46,10 @@ class Arm:
     cup: Frame
 
 
-_GREY = (0.45, 0.46, 0.48, 1.0)
-_FIXTURES = "fixtures."
+_PEDESTAL_COLOR = (0.45, 0.46, 0.48, 1.0)
+_FIXTURE_PREFIX = "fixtures."
 """Before a fixture's name in that of its model instance, which no other model has."""
-_HOUSING = 0.06
+_CAMERA_HOUSING_RADIUS = 0.06
 """Radius of the sphere that stands for a camera's housing, behind its lens [m]."""
 
 
@@ -89,13 +89,13 @@ def add_work_cell(
             shape = Box(*fixture.box)
             _add_solid(plant, fixture.name, fixture.pose.transform, shape, fixture.color)
     for name, camera in cell.cameras.items():
-        X_TS = camera.X_TC @ RigidTransform([0.0, 0.0, -_HOUSING / 2])
+        X_TS = camera.X_TC @ RigidTransform([0.0, 0.0, -_CAMERA_HOUSING_RADIUS / 2])
         name = "camera" if len(cell.cameras) == 1 else name
-        _add_solid(plant, name, X_TS, Sphere(_HOUSING), None)
+        _add_solid(plant, name, X_TS, Sphere(_CAMERA_HOUSING_RADIUS), None)
     pedestal = cell.pedestal
     if pedestal is not None:
         X_TS, size = pedestal
-        _add_solid(plant, PEDESTAL_NAME, X_TS, Box(*size), _GREY)
+        _add_solid(plant, PEDESTAL_NAME, X_TS, Box(*size), _PEDESTAL_COLOR)
     filter_collisions(plant, scene_graph, model, robot)
     bodies = _bodies(plant, robot, tool)
     cup = plant.GetFrameByName("cup", tool)
@@ -104,10 +104,10 @@ def add_work_cell(
 
 def fixture_name(plant: MultibodyPlant, body: RigidBody) -> str:
     """Return the name of the fixture whose model a body belongs to."""
-    return str(plant.GetModelInstanceName(body.model_instance())).removeprefix(_FIXTURES)
+    return str(plant.GetModelInstanceName(body.model_instance())).removeprefix(_FIXTURE_PREFIX)
 
 
-def check_models(cell: WorkCell) -> None:
+def validate_models(cell: WorkCell) -> None:
     """Read all models of a cell.
 
     Raises:
@@ -138,14 +138,16 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     """Add a fixture's model, fixed to the world; see `fixture_name` for its model instance."""
     field = f"fixtures.{fixture.name}.model"
     instance = parse_model(plant, fixture.model, visuals=visuals, field=field)
-    plant.RenameModelInstance(instance, f"{_FIXTURES}{fixture.name}")
+    plant.RenameModelInstance(instance, f"{_FIXTURE_PREFIX}{fixture.name}")
     bodies = _bodies(plant, instance)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if any(joint.parent_body().index() == plant.world_body().index() for joint in joints):
         found = f"{field}: {fixture.model!r} is fixed to the world"
         raise InputError(f"{found}; allowed is a model that its pose fixes there")
-    of_model = plant.HasFrameNamed("__model__", instance)
-    frame = plant.GetFrameByName("__model__", instance) if of_model else bodies[0].body_frame()
+    has_model_frame = plant.HasFrameNamed("__model__", instance)
+    frame = (
+        plant.GetFrameByName("__model__", instance) if has_model_frame else bodies[0].body_frame()
+    )
     plant.WeldFrames(plant.world_frame(), frame, fixture.pose.transform)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if len(joints) != len(bodies) or any(joint.num_positions() for joint in joints):
@@ -155,7 +157,9 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     return bodies
 
 
-def joint_numbers(plant: MultibodyPlant, arm: Arm) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def joint_state_indices(
+    plant: MultibodyPlant, arm: Arm
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return where q (n,) and v (n,) of the arm lie in the finalized plant's."""
     joints = [plant.GetJointByName(name, arm.robot) for name in arm.joints]
     return np.array([j.position_start() for j in joints]), np.array(
@@ -166,5 +170,5 @@ def joint_numbers(plant: MultibodyPlant, arm: Arm) -> tuple[NDArray[np.int64], N
 def set_joint_angles(plant: MultibodyPlant, context: Context, arm: Arm, q: Sequence[float]) -> None:
     """Put the arm at q (n,) [rad]; the rest of the plant stays as it is."""
     positions = plant.GetPositions(context)
-    positions[joint_numbers(plant, arm)[0]] = q
+    positions[joint_state_indices(plant, arm)[0]] = q
     plant.SetPositions(context, positions)

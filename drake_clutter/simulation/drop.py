@@ -10,20 +10,22 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant
 
-_WITHIN = 0.3
+_START_RANGE = 0.3
 """Of the tray's side: objects start this far from its middle, each way; the tray's rim alone does not keep them."""
-_LEAST_GAP, _MOST_GAP = 0.01, 0.06
+_MIN_START_GAP, _MAX_START_GAP = 0.01, 0.06
 """m, between an object and what it starts above."""
 
 
-def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.Generator) -> Scene:
+def sample_drop_scene(
+    classes: Sequence[ObjectClass], support: Support, rng: np.random.Generator
+) -> Scene:
     """Objects of the classes in the air over the tray, turned at random, each above those whose way down it shares."""
     objects = list[SceneObject]()
     for number, object_class in enumerate(classes):
         R_TO = Rotation.random(rng=rng).as_matrix()
-        x, y = rng.uniform(-_WITHIN, _WITHIN, 2) * support.size
+        x, y = rng.uniform(-_START_RANGE, _START_RANGE, 2) * support.size
         loose = SceneObject(
             f"{object_class.name}_{number}", object_class, Pose.from_rotation(R_TO, (x, y, 0.0))
         )
@@ -33,18 +35,18 @@ def above_tray(classes: Sequence[ObjectClass], support: Support, rng: np.random.
             for bottom, top in (o.bounds_T for o in objects)
             if (np.minimum(upper, top)[:2] > np.maximum(lower, bottom)[:2]).all()
         ]
-        z = max(below, default=0.0) + rng.uniform(_LEAST_GAP, _MOST_GAP) - lower[2]
+        z = max(below, default=0.0) + rng.uniform(_MIN_START_GAP, _MAX_START_GAP) - lower[2]
         objects.append(SceneObject(loose.name, object_class, Pose.from_rotation(R_TO, (x, y, z))))
     return Scene(tuple(objects), support)
 
 
-def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Scene]:
+def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> list[Scene]:
     """What Drake makes of objects that are let go where they are: at each moment (s), those that are on the tray.
 
     Args:
         scene: objects at rest in the air.
         time_step: s.
-        moments: s after they were let go, increasing.
+        times: s after they were let go, increasing.
     """
     builder = DiagramBuilder()
     names = [(o.name, o.object_class) for o in scene.objects]
@@ -55,11 +57,11 @@ def dropped(scene: Scene, time_step: float, moments: Sequence[float]) -> list[Sc
     scene_plant.set_poses(context, scene.objects)
     simulator.Initialize()
     scenes = []
-    for moment in moments:
+    for moment in times:
         simulator.AdvanceTo(moment)
-        fallen = scene.with_poses(scene_plant.poses(context))
+        snapshot = scene.with_poses(scene_plant.poses(context))
         scenes.append(
-            Scene(tuple(o for o in fallen.objects if _on_tray(o, scene.support)), scene.support)
+            Scene(tuple(o for o in snapshot.objects if _on_tray(o, scene.support)), scene.support)
         )
     return scenes
 

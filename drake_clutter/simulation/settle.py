@@ -13,7 +13,7 @@ from drake_clutter.cell.support import Support
 from drake_clutter.config import SettleConfig
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, MotionSample
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
-from drake_clutter.simulation.plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant
 
 SAMPLE_PERIOD = 0.05
 """s between two looks at whether the objects have come to rest; at every second one, at whether they have fallen."""
@@ -22,7 +22,7 @@ REST_SAMPLES = 10
 
 
 @dataclass(frozen=True)
-class Settled:
+class SettleResult:
     """How objects settled.
 
     Attributes:
@@ -36,7 +36,7 @@ class Settled:
     motion: tuple[MotionSample, ...]
 
 
-def fallen(
+def find_instability(
     before: SceneObject, after: Pose, support: Support, config: SettleConfig
 ) -> Instability | None:
     """How an object has fallen that was before, and is now; None if it stayed within the limits."""
@@ -60,8 +60,8 @@ def settle(
     config: SettleConfig,
     *,
     record: bool = False,
-    follow_falls: bool = False,
-) -> Settled:
+    simulate_collapse: bool = False,
+) -> SettleResult:
     """Simulates objects alone on the tray, from rest where they are.
 
     Ends when an object has fallen, when all have been calm or still for a while, or when the config's time is up. A single lying
@@ -72,7 +72,7 @@ def settle(
         support: what they stand on.
         config: time step and limits.
         record: whether to keep the motion.
-        follow_falls: go on after an object has fallen, until everything is calm or the time is up.
+        simulate_collapse: go on after an object has fallen, until everything is calm or the time is up.
     """
     builder = DiagramBuilder()
     scene_plant = add_scene_plant(
@@ -90,9 +90,9 @@ def settle(
 
     history = [{o.name: o.X_TO for o in objects}]
     motion = [MotionSample(0.0, history[0])] if record else []
-    may_creep = _may_creep(objects)
-    still_samples = REST_SAMPLES * (2 if may_creep else 1)
-    calm_samples, instability = 0, None
+    may_roll_slowly = _may_roll_slowly(objects)
+    num_window_samples = REST_SAMPLES * (2 if may_roll_slowly else 1)
+    num_calm_samples, instability = 0, None
     last = math.ceil(config.max_time / SAMPLE_PERIOD)
     for sample in range(1, last + 1):
         if record:
@@ -108,39 +108,39 @@ def settle(
             motion.append(MotionSample(sample * SAMPLE_PERIOD, poses))
         # Every second time: by then what topples has turned so far that it is not taken for something that slides.
         if instability is None and (sample % 2 == 0 or sample == last):
-            gone = [
+            instabilities = [
                 found
                 for o in objects
-                if (found := fallen(o, poses[o.name], support, config)) is not None
+                if (found := find_instability(o, poses[o.name], support, config)) is not None
             ]
-            instability = max(gone, key=lambda f: f.displacement, default=None)
-            if instability is not None and not follow_falls:
-                return Settled(instability, poses, tuple(motion))
+            instability = max(instabilities, key=lambda f: f.displacement, default=None)
+            if instability is not None and not simulate_collapse:
+                return SettleResult(instability, poses, tuple(motion))
         reference = history[-2] if instability else history[0]
-        calm = all(
+        is_calm = all(
             speeds[o.name] < config.calm_speed
             and _distance(poses[o.name], reference[o.name]) < config.calm_displacement
             and tilt_between(o.object_class, reference[o.name], poses[o.name])
             < math.radians(config.calm_tilt_deg)
             for o in objects
         )
-        calm_samples = calm_samples + 1 if calm else 0
-        if calm_samples >= config.calm_samples and (instability or not may_creep):
-            return Settled(instability, poses, tuple(motion))
+        num_calm_samples = num_calm_samples + 1 if is_calm else 0
+        if num_calm_samples >= config.calm_samples and (instability or not may_roll_slowly):
+            return SettleResult(instability, poses, tuple(motion))
         if (
             sample % 2 == 0
-            and len(history) > still_samples
-            and _still(objects, history[-1 - still_samples :], config)
+            and len(history) > num_window_samples
+            and _stayed_close(objects, history[-1 - num_window_samples :], config)
         ):
-            return Settled(instability, poses, tuple(motion))
+            return SettleResult(instability, poses, tuple(motion))
     if instability is None:
-        instability = _still_moving(
+        instability = _find_motion(
             objects, poses, history[max(0, len(history) - 1 - REST_SAMPLES)], config
         )
-    return Settled(instability, poses, tuple(motion))
+    return SettleResult(instability, poses, tuple(motion))
 
 
-def _still(
+def _stayed_close(
     objects: Sequence[SceneObject], history: Sequence[dict[str, Pose]], config: SettleConfig
 ) -> bool:
     """Whether all objects have been close to where they are now."""
@@ -158,7 +158,7 @@ def _distance(X_TA: Pose, X_TB: Pose) -> float:
     return float(np.linalg.norm(X_TA.p - X_TB.p))
 
 
-def _still_moving(
+def _find_motion(
     objects: Sequence[SceneObject],
     poses: dict[str, Pose],
     earlier: dict[str, Pose],
@@ -175,7 +175,7 @@ def _still_moving(
     )
 
 
-def _may_creep(objects: Sequence[SceneObject]) -> bool:
+def _may_roll_slowly(objects: Sequence[SceneObject]) -> bool:
     """Whether a lying cylinder may carry something: its axis is level and something reaches higher above it."""
     for o in objects:
         if o.object_class.shape is not Shape.CYLINDER or abs(o.X_TO.rotation[2, 2]) > 0.5:

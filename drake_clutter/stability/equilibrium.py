@@ -11,24 +11,24 @@ from numba import njit
 from drake_clutter.stability.contacts import GROUND, contact_polygon
 from drake_clutter.stability.nnls import nnls
 
-_LENGTH = 0.05
+_MOMENT_ARM = 0.05
 """m, by which moments are divided, so that they count about as much as forces."""
-_BALANCED = 1e-6
+_RESIDUAL_TOLERANCE = 1e-6
 """Of the total weight: the residual that is taken for rounding."""
 NO_LOADS = np.empty((0, 4))
 
 
 @njit(cache=True)
-def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # type: ignore[no-untyped-def]
+def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, friction, loads):  # type: ignore[no-untyped-def]
     """How much of each object's weight and moment no contact forces can hold.
 
     Args:
-        posed: (N,) of `shapes.POSED`.
+        records: (N,) of `shapes.POSED`.
         shapes: (n,) the objects' rows.
         p_T: (n, 3) m.
         pairs: (c, 2) lower (`GROUND`: the tray) and upper object of each contact.
         margins: (n,) m, by which the contacts below each object are shrunk.
-        aside: (n, 2) m, by which the centres of mass are moved.
+        com_offsets: (n, 2) m, by which the centres of mass are moved.
         friction: 0, or the coefficient of the pyramids in which the forces lie.
         loads: (l, 4) points x, y, z, m, at which anything may press straight down, and the object that is pressed; may be empty.
 
@@ -36,46 +36,46 @@ def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
         (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
     """
     n = len(shapes)
-    at, ends = (
+    points, ends = (
         np.empty((48 * len(pairs) + len(loads), 3)),
         np.empty((48 * len(pairs) + len(loads), 2), np.int64),
     )
     count = 0
     for load in loads:
-        at[count] = load[:3]
+        points[count] = load[:3]
         ends[count, 0], ends[count, 1] = -1, int(load[3])
         count += 1
     for c in range(len(pairs)):
         lower, upper = pairs[c]
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
         polygon = contact_polygon(
-            posed, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper]
+            records, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper]
         )
         for k in range(len(polygon)):
-            at[count, 0], at[count, 1] = polygon[k, 0], polygon[k, 1]
-            at[count, 2] = p_T[upper, 2] + posed[shapes[upper]].low
+            points[count, 0], points[count, 1] = polygon[k, 0], polygon[k, 1]
+            points[count, 2] = p_T[upper, 2] + records[shapes[upper]].bottom_z
             ends[count, 0], ends[count, 1] = upper, lower
             count += 1
     total = 0.0
     for i in range(n):
-        total += posed[shapes[i]].mass
+        total += records[shapes[i]].mass
     rows, sides = (6, 4) if friction > 0 else (3, 1)
     A, b = (
         np.zeros((sides * count, rows * n)),
         np.zeros(rows * n),
     )  # a row of A is a column of the problem
     for i in range(n):
-        b[rows * i] = posed[shapes[i]].mass / total
+        b[rows * i] = records[shapes[i]].mass / total
     for k in range(count):
         for end in range(2):
             i = ends[k, end]
             if i < 0:
                 continue
             sign = 1.0 - 2.0 * end
-            com = posed[shapes[i]].com
-            x = (at[k, 0] - p_T[i, 0] - com[0] - aside[i, 0]) / _LENGTH
-            y = (at[k, 1] - p_T[i, 1] - com[1] - aside[i, 1]) / _LENGTH
-            z = (at[k, 2] - p_T[i, 2] - com[2]) / _LENGTH
+            com = records[shapes[i]].com
+            x = (points[k, 0] - p_T[i, 0] - com[0] - com_offsets[i, 0]) / _MOMENT_ARM
+            y = (points[k, 1] - p_T[i, 1] - com[1] - com_offsets[i, 1]) / _MOMENT_ARM
+            z = (points[k, 2] - p_T[i, 2] - com[2]) / _MOMENT_ARM
             for side in range(sides):
                 slants = sides > 1 and k >= len(loads)
                 fx = friction * ((side == 0) - (side == 1)) if slants else 0.0
@@ -88,16 +88,16 @@ def residuals(posed, shapes, p_T, pairs, margins, aside, friction, loads):  # ty
                     A[column, rows * i + 3] = sign * fx
                     A[column, rows * i + 4] = sign * fy
                     A[column, rows * i + 5] = sign * (x * fy - y * fx)
-    rest = nnls(A, b, 1e-9)[1]
-    found = np.empty(n)
+    residual = nnls(A, b, 1e-9)[1]
+    norms = np.empty(n)
     for i in range(n):
-        norm = np.sqrt((rest[rows * i : rows * i + rows] ** 2).sum())
-        found[i] = norm if norm > _BALANCED else 0.0
-    return found
+        norm = np.sqrt((residual[rows * i : rows * i + rows] ** 2).sum())
+        norms[i] = norm if norm > _RESIDUAL_TOLERANCE else 0.0
+    return norms
 
 
 @njit(cache=True)
-def _holds(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
+def _contains(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
     """Whether a point lies in a convex polygon, moved by p, by at least the margin."""
     for k in range(count):
         after = (k + 1) % count
@@ -109,7 +109,7 @@ def _holds(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _stands_one_on_one(posed, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
+def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
     """Whether a stack stands in which no object has more than one contact below: then loads simply add up from the top.
 
     False also if there is such an object, or a cylinder that carries: then it takes a solver to know.
@@ -117,22 +117,24 @@ def _stands_one_on_one(posed, shapes, p_T, pairs, margin):  # type: ignore[no-un
     n = len(shapes)
     below = np.full(n, -2)
     for lower, upper in pairs:
-        if below[upper] != -2 or (lower >= 0 and posed[shapes[lower]].rolls):
+        if below[upper] != -2 or (lower >= 0 and records[shapes[lower]].rolls):
             return False
         below[upper] = lower
     force, moment = np.empty(n), np.empty((n, 2))  # of the object and all that it carries
     for i in range(n):
-        force[i] = posed[shapes[i]].mass
+        force[i] = records[shapes[i]].mass
         for axis in range(2):
-            moment[i, axis] = force[i] * (p_T[i, axis] + posed[shapes[i]].com[axis])
+            moment[i, axis] = force[i] * (p_T[i, axis] + records[shapes[i]].com[axis])
     for i in np.argsort(p_T[:, 2])[::-1]:
         x, y = moment[i, 0] / force[i], moment[i, 1] / force[i]
         shape, lower = shapes[i], below[i]
-        if not _holds(posed[shape].bottom, posed[shape].bottom_count, p_T[i], x, y, margin):
+        if not _contains(records[shape].bottom, records[shape].bottom_count, p_T[i], x, y, margin):
             return False
         if lower >= 0:
             carrier = shapes[lower]
-            if not _holds(posed[carrier].top, posed[carrier].top_count, p_T[lower], x, y, margin):
+            if not _contains(
+                records[carrier].top, records[carrier].top_count, p_T[lower], x, y, margin
+            ):
                 return False
             force[lower] += force[i]
             moment[lower, 0] += moment[i, 0]
@@ -141,34 +143,46 @@ def _stands_one_on_one(posed, shapes, p_T, pairs, margin):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def weakest(posed, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
+def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
     """The object of a stack that is furthest from equilibrium, and whether it rolls; -1 if the stack stands.
 
     Vertical forces come first; what they cannot hold, forces with friction may, as in an arch of two boxes that lean on what
     bridges them. All contacts are shrunk by the margin (m). The line along which a cylinder carries has no width to shrink:
     instead, what lies on one must also be held with its centre of mass moved by the margin to either side of the line.
     """
-    if _stands_one_on_one(posed, shapes, p_T, pairs, margin):
+    if _is_stable_tower(records, shapes, p_T, pairs, margin):
         return -1, False
     n = len(shapes)
-    margins, aside = np.full(n, margin), np.zeros((n, 2))
-    rest = residuals(posed, shapes, p_T, pairs, margins, aside, 0.0, NO_LOADS)
-    needed = 0.0
-    if rest.max() > 0:
-        needed = friction
-        if residuals(posed, shapes, p_T, pairs, margins, aside, friction, NO_LOADS).max() > 0:
-            return np.nonzero(rest > rest.max() - 1e-9)[0][
+    margins, com_offsets = np.full(n, margin), np.zeros((n, 2))
+    residual = equilibrium_residuals(
+        records, shapes, p_T, pairs, margins, com_offsets, 0.0, NO_LOADS
+    )
+    needed_friction = 0.0
+    if residual.max() > 0:
+        needed_friction = friction
+        if (
+            equilibrium_residuals(
+                records, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
+            ).max()
+            > 0
+        ):
+            return np.nonzero(residual > residual.max() - 1e-9)[0][
                 0
             ], False  # of twins the first, whatever rounding says
     for lower, upper in pairs:
-        if lower >= 0 and posed[shapes[lower]].rolls:
-            line = posed[shapes[lower]].top[1] - posed[shapes[lower]].top[0]
+        if lower >= 0 and records[shapes[lower]].rolls:
+            line = records[shapes[lower]].top[1] - records[shapes[lower]].top[0]
             for sign in (-1.0, 1.0):
-                aside[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
-                aside[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
-                if residuals(posed, shapes, p_T, pairs, margins, aside, needed, NO_LOADS).max() > 0:
+                com_offsets[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
+                com_offsets[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
+                if (
+                    equilibrium_residuals(
+                        records, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
+                    ).max()
+                    > 0
+                ):
                     return upper, True
-            aside[upper] = 0.0
+            com_offsets[upper] = 0.0
     return -1, False
 
 
@@ -210,29 +224,29 @@ def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
             at -= 1
         order[at] = i
         count += 1
-    described, first, stacks = np.empty((count, 4), np.int64), np.empty(count + 1, np.int64), 0
+    description, first, stacks = np.empty((count, 4), np.int64), np.empty(count + 1, np.int64), 0
     for k in range(count):
         i = order[k]
         if k == 0 or stack[i] != stack[order[k - 1]]:
             first[stacks] = k
             stacks += 1
         base = order[first[stacks - 1]]
-        described[k, 0], described[k, 3] = shapes[i], key[i, 1]
-        described[k, 1], described[k, 2] = key[i, 3] - key[base, 3], key[i, 4] - key[base, 4]
+        description[k, 0], description[k, 3] = shapes[i], key[i, 1]
+        description[k, 1], description[k, 2] = key[i, 3] - key[base, 3], key[i, 4] - key[base, 4]
     first[stacks] = count
-    return order[:count], first[: stacks + 1], described
+    return order[:count], first[: stacks + 1], description
 
 
 @njit(cache=True)
-def weakest_each(posed, shapes, p_T, pairs, order, first, chosen, margin, friction):  # type: ignore[no-untyped-def]
+def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, margin, friction):  # type: ignore[no-untyped-def]
     """See `weakest`, for the chosen (k,) of several stacks: the rows of stack i are order[first[i]] up to order[first[i + 1]].
 
     Returns:
         (k, 2) position in its stack of what is furthest from equilibrium, or -1, and whether it rolls.
     """
-    found = np.empty((len(chosen), 2), np.int64)
-    for k in range(len(chosen)):
-        rows = order[first[chosen[k]] : first[chosen[k] + 1]]
+    found = np.empty((len(selected), 2), np.int64)
+    for k in range(len(selected)):
+        rows = order[first[selected[k]] : first[selected[k] + 1]]
         position = np.full(len(shapes) + 1, -2)
         position[GROUND] = GROUND
         for own, row in enumerate(rows):
@@ -243,7 +257,7 @@ def weakest_each(posed, shapes, p_T, pairs, order, first, chosen, margin, fricti
             if position[lower] != -2 and position[upper] != -2:
                 within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
                 contacts += 1
-        found[k, 0], found[k, 1] = weakest(
-            posed, shapes[rows], p_T[rows], within[:contacts], margin, friction
+        found[k, 0], found[k, 1] = least_stable_object(
+            records, shapes[rows], p_T[rows], within[:contacts], margin, friction
         )
     return found

@@ -39,25 +39,25 @@ def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
         x (columns,) and the residual b - A^T x (rows,).
     """
     columns, rows = A.shape
-    x, rest = np.zeros(columns), b.copy()
-    chosen, blocked = np.zeros(columns, np.bool_), np.zeros(columns, np.bool_)
-    most_members = min(columns, rows) + 1
-    members, m = np.empty(most_members, np.int64), 0
-    L, c, s = np.empty((most_members, most_members)), np.empty(most_members), np.empty(most_members)
+    x, residual = np.zeros(columns), b.copy()
+    is_member, blocked = np.zeros(columns, np.bool_), np.zeros(columns, np.bool_)
+    max_members = min(columns, rows) + 1
+    members, m = np.empty(max_members, np.int64), 0
+    L, c, s = np.empty((max_members, max_members)), np.empty(max_members), np.empty(max_members)
     for _ in range(6 * rows + 30):
-        entering, most = -1, tolerance
+        entering, steepest = -1, tolerance
         for k in range(columns):
-            if not chosen[k] and not blocked[k]:
-                slope = _dot(A[k], rest, rows)
-                if slope > most:
-                    entering, most = k, slope
+            if not is_member[k] and not blocked[k]:
+                slope = _dot(A[k], residual, rows)
+                if slope > steepest:
+                    entering, steepest = k, slope
         if entering < 0:
             break
         members[m] = entering
-        if m + 1 == most_members or not _factor_row(A, members, m, L):
+        if m + 1 == max_members or not _factor_row(A, members, m, L):
             blocked[entering] = True
             continue
-        chosen[entering] = True
+        is_member[entering] = True
         c[m] = _dot(A[entering], b, rows)
         m += 1
         while True:
@@ -76,7 +76,7 @@ def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
                 k = members[r]
                 x[k] += step * (s[r] - x[k])
                 if step < 1.0 and x[k] <= 1e-12:
-                    x[k], chosen[k] = 0.0, False
+                    x[k], is_member[k] = 0.0, False
                     continue
                 members[kept], c[kept] = k, c[r]
                 if kept < r:
@@ -86,7 +86,7 @@ def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
             if step >= 1.0:
                 blocked[:] = False
                 break
-        rest[:] = b
+        residual[:] = b
         for r in range(m):
-            rest -= x[members[r]] * A[members[r]]
-    return x, rest
+            residual -= x[members[r]] * A[members[r]]
+    return x, residual

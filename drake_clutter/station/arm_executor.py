@@ -13,8 +13,8 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.interfaces import Instability, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.judge import TOUCHING_MARGIN
-from drake_clutter.simulation.settle import fallen, settle
+from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle import find_instability, settle
 from drake_clutter.station.station_simulation import StationSimulation
 
 MIN_DISPLACEMENT = 1e-4
@@ -104,6 +104,8 @@ def worst_instability(
 ) -> Instability | None:
     """Of the objects that did not stay where they were, the one that went furthest."""
     found = [
-        fall for o in expected if (fall := fallen(o, after[o.name].X_TO, after.support, config))
+        fall
+        for o in expected
+        if (fall := find_instability(o, after[o.name].X_TO, after.support, config))
     ]
     return max(found, key=lambda fall: fall.displacement, default=None)

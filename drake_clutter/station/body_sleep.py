@@ -13,8 +13,8 @@ from pydrake.systems.framework import Context
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.geometry import group_touching_objects, transport_pose
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.judge import TOUCHING_MARGIN
-from drake_clutter.simulation.plant import support_body
+from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
+from drake_clutter.simulation.scene_plant import get_support_body
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import DWELL_TIME, CommandSchedule
 from drake_clutter.station.gripper_actuator import GraspStatus
@@ -158,7 +158,7 @@ class BodySleepManager:
         station, plant = self._station, self._station.plant
         context = station.plant_context(root)
         locked, fixed = GeometrySet(), GeometrySet()
-        for body in (*station.arm.fixed, support_body(plant)):
+        for body in (*station.arm.fixed, get_support_body(plant)):
             fixed.Add(plant.GetCollisionGeometriesForBody(body))
         for name, joint in station.free_joints.items():
             if name in awake:

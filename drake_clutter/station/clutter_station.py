@@ -15,8 +15,13 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_numbers
-from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, populated, rigid_transform
+from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_state_indices
+from drake_clutter.simulation.scene_plant import (
+    ScenePlant,
+    add_objects,
+    add_scene_plant,
+    rigid_transform,
+)
 from drake_clutter.station.grasp_constraint import CompliantGrasp, GraspConstraint, WeldGrasp
 
 Floats = NDArray[np.float64]
@@ -105,7 +110,7 @@ class ClutterStation(Diagram):
         self._object_names = {
             int(body.index()): name for name, body in self.scene_plant.bodies.items()
         }
-        self._q_indices, self._v_indices = joint_numbers(plant, self.arm)
+        self._q_indices, self._v_indices = joint_state_indices(plant, self.arm)
         num_joints = len(self.arm.joints)
         command = builder.AddSystem(Demultiplexer(np.array([2 * num_joints, num_joints])))
         builder.ExportInput(command.get_input_port(), "command")
@@ -131,7 +136,7 @@ class ClutterStation(Diagram):
             builder.AddNamedSystem("camera_scene_graph", SceneGraph()),
         )
         twin.RegisterAsSourceForSceneGraph(seen)
-        bodies = populated(
+        bodies = add_objects(
             twin, seen, objects, self.cell.support, visuals=True, jointed=self._weldable_object
         ).bodies
         arm = add_work_cell(twin, seen, self.cell, compliant=True, visuals=True)

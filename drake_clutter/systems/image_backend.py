@@ -16,8 +16,8 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.executor import SettleExecutor
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.systems.action_filter import InfeasibleMoveFilter
 from drake_clutter.systems.perception_system import PerceptionFn, with_min_release_height
@@ -51,10 +51,10 @@ class ImageBackend(SteppedBackend):
         """
         world = with_min_release_height(world)
         self._perceive, self._seed = perceive, seed
-        self._camera = OverheadCamera(world.cell.camera)
+        self._camera = CameraRenderer(world.cell.camera)
         empty_depth = self._camera.render(replace(scene, objects=())).depth
         super().__init__(
-            SettleExecutor(world, follow_falls=False),
+            SettleExecutor(world, simulate_collapse=False),
             LabelDetector(world.cell.camera),
             world.exploration,
             scene,

@@ -18,7 +18,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.plant import pose_of
+from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import empty_observation
 
@@ -138,7 +138,9 @@ class LabelPerception:
         body_poses: Sequence[RigidTransform],
     ) -> Observation:
         """See `Perceive`."""
-        poses = {name: pose_of(body_poses[number]) for name, number in self._numbers.items()}
+        poses = {
+            name: pose_from_transform(body_poses[number]) for name, number in self._numbers.items()
+        }
         told = self._detector.perceive(self._scene.with_poses(poses)).observation
         unobstructed = depth > told.depth - 0.01  # the arm may be in the way
         in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)

@@ -9,7 +9,11 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F, RgbdSensor
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.simulation.camera import ENGINE, RENDERER, Intrinsics
+from drake_clutter.simulation.camera_renderer import (
+    RENDER_ENGINE_PARAMS,
+    RENDERER_NAME,
+    RenderCameras,
+)
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.station_simulation import TIME_STEP
 
@@ -18,8 +22,8 @@ def add_overhead_camera(builder: DiagramBuilder, station: ClutterStation) -> Rgb
     """Add the cell's camera to a diagram, connected to a station that has visuals."""
     seen = station.camera_scene_graph
     assert seen is not None
-    seen.AddRenderer(RENDERER, MakeRenderEngineVtk(ENGINE))
-    eye = Intrinsics.of(station.cell.camera)
+    seen.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(RENDER_ENGINE_PARAMS))
+    eye = RenderCameras.from_camera(station.cell.camera)
     sensor = RgbdSensor(seen.world_frame_id(), eye.X_TC, eye.color, eye.depth)
     builder.AddNamedSystem("overhead_camera", sensor)
     builder.Connect(station.GetOutputPort("query"), sensor.GetInputPort("geometry_query"))

@@ -13,7 +13,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset, relayout
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import BackendFactory, make_teleport_backend_factory
 from drake_clutter.tasks.exploration_graph import (
@@ -81,7 +81,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         if isinstance(fidelity, str):
             fidelity = make_teleport_backend_factory(fidelity, self._config)
         self._start_backend = fidelity
-        self._judge = FastJudge(self._config)
+        self._judge = StaticStabilityJudge(self._config)
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.node_kind_ids), (n,), np.int8),
@@ -120,7 +120,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
                 self._config,
                 self.np_random,
             )
-            if self._judge.stability(scene) is None and len(scene.objects) < self._nodes:
+            if self._judge.find_instability(scene) is None and len(scene.objects) < self._nodes:
                 observation = self.reset_to_scene(scene)
                 if self.task.termination is None:
                     return observation

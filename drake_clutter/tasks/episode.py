@@ -20,9 +20,9 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.simulation.fallback import FastOrDrakeExecutor
-from drake_clutter.stability.executor import FastExecutor
+from drake_clutter.simulation.hybrid import HybridExecutor
+from drake_clutter.simulation.settle_executor import SettleExecutor
+from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.tasks.belief import (
     ActionFilter,
     Belief,
@@ -238,11 +238,11 @@ def make_teleport_backend_factory(
     detector: Detector = RayDetector(config.cell.camera)
     match fidelity:
         case "equilibrium":
-            executor = FastExecutor(config)
+            executor = StaticExecutor(config)
         case "fast":
-            executor = FastOrDrakeExecutor(config, follow_falls=follow_falls)
+            executor = HybridExecutor(config, simulate_collapse=follow_falls)
         case "settle":
-            executor = SettleExecutor(config, follow_falls=follow_falls)
+            executor = SettleExecutor(config, simulate_collapse=follow_falls)
             detector = LabelDetector(config.cell.camera)
         case _:
             allowed = ", ".join(TELEPORT_FIDELITIES)

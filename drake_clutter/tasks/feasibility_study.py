@@ -27,7 +27,7 @@ from drake_clutter.scenes.interfaces import Move, PickPlaceCommand
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.plant import rigid_transform
+from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.tasks.belief import legal_moves
 
 PLANNED = "planned"

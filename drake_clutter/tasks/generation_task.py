@@ -24,7 +24,7 @@ from drake_clutter.grammar.graph import (
 from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
 
 MAX_BALANCED_STACK_FRACTION = 0.6
@@ -96,7 +96,7 @@ class PartialScene:
         grammar: SceneGrammar,
         task: GenerationTaskConfig,
         config: ClutterConfig,
-        judge: FastJudge,
+        judge: StaticStabilityJudge,
     ) -> None:
         """Starts from the tray; `judge` is asked about every stack."""
         vocabulary = GraphVocabulary.from_grammar(grammar)
@@ -162,14 +162,14 @@ class PartialScene:
         scene = Scene(tuple(stack.objects()), self._config.cell.support)
         if stack.upper[2] > self._config.layout.max_stack_height:
             self.failure = StackFailure.TOO_HIGH
-        elif isinstance(found := self._judge.stability(scene), InconclusiveVerdict):
+        elif isinstance(found := self._judge.find_instability(scene), InconclusiveVerdict):
             self.failure = StackFailure.INCONCLUSIVE
         elif found is not None:
             self.failure = StackFailure.UNSTABLE
-        elif self._task.require_disassembly and not self._judge.comes_apart(scene):
+        elif self._task.require_disassembly and not self._judge.is_disassemblable(scene):
             self.failure = StackFailure.NOT_DISASSEMBLABLE
         else:
-            shares = self._judge.rays.visible_shares(scene.objects).values()
+            shares = self._judge.ray_caster.visible_fractions(scene.objects).values()
             self.num_hidden += sum(
                 share < self._config.cell.camera.visibility_threshold for share in shares
             )
@@ -267,7 +267,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         self.task, self._config = task or GenerationTaskConfig(), config or ClutterConfig()
         self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
         self.vocabulary = GraphVocabulary.from_grammar(self.grammar)
-        self._judge = FastJudge(self._config, margin=self.task.contact_margin)
+        self._judge = StaticStabilityJudge(self._config, margin=self.task.contact_margin)
         n, e = self.task.nodes, max_edges(self.task.nodes)
         far = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
         box = gymnasium.spaces.Box

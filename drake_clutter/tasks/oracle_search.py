@@ -18,8 +18,8 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict, Move, MoveResul
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.stability.executor import FastExecutor
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.stability.static_executor import StaticExecutor
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 MAX_OBJECTS = 64
 """Objects in a scene, see `RayCaster.cover`."""
@@ -99,11 +99,11 @@ class OracleSearch:
     object needs as many moves as free enough of its rays. Objects that need no move in common add up.
     """
 
-    def __init__(self, config: ClutterConfig, judge: FastJudge | None = None) -> None:
+    def __init__(self, config: ClutterConfig, judge: StaticStabilityJudge | None = None) -> None:
         """Makes a search; a judge that is shared remembers more stacks."""
-        self._judge = judge or FastJudge(config)
-        self._rays = self._judge.rays
-        self._executor = FastExecutor(config, self._judge)
+        self._judge = judge or StaticStabilityJudge(config)
+        self._rays = self._judge.ray_caster
+        self._executor = StaticExecutor(config, self._judge)
         self._config = config.exploration
         self._hidden_below = config.cell.camera.visibility_threshold
 
@@ -139,7 +139,7 @@ class OracleSearch:
         self._failed = invalid_moves
         self._left, self._doubts = budget, 0
         start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
-        fixed = self._judge.never_movable(scene)
+        fixed = self._judge.immovable_objects(scene)
         never = self.find_unrevealable(
             scene, start.known, fixed if isinstance(fixed, frozenset) else ()
         )
@@ -210,7 +210,7 @@ class OracleSearch:
 
     def _carried(self, scene: Scene) -> dict[str, frozenset[str]]:
         """What must be moved before each object can be, itself included: everything that stands on nothing else, by name."""
-        supports = self._judge.supports(scene)
+        supports = self._judge.find_supports(scene)
         if isinstance(supports, InconclusiveVerdict):
             return {name: frozenset({name}) for name in scene.names}
         found = {}
@@ -229,7 +229,7 @@ class OracleSearch:
         """Moves without which a hidden object stays hidden, and what may have to be moved for it."""
         rays: Counter[int] = Counter()
         involved: frozenset[str] = frozenset()
-        for before, count in self._rays.cover(scene, name).items():
+        for before, count in self._rays.occluder_sets(scene, name).items():
             moved = frozenset[str]().union(*(carried[other] for other in before))
             rays[len(moved)] += count
             involved |= moved
@@ -255,8 +255,8 @@ class OracleSearch:
             if name in known:
                 continue
             left = [o for o in scene.objects if o.name == name or o.name in fixed]
-            out_of_frame = not self._rays.cover(scene, name)
-            if out_of_frame or self._rays.visible_shares(left)[name] < self._hidden_below:
+            out_of_frame = not self._rays.occluder_sets(scene, name)
+            if out_of_frame or self._rays.visible_fractions(left)[name] < self._hidden_below:
                 found.append(name)
         return tuple(found)
 
@@ -295,7 +295,7 @@ class OracleSearch:
     def _moves(self, state: _State, only_blockers: bool) -> Iterator[list[Move]]:
         """Legal moves that lose no support, in batches, the most promising first."""
         in_view = [detection.name for detection in state.observation.detections]
-        losing = {name: self._judge.losing_support(state.scene, name) for name in in_view}
+        losing = {name: self._judge.objects_losing_support(state.scene, name) for name in in_view}
         self._doubts += sum(isinstance(lost, InconclusiveVerdict) for lost in losing.values())
         free = [name for name, lost in losing.items() if lost == ()]
         for useful in (True, False):

@@ -9,10 +9,10 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.interfaces import MotionSample, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, perturb_poses
-from drake_clutter.simulation.judge import TOUCHING_MARGIN
-from drake_clutter.simulation.settle import Settled, settle
+from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle import SettleResult, settle
 
-_AFTERMATH_TIME_STEP = 0.005
+_COLLAPSE_TIME_STEP = 0.005
 """s; what a fall does to the rest of the scene decides nothing any more, it is only shown."""
 
 
@@ -25,15 +25,15 @@ class SettleExecutor:
     of them falls, the whole scene is settled again, so that neighbours are hit as they would be.
     """
 
-    def __init__(self, config: ClutterConfig, *, follow_falls: bool = True) -> None:
+    def __init__(self, config: ClutterConfig, *, simulate_collapse: bool = True) -> None:
         """Makes an executor.
 
         Args:
             config: the world.
-            follow_falls: whether to simulate what a collapse does to the whole scene, which decides nothing; if not, the scene
+            simulate_collapse: whether to simulate what a collapse does to the whole scene; if not, the scene
                 afterwards and the motion are those of the stack that fell, up to the moment when it is known to fall.
         """
-        self._config, self._follow_falls = config, follow_falls
+        self._config, self._simulate_collapse = config, simulate_collapse
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`. Random offsets are added to the pose of release."""
@@ -47,14 +47,14 @@ class SettleExecutor:
         groups = group_touching_objects(scene.objects, TOUCHING_MARGIN)
         touched = next(names for group in groups if pick in (names := {o.name for o in group}))
         settled = []
-        for group in _groups(moved, released):
+        for group in _groups_to_settle(moved, released):
             if touched.isdisjoint(o.name for o in group):
                 continue
             settled.append(settle(group, scene.support, settle_config, record=True))
             if settled[-1].instability is not None:
-                if not self._follow_falls:
+                if not self._simulate_collapse:
                     after = moved.with_poses(settled[-1].poses)
-                    motion = _together(moved.poses, settled)
+                    motion = _merge_motions(moved.poses, settled)
                     return Outcome(
                         MoveResult.COLLAPSED,
                         after,
@@ -62,8 +62,10 @@ class SettleExecutor:
                         motion,
                         X_TO_released=released.X_TO,
                     )
-                coarse = replace(settle_config, time_step=_AFTERMATH_TIME_STEP)
-                whole = settle(moved.objects, scene.support, coarse, record=True, follow_falls=True)
+                coarse = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
+                whole = settle(
+                    moved.objects, scene.support, coarse, record=True, simulate_collapse=True
+                )
                 fall = settled[-1].instability
                 return Outcome(
                     MoveResult.COLLAPSED,
@@ -72,17 +74,17 @@ class SettleExecutor:
                     whole.motion,
                     X_TO_released=released.X_TO,
                 )
-        motion = _together(moved.poses, settled)
+        motion = _merge_motions(moved.poses, settled)
         return Outcome(
             MoveResult.PLACED,
-            moved.with_poses(_poses(settled)),
+            moved.with_poses(_merge_poses(settled)),
             None,
             motion,
             X_TO_released=released.X_TO,
         )
 
 
-def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
+def _groups_to_settle(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
     """Objects that may touch each other; what is let go may fall onto all that is below it, however far."""
     lower, upper = (bound[:2] for bound in released.bounds_T)
     with_released, others = list[SceneObject](), []
@@ -96,11 +98,13 @@ def _groups(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
     return [with_released, *others]
 
 
-def _poses(settled: Sequence[Settled]) -> dict[str, Pose]:
+def _merge_poses(settled: Sequence[SettleResult]) -> dict[str, Pose]:
     return {name: pose for result in settled for name, pose in result.poses.items()}
 
 
-def _together(start: dict[str, Pose], settled: Sequence[Settled]) -> tuple[MotionSample, ...]:
+def _merge_motions(
+    start: dict[str, Pose], settled: Sequence[SettleResult]
+) -> tuple[MotionSample, ...]:
     """The motions of groups that settled apart, as one motion of the whole scene; a group that has ended stays."""
     longest = max((result.motion for result in settled), key=len)
     poses, frames = dict(start), []

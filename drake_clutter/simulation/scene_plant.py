@@ -17,7 +17,7 @@ from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Pose, SceneObject
 
-ROLLING_STOPS_WITHIN = 0.05
+ROLLING_DAMPING_TIME = 0.05
 """s, time constant with which a free cylinder that may lie stops rolling: a real marker has a clip and a soft barrel, while
 an ideal cylinder rocks on the facets of its contact mesh for seconds. The damping is far too weak to hold up a fall."""
 
@@ -27,7 +27,7 @@ def rigid_transform(pose: Pose) -> RigidTransform:
     return RigidTransform(RotationMatrix(pose.rotation), pose.p)
 
 
-def pose_of(X_AB: RigidTransform) -> Pose:
+def pose_from_transform(X_AB: RigidTransform) -> Pose:
     """Drake's type as a pose."""
     return Pose.from_rotation(X_AB.rotation().matrix(), X_AB.translation())
 
@@ -56,7 +56,7 @@ class ScenePlant:
     def poses(self, context: Context, names: Iterable[str] | None = None) -> dict[str, Pose]:
         """X_TO of all objects, or of those that are named, by name; from the plant's context."""
         return {
-            n: pose_of(self.bodies[n].EvalPoseInWorld(context))
+            n: pose_from_transform(self.bodies[n].EvalPoseInWorld(context))
             for n in (self.bodies if names is None else names)
         }
 
@@ -70,7 +70,7 @@ class ScenePlant:
         }
 
 
-def support_body(plant: MultibodyPlant) -> RigidBody:
+def get_support_body(plant: MultibodyPlant) -> RigidBody:
     """The support's body; others may have its name in models of their own."""
     return plant.GetBodyByName("tray", plant.GetModelInstanceByName("tray"))
 
@@ -100,10 +100,10 @@ def add_scene_plant(
         discrete_contact_approximation="lagged",
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    return populated(plant, scene_graph, objects, support, visuals=visuals, jointed=jointed)
+    return add_objects(plant, scene_graph, objects, support, visuals=visuals, jointed=jointed)
 
 
-def populated(
+def add_objects(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     objects: Sequence[tuple[str, ObjectClass]],
@@ -134,7 +134,7 @@ def populated(
                     f"{name}_floating",
                     plant.world_frame(),
                     bodies[name].body_frame(),
-                    rolling_inertia / ROLLING_STOPS_WITHIN,
+                    rolling_inertia / ROLLING_DAMPING_TIME,
                 )
             )
     return ScenePlant(plant, scene_graph, bodies)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
-from test_fast_judge import FAST, MARGIN, STEP, UPRIGHT, reason_of, stands
 from test_settle import BELOW
+from test_static_judge import FAST, MARGIN, STEP, UPRIGHT, reason_of, stands
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -24,8 +24,8 @@ from drake_clutter.scenes.interfaces import (
     Verdict,
 )
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 # --- Columns, for which there is a formula ---
 
@@ -89,14 +89,14 @@ def test_a_column_stands_while_every_centre_of_mass_is_inside(layers: Layers) ->
     """And the margins are how far inside it is, in steps of 0.1 mm; where another contact fails, nothing helps."""
     objects = column(layers)
     scene = scene_of(*objects)
-    margins = FAST.margins(scene)
+    margins = FAST.stability_margins(scene)
     assume(
         not isinstance(margins, InconclusiveVerdict)
     )  # out of the tray, or beside what should carry it
     assert not isinstance(margins, InconclusiveVerdict)
     expected = column_margins(objects)
     assume(all(abs(e) > STEP for e in expected) and abs(min(expected) - MARGIN) > 1e-5)
-    found = FAST.stability(scene)
+    found = FAST.find_instability(scene)
     assert reason_of(found) is (None if min(expected) > MARGIN else InstabilityReason.UNBALANCED)
     for k, o in enumerate(objects):
         hopeless = any(other < 0 for other in expected[:k] + expected[k + 1 :])
@@ -110,10 +110,10 @@ def test_losing_support_is_what_the_rest_cannot_do_without(layers: Layers, which
     """Of a column that stands, what is left without an object stands exactly if nothing loses its support."""
     objects = column(layers)
     scene = scene_of(*objects)
-    assume(FAST.stability(scene) is None)
+    assume(FAST.find_instability(scene) is None)
     taken = objects[which % len(objects)].name
     rest = [o for o in objects if o.name != taken]
-    losing = FAST.losing_support(scene, taken)
+    losing = FAST.objects_losing_support(scene, taken)
     above = tuple(o.name for o in objects[objects.index(scene[taken]) + 1 :])
     assert not isinstance(losing, InconclusiveVerdict)
     assert set(above) <= set(losing)
@@ -164,7 +164,7 @@ def test_a_box_on_feet_stands_while_its_middle_is_between_them(
     top = resting("cereal_box_large", orientation, xy, 0.175, "top")
     expected = on_feet(feet, top, MARGIN)
     assume(on_feet(feet, top, MARGIN - 1e-5) == expected == on_feet(feet, top, MARGIN + 1e-5))
-    found = FAST.stability(
+    found = FAST.find_instability(
         scene_of(*(resting("sugar_box", UPRIGHT, foot, name=f"{foot}") for foot in feet), top)
     )
     assume(reason_of(found) is not InconclusiveReason.FLOATING)
@@ -201,16 +201,18 @@ def turned(scene: Scene, quarters: int) -> Scene:
 @settings(max_examples=60)
 def test_the_place_on_the_tray_is_no_matter(layers: Layers, x: int, y: int) -> None:
     scene = scene_of(*column(layers), side=2.0)
-    assert reason_of(FAST.stability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))) is reason_of(
-        FAST.stability(scene)
-    )
+    assert reason_of(
+        FAST.find_instability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))
+    ) is reason_of(FAST.find_instability(scene))
 
 
 @given(ANYTHING, st.integers(1, 3))
 @settings(max_examples=60)
 def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
     scene = scene_of(*column(layers), side=2.0)
-    assert reason_of(FAST.stability(turned(scene, quarters))) is reason_of(FAST.stability(scene))
+    assert reason_of(FAST.find_instability(turned(scene, quarters))) is reason_of(
+        FAST.find_instability(scene)
+    )
 
 
 @given(ANYTHING, st.randoms(use_true_random=False))
@@ -218,16 +220,21 @@ def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
 def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) -> None:
     """Unless two objects cannot be judged, of which the first is named."""
     scene = scene_of(*column(layers), side=2.0)
-    supports = FAST.supports(scene)
+    supports = FAST.find_supports(scene)
     assume(not isinstance(supports, InconclusiveVerdict))
     objects = list(scene.objects)
     shuffle.shuffle(objects)
     other = replace(scene, objects=tuple(objects))
-    assert reason_of(FAST.stability(other)) is reason_of(FAST.stability(scene))
-    assert FAST.supports(other) == supports
-    assert FAST.margins(other) == pytest.approx(FAST.margins(scene), abs=1.01 * STEP)
+    assert reason_of(FAST.find_instability(other)) is reason_of(FAST.find_instability(scene))
+    assert FAST.find_supports(other) == supports
+    assert FAST.stability_margins(other) == pytest.approx(
+        FAST.stability_margins(scene), abs=1.01 * STEP
+    )
     for name in scene.names:
-        one, same = FAST.losing_support(scene, name), FAST.losing_support(other, name)
+        one, same = (
+            FAST.objects_losing_support(scene, name),
+            FAST.objects_losing_support(other, name),
+        )
         assert not isinstance(one, InconclusiveVerdict)
         assert not isinstance(same, InconclusiveVerdict)
         assert set(one) == set(same)
@@ -242,12 +249,14 @@ def test_a_stack_far_away_is_no_matter(layers: Layers) -> None:
         resting("sugar_box", xy=(0.8, 0.8), floor=0.060, name="far"),
     ]
     for objects in ((*scene.objects, *far), (*far, *scene.objects)):
-        assert FAST.stability(replace(scene, objects=objects)) == FAST.stability(scene)
+        assert FAST.find_instability(replace(scene, objects=objects)) == FAST.find_instability(
+            scene
+        )
 
 
 def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
     """The same verdicts, bit for bit, as those of a judge that has seen nothing, over scenes that come back, changed a little."""
-    used = FastJudge(config)
+    used = StaticStabilityJudge(config)
     scenes = [random_scene(seed, 4, 17) for seed in range(12)]
     generator = rng(7)
     kinds = set()
@@ -264,7 +273,7 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
                 {o.name: o.X_TO.translated((*generator.uniform(-0.02, 0.02, 2), 0.0))}
             )
         verdict = used.judge(scene, rng(step))
-        assert FastJudge(config).judge(scene, rng(step)) == verdict
+        assert StaticStabilityJudge(config).judge(scene, rng(step)) == verdict
         kinds.add(type(verdict) if isinstance(verdict, InconclusiveVerdict) else verdict.stable)
     assert kinds >= {True, False}
 
@@ -272,14 +281,14 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
 def test_which_of_two_twins_falls_does_not_depend_on_what_was_judged_before(
     config: ClutterConfig,
 ) -> None:
-    used = FastJudge(config)
+    used = StaticStabilityJudge(config)
     scene = scene_of(
         BELOW, *(resting("sugar_box", xy=(0.0, s * 0.1), floor=0.060, name=f"{s}") for s in (-1, 1))
     )
     for x, y in ((0.0, 0.0), (0.1, 0.05), (-0.1, -0.1)):
-        assert FastJudge(config).stability(shifted(scene, x, y)) == used.stability(
+        assert StaticStabilityJudge(config).find_instability(
             shifted(scene, x, y)
-        )
+        ) == used.find_instability(shifted(scene, x, y))
 
 
 def test_a_force_that_ends_at_zero_ends_no_search() -> None:
@@ -290,17 +299,17 @@ def test_a_force_that_ends_at_zero_ends_no_search() -> None:
     ]
     layers.append(("sugar_box", 0.001013, 0.001013))
     scene = scene_of(*column([(name, Orientation.FLAT_0, x, y) for name, x, y in layers]))
-    assert reason_of(FAST.stability(scene)) is InstabilityReason.UNBALANCED
+    assert reason_of(FAST.find_instability(scene)) is InstabilityReason.UNBALANCED
 
 
 def test_any_number_of_orientations(config: ClutterConfig) -> None:
     """A box has 6 faces of 4 corners, fewer than the table expects: its rows run out first."""
-    used = FastJudge(config)
+    used = StaticStabilityJudge(config)
     for degrees in range(150):
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         o = resting("sugar_box", name="box")
         assert (
-            used.stability(
+            used.find_instability(
                 scene_of(replace(o, X_TO=Pose.from_rotation(turn @ o.X_TO.rotation, o.X_TO.p)))
             )
             is None
@@ -309,4 +318,4 @@ def test_any_number_of_orientations(config: ClutterConfig) -> None:
 
 def test_an_empty_tray_is_stable(config: ClutterConfig, judge: DrakeJudge) -> None:
     assert judge.judge(scene_of(), rng()) == Verdict(None, {}, {}, ())
-    assert FastJudge(config).judge(scene_of(), rng()) == Verdict(None, {}, {}, ())
+    assert StaticStabilityJudge(config).judge(scene_of(), rng()) == Verdict(None, {}, {}, ())

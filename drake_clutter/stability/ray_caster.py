@@ -17,9 +17,9 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project, vector_to_camera
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.stability.shapes import Floats, Ints, Shapes
+from drake_clutter.stability.shape_table import Floats, Ints, ShapeTable
 
-_MOST_COVERED = 64
+_MAX_OCCLUDERS = 64
 
 
 @njit(cache=True, inline="always")
@@ -34,14 +34,14 @@ def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
+def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
     """Casts all rays that may meet one object; where it is nearer than what is known, it is written down.
 
     Returns:
         The number of rays that meet it, whatever is before it.
     """
     height, width = hit.shape
-    eye = camera.p_TC
+    p_TC = camera.p_TC
     p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
     begin, end = (
@@ -49,14 +49,14 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
         np.zeros(height, np.int64),
     )  # columns of a face, row by row
     rays = 0
-    for face in range(table.posed[shape].first_face, table.posed[shape].last_face):
+    for face in range(table.records[shape].first_face, table.records[shape].last_face):
         first, last = table.first_corner[face], table.first_corner[face + 1]
         nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
         corner = table.corner[first]
         k = (
-            nx * (corner[0] + p_TO[0] - eye[0])
-            + ny * (corner[1] + p_TO[1] - eye[1])
-            + nz * (corner[2] + p_TO[2] - eye[2])
+            nx * (corner[0] + p_TO[0] - p_TC[0])
+            + ny * (corner[1] + p_TO[1] - p_TC[1])
+            + nz * (corner[2] + p_TO[2] - p_TC[2])
         )
         if k > -1e-9:
             continue  # turned away from the camera
@@ -111,7 +111,7 @@ def _cast_at(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[n
 
 
 @njit(cache=True)
-def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
+def _window(records, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
     """First and last row, first and last column (ends excluded) of what holds an object's box.
 
     All are 0 if nothing of it is in the image.
@@ -122,9 +122,9 @@ def _window(posed, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
     for corner in range(8):
         x, y, z = point_to_camera(
             camera,
-            posed.upper[0] if corner & 1 else posed.lower[0],
-            posed.upper[1] if corner & 2 else posed.lower[1],
-            posed.upper[2] if corner & 4 else posed.lower[2],
+            records.upper[0] if corner & 1 else records.lower[0],
+            records.upper[1] if corner & 2 else records.lower[1],
+            records.upper[2] if corner & 4 else records.lower[2],
         )
         if z + p_z < MIN_DEPTH:
             return 0, 0, 0, 0
@@ -148,7 +148,7 @@ def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignore[no-untyped-def]
+def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible):  # type: ignore[no-untyped-def]
     """Finds what every ray that may meet an object meets first, and counts.
 
     Args:
@@ -158,8 +158,8 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
         camera: a `Pinhole`.
         nearest: (height, width) float32, becomes the inverse depth of what is seen, 1/m, or 0.
         hit: (height, width) int16, becomes the index of the object, -1 where no object is.
-        alone: (n,) zeros; becomes the number of rays that meet the object if nothing is before it.
-        seen: (n,) zeros; becomes the number of rays that meet the object first.
+        unoccluded: (n,) zeros; becomes the number of rays that meet the object if nothing is before it.
+        visible: (n,) zeros; becomes the number of rays that meet the object first.
 
     Returns:
         The rectangle that was written to, see `_window`.
@@ -167,7 +167,7 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
     windows = np.zeros((len(shapes), 4), np.int64)
     row_begin, row_end, column_begin, column_end = hit.shape[0], 0, hit.shape[1], 0
     for i in range(len(shapes)):
-        window = _window(table.posed[shapes[i]], p_T[i], camera, hit.shape)
+        window = _window(table.records[shapes[i]], p_T[i], camera, hit.shape)
         windows[i, 0], windows[i, 1], windows[i, 2], windows[i, 3] = window
         if window[1] > 0:
             row_begin, row_end = min(row_begin, window[0]), max(row_end, window[1])
@@ -181,7 +181,9 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
         _cast_floor(nearest[row_begin:row_end, column_begin:column_end], along, down, first)
     for i in range(len(shapes)):
         if windows[i, 1] > 0:
-            alone[i] = _cast_at(table, shapes[i], p_T[i], camera, np.int16(i), nearest, hit)
+            unoccluded[i] = _cast_object(
+                table, shapes[i], p_T[i], camera, np.int16(i), nearest, hit
+            )
     for i in range(len(shapes)):
         label, total = np.int16(i), 0
         for row in range(windows[i, 0], windows[i, 1]):
@@ -191,61 +193,65 @@ def _cast(table, shapes, p_T, camera, nearest, hit, alone, seen):  # type: ignor
                     in_row + (here[k] == label)
                 )  # 16 bits wide: more pixels at a time
             total += int(in_row)
-        seen[i] = total
+        visible[i] = total
     return min(row_begin, row_end), row_end, min(column_begin, column_end), column_end
 
 
 @njit(cache=True)
-def _cover(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
+def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
     """(rays,) for every ray that would meet the target, the objects before it, as bits."""
-    window = _window(table.posed[shapes[target]], p_T[target], camera, hit.shape)
+    window = _window(table.records[shapes[target]], p_T[target], camera, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
     if window[1] > 0:
-        _cast_at(table, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
+        _cast_object(table, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
     rows, columns = np.nonzero(hit[window[0] : window[1], window[2] : window[3]] == 0)
     rows, columns = rows + window[0], columns + window[2]
-    own, before = np.empty(len(rows), np.float32), np.zeros(len(rows), np.uint64)
+    own, occluders = np.empty(len(rows), np.float32), np.zeros(len(rows), np.uint64)
     for k in range(len(rows)):
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
-        other = _window(table.posed[shapes[i]], p_T[i], camera, hit.shape)
-        apart = (
+        other = _window(table.records[shapes[i]], p_T[i], camera, hit.shape)
+        is_apart = (
             other[0] >= window[1]
             or window[0] >= other[1]
             or other[2] >= window[3]
             or window[2] >= other[3]
         )
-        if i == target or apart:
+        if i == target or is_apart:
             continue
-        _cast_at(table, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
+        _cast_object(table, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
         for k in range(len(rows)):
             if hit[rows[k], columns[k]] == 1:
-                before[k] |= np.uint64(1) << np.uint64(i)
+                occluders[k] |= np.uint64(1) << np.uint64(i)
                 hit[rows[k], columns[k]], nearest[rows[k], columns[k]] = 0, own[k]
-    return before
+    return occluders
 
 
 class RayCaster:
     """Casts a camera's rays at scenes of convex objects."""
 
-    def __init__(self, config: Camera, shapes: Shapes | None = None) -> None:
+    def __init__(self, camera: Camera, shapes: ShapeTable | None = None) -> None:
         """Makes a caster; `shapes` may be shared with a judge."""
-        self.config = config
-        self._pinhole = config.pinhole
-        self._shapes = shapes or Shapes()
-        self._nearest = np.empty((config.height, config.width), np.float32)
-        self._hit = np.empty((config.height, config.width), np.int16)
+        self.camera = camera
+        self._pinhole = camera.pinhole
+        self._shapes = shapes or ShapeTable()
+        self._nearest = np.empty((camera.height, camera.width), np.float32)
+        self._hit = np.empty((camera.height, camera.width), np.int16)
 
     def _cast(self, shapes: Ints, p_T: Floats) -> tuple[list[float], tuple[slice, slice]]:
         """Fills the buffers in a rectangle, which it returns after the visible share of each object."""
         if not len(shapes):
             return [], (slice(0, 0), slice(0, 0))
-        alone, seen = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
-        arguments = (self._shapes.table, shapes, p_T, self._pinhole)
-        row, row_end, column, column_end = _cast(*arguments, self._nearest, self._hit, alone, seen)
-        shares = [s / a if a else 1.0 for s, a in zip(seen.tolist(), alone.tolist(), strict=True)]
-        return shares, (slice(row, row_end), slice(column, column_end))
+        unoccluded, visible = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
+        arguments = (self._shapes.arrays, shapes, p_T, self._pinhole)
+        row, row_end, column, column_end = _cast_scene(
+            *arguments, self._nearest, self._hit, unoccluded, visible
+        )
+        fractions = [
+            s / a if a else 1.0 for s, a in zip(visible.tolist(), unoccluded.tolist(), strict=True)
+        ]
+        return fractions, (slice(row, row_end), slice(column, column_end))
 
     def _mask(self, index: int, rectangle: tuple[slice, slice]) -> NDArray[np.bool_]:
         """The pixels of the last cast that show an object."""
@@ -253,20 +259,20 @@ class RayCaster:
         np.equal(self._hit[rectangle], index, out=mask[rectangle])
         return mask
 
-    def shares(self, shapes: Ints, p_T: Floats) -> list[float]:
+    def visible_fractions_of_rows(self, shapes: Ints, p_T: Floats) -> list[float]:
         """See `visible_shares`, of the table's shapes at p_T (n, 3) m, in their order."""
         return self._cast(shapes, p_T)[0]
 
-    def visible_shares(self, objects: Sequence[SceneObject]) -> dict[str, float]:
+    def visible_fractions(self, objects: Sequence[SceneObject]) -> dict[str, float]:
         """Of the rays that would meet each object alone on the tray, the share that does, by name; out of the frame, 1.
 
         Args:
             objects: convex ones.
         """
-        shares = self.shares(*self._shapes.arrays(objects))
-        return {o.name: share for o, share in zip(objects, shares, strict=True)}
+        fractions = self.visible_fractions_of_rows(*self._shapes.rows_and_positions(objects))
+        return {o.name: share for o, share in zip(objects, fractions, strict=True)}
 
-    def cover(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
+    def occluder_sets(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
         """Of the rays that would meet the named object alone: how many meet which other objects before it.
 
         Raises:
@@ -274,13 +280,15 @@ class RayCaster:
             ValueError: the scene has more than 64 objects.
         """
         scene[name]
-        if len(scene.objects) > _MOST_COVERED:
+        if len(scene.objects) > _MAX_OCCLUDERS:
             raise ValueError(
-                f"the scene has {len(scene.objects)} objects; allowed are {_MOST_COVERED} at most"
+                f"the scene has {len(scene.objects)} objects; allowed are {_MAX_OCCLUDERS} at most"
             )
-        shapes, p_T = self._shapes.arrays(scene.objects)
-        arguments = (self._shapes.table, shapes, p_T, self._pinhole, scene.names.index(name))
-        sets, counts = np.unique(_cover(*arguments, self._nearest, self._hit), return_counts=True)
+        shapes, p_T = self._shapes.rows_and_positions(scene.objects)
+        arguments = (self._shapes.arrays, shapes, p_T, self._pinhole, scene.names.index(name))
+        sets, counts = np.unique(
+            _occluders_by_ray(*arguments, self._nearest, self._hit), return_counts=True
+        )
         names = scene.names
         members = [
             frozenset(names[i] for i in range(len(names)) if bits >> i & 1)
@@ -290,16 +298,16 @@ class RayCaster:
 
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
         """What the camera shows of a scene, and the visible shares; as `LabelDetector` has it, but with the floor all around."""
-        shares, rectangle = self._cast(*self._shapes.arrays(scene.objects))
-        depth = self.config.floor_depth.copy()
+        fractions, rectangle = self._cast(*self._shapes.rows_and_positions(scene.objects))
+        depth = self.camera.floor_depth.copy()
         with np.errstate(divide="ignore"):
             depth[rectangle] = 1 / self._nearest[rectangle]
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
-            for index, (o, share) in enumerate(zip(scene.objects, shares, strict=True))
-            if share >= self.config.visibility_threshold
+            for index, (o, share) in enumerate(zip(scene.objects, fractions, strict=True))
+            if share >= self.camera.visibility_threshold
             and (mask := self._mask(index, rectangle)).any()
         )
-        return Observation(depth, detections, self.config, scene.support), dict(
-            zip(scene.names, shares, strict=True)
+        return Observation(depth, detections, self.camera, scene.support), dict(
+            zip(scene.names, fractions, strict=True)
         )

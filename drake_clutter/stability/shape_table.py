@@ -19,19 +19,19 @@ from drake_clutter.scenes.scene import SceneObject
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LEVEL_WITHIN = np.radians(1.5)
+MAX_LEVEL_ANGLE = np.radians(1.5)
 """rad; a face or an axis that is further from level is taken to lean."""
 RIM_CORNERS = 16
 """Corners of a can's rim, as in Drake's contact mesh of it; and the most that any face that carries is given."""
-STRIP = 0.006
+STRIP_HALF_WIDTH = 0.006
 """m, half the width of the strip on which a cylinder lies. Its centre of mass and its load are above the strip's middle, so the
 width holds no moment; but a cylinder that lies over the gap of a pair touches both its edges."""
 _FOOTPRINT_CORNERS = 32
 _SURFACE_SIDES = 48
 """Sides of a cylinder's surface, as in the mesh that Drake's camera sees."""
-_SAME_PLANE = 1e-4
+_COPLANARITY_TOLERANCE = 1e-4
 """By which normals (and offsets, in sizes of the object) of one face's triangles may differ: files round corners to 0.1 um."""
-_MOST_ROWS = 8192
+_MAX_ROWS = 8192
 
 
 class Fault(IntEnum):
@@ -65,9 +65,10 @@ def _hull_surface(corners: Floats) -> _Surface:
     member = np.full(len(planes), -1)
     for triangle in range(len(planes)):
         if member[triangle] < 0:
-            member[(np.abs(planes - planes[triangle]).max(axis=1) < _SAME_PLANE) & (member < 0)] = (
-                triangle
-            )
+            member[
+                (np.abs(planes - planes[triangle]).max(axis=1) < _COPLANARITY_TOLERANCE)
+                & (member < 0)
+            ] = triangle
     faces, normals = [], []
     for index in np.unique(member):
         triangles = np.flatnonzero(member == index)
@@ -101,13 +102,17 @@ def _surface(object_class: ObjectClass) -> _Surface:
     return surface._replace(p_Ocm=np.zeros(3))
 
 
-def _outline(points: Floats, most: int) -> Floats:
+def _convex_outline(points: Floats, max_corners: int) -> Floats:
     """(C, 2) corners of the points' hull seen from above, counter-clockwise; of too many, evenly chosen ones."""
     corners = points[ConvexHull(points[:, :2]).vertices, :2]
-    return corners[np.arange(most) * len(corners) // most] if len(corners) > most else corners
+    return (
+        corners[np.arange(max_corners) * len(corners) // max_corners]
+        if len(corners) > max_corners
+        else corners
+    )
 
 
-class Posed(NamedTuple):
+class OrientedShape(NamedTuple):
     """One object class in one orientation; lengths in m, axes those of T, origin the object's.
 
     Attributes:
@@ -116,7 +121,7 @@ class Posed(NamedTuple):
         com: (3,) its centre of mass.
         bottom, top: (C, 2) corners of the face that it stands on, and of the one that carries; none if there is no such face. A
             cylinder that lies has a strip, see `STRIP`, and a line of two points.
-        low, high: heights of these faces' middles; where there is none, of the lowest and the highest point.
+        bottom_z, top_z: heights of these faces' middles; where there is none, of the lowest and the highest point.
         footprint: (C, 2) corners of its outline seen from above, counter-clockwise.
         surface: its surface, with axes turned to those of T.
     """
@@ -126,49 +131,52 @@ class Posed(NamedTuple):
     com: Floats
     bottom: Floats
     top: Floats
-    low: float
-    high: float
+    bottom_z: float
+    top_z: float
     footprint: Floats
     surface: _Surface
 
 
-def pose(object_class: ObjectClass, quaternion: Sequence[float]) -> Posed:
+def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> OrientedShape:
     """The class in an orientation, (4,) w, x, y, z."""
     R_TO = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     surface = _surface(object_class)
     corner, normal = surface.corner @ R_TO.T, surface.normal @ R_TO.T
-    none = np.empty((0, 3))
-    bottom, top, rolls = none, none, False
-    if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(LEVEL_WITHIN):
+    empty = np.empty((0, 3))
+    bottom, top, rolls = empty, empty, False
+    if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(MAX_LEVEL_ANGLE):
         rolls = True
         up = np.array([0.0, 0.0, object_class.size[0] / 2])
-        axis, aside = (
+        axis, half_width = (
             object_class.size[2] / 2 * R_TO[:, 2],
-            STRIP * np.cross([0.0, 0.0, 1.0], R_TO[:, 2]),
+            STRIP_HALF_WIDTH * np.cross([0.0, 0.0, 1.0], R_TO[:, 2]),
         )
         top = np.array([axis, -axis]) + up
-        bottom = np.array([axis + aside, aside - axis, -axis - aside, axis - aside]) - up
+        bottom = (
+            np.array([axis + half_width, half_width - axis, -axis - half_width, axis - half_width])
+            - up
+        )
     else:
-        level = np.flatnonzero(np.abs(normal[:, 2]) > np.cos(LEVEL_WITHIN))
+        level = np.flatnonzero(np.abs(normal[:, 2]) > np.cos(MAX_LEVEL_ANGLE))
         faces = {
             face: corner[surface.counts[:face].sum() :][: surface.counts[face]] for face in level
         }
         below = [face for face in faces if normal[face, 2] < 0]
         above = [face for face in faces if normal[face, 2] > 0]
-        bottom = faces[max(below, key=lambda face: _area(faces[face]))] if below else none
-        top = faces[max(above, key=lambda face: _area(faces[face]))] if above else none
+        bottom = faces[max(below, key=lambda face: _area(faces[face]))] if below else empty
+        top = faces[max(above, key=lambda face: _area(faces[face]))] if above else empty
     fault = Fault.NONE if len(bottom) else Fault.LEANING
     if len(object_class.convex_pieces) > 1:
         fault = Fault.NOT_CONVEX
-    return Posed(
+    return OrientedShape(
         fault,
         rolls,
         com=R_TO @ surface.p_Ocm,
-        bottom=_outline(bottom, RIM_CORNERS) if len(bottom) else none[:, :2],
-        top=top[:, :2] if len(top) < 3 else _outline(top, RIM_CORNERS),
-        low=float(bottom[:, 2].mean() if len(bottom) else corner[:, 2].min()),
-        high=float(top[:, 2].mean() if len(top) else corner[:, 2].max()),
-        footprint=_outline(corner, _FOOTPRINT_CORNERS),
+        bottom=_convex_outline(bottom, RIM_CORNERS) if len(bottom) else empty[:, :2],
+        top=top[:, :2] if len(top) < 3 else _convex_outline(top, RIM_CORNERS),
+        bottom_z=float(bottom[:, 2].mean() if len(bottom) else corner[:, 2].min()),
+        top_z=float(top[:, 2].mean() if len(top) else corner[:, 2].max()),
+        footprint=_convex_outline(corner, _FOOTPRINT_CORNERS),
         surface=surface._replace(corner=corner, normal=normal),
     )
 
@@ -177,7 +185,7 @@ def _area(face: Floats) -> float:
     return float(np.linalg.norm(np.cross(face[1:-1] - face[0], face[2:] - face[0]).sum(axis=0)) / 2)
 
 
-POSED = np.dtype(
+SHAPE_DTYPE = np.dtype(
     [
         ("fault", np.int64),
         ("rolls", np.bool_),
@@ -185,10 +193,10 @@ POSED = np.dtype(
         ("com", np.float64, 3),
         ("lower", np.float64, 3),
         ("upper", np.float64, 3),
-        ("low", np.float64),
-        ("high", np.float64),
+        ("bottom_z", np.float64),
+        ("top_z", np.float64),
         ("mass", np.float64),
-        ("reach", np.float64),
+        ("footprint_radius", np.float64),
         ("bottom", np.float64, (RIM_CORNERS, 2)),
         ("top", np.float64, (RIM_CORNERS, 2)),
         ("footprint", np.float64, (_FOOTPRINT_CORNERS, 2)),
@@ -200,7 +208,7 @@ POSED = np.dtype(
         ("last_face", np.int64),
     ]
 )
-"""A posed shape in a record: see `Posed`, and
+"""A records shape in a record: see `Posed`, and
 
     flat: whether bottom and top are as large as the footprint.
     lower, upper: (3,) m, of the box along the axes that holds it.
@@ -212,36 +220,36 @@ POSED = np.dtype(
 """
 
 
-class Table(NamedTuple):
+class ShapeArrays(NamedTuple):
     """Posed shapes in few arrays (each costs a compiled function a moment), with room for more.
 
     Attributes:
-        posed: (N,) of `POSED`.
+        records: (N,) of `POSED`.
         first_corner: (F + 1,) a face's corners are first_corner[f] up to first_corner[f + 1].
         normal: (F, 3).
         corner: (V, 3) m.
     """
 
-    posed: NDArray[np.void]
+    records: NDArray[np.void]
     first_corner: Ints
     normal: Floats
     corner: Floats
 
 
-def _room(rows: int, faces: int, corners: int) -> Table:
-    return Table(
-        np.zeros(rows, POSED),
+def _allocate(rows: int, faces: int, corners: int) -> ShapeArrays:
+    return ShapeArrays(
+        np.zeros(rows, SHAPE_DTYPE),
         np.zeros(faces + 1, np.int64),
         np.zeros((faces, 3)),
         np.zeros((corners, 3)),
     )
 
 
-class Shapes:
-    """A table of the posed shapes that were asked for, each made once.
+class ShapeTable:
+    """A table of the records shapes that were asked for, each made once.
 
     Attributes:
-        table: of all rows given out so far.
+        arrays: of all rows given out so far.
         generation: grows whenever the table starts anew, after which earlier rows mean nothing.
     """
 
@@ -251,11 +259,11 @@ class Shapes:
 
     def _start(self) -> None:
         self._row: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
-        self.table = _room(64, 512, 4096)
+        self.arrays = _allocate(64, 512, 4096)
 
-    def rows(self, objects: Sequence[SceneObject]) -> Ints:
+    def find_rows(self, objects: Sequence[SceneObject]) -> Ints:
         """(n,) the table's row of each object."""
-        if len(self._row) > _MOST_ROWS:
+        if len(self._row) > _MAX_ROWS:
             self._start()
             self.generation += 1
         known = self._row
@@ -271,59 +279,61 @@ class Shapes:
                 [known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
             )
 
-    def arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
+    def rows_and_positions(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
         """The table's row of each object (n,), and p_TO (n, 3) m."""
-        return self.rows(objects), np.array([o.X_TO.translation for o in objects]).reshape(-1, 3)
+        return self.find_rows(objects), np.array([o.X_TO.translation for o in objects]).reshape(
+            -1, 3
+        )
 
     def _add(self, scene_object: SceneObject) -> None:
-        shape = pose(scene_object.object_class, scene_object.X_TO.quaternion)
+        shape = orient_shape(scene_object.object_class, scene_object.X_TO.quaternion)
         row = len(self._row)
-        face = int(self.table.posed["last_face"].max())
-        corner = self.table.first_corner[face]
+        face = int(self.arrays.records["last_face"].max())
+        corner = self.arrays.first_corner[face]
         last_face, last_corner = (
             face + len(shape.surface.counts),
             corner + len(shape.surface.corner),
         )
         if (
-            row >= len(self.table.posed)
-            or last_face >= len(self.table.normal)
-            or last_corner > len(self.table.corner)
+            row >= len(self.arrays.records)
+            or last_face >= len(self.arrays.normal)
+            or last_corner > len(self.arrays.corner)
         ):
-            old = self.table
-            self.table = _room(
-                2 * len(old.posed),
+            old = self.arrays
+            self.arrays = _allocate(
+                2 * len(old.records),
                 2 * max(last_face + 1, len(old.normal)),
                 2 * max(last_corner, len(old.corner)),
             )
-            for array, earlier in zip(self.table, old, strict=True):
+            for array, earlier in zip(self.arrays, old, strict=True):
                 array[: len(earlier)] = earlier
-        table, posed = self.table, self.table.posed[row]
-        posed["fault"], posed["rolls"], posed["com"] = shape.fault, shape.rolls, shape.com
-        posed["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
-        posed["lower"], posed["upper"] = (
+        table, records = self.arrays, self.arrays.records[row]
+        records["fault"], records["rolls"], records["com"] = shape.fault, shape.rolls, shape.com
+        records["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
+        records["lower"], records["upper"] = (
             shape.surface.corner.min(axis=0),
             shape.surface.corner.max(axis=0),
         )
-        posed["low"], posed["high"], posed["mass"] = (
-            shape.low,
-            shape.high,
+        records["bottom_z"], records["top_z"], records["mass"] = (
+            shape.bottom_z,
+            shape.top_z,
             scene_object.object_class.mass,
         )
-        posed["reach"] = np.linalg.norm(shape.footprint, axis=1).max()
+        records["footprint_radius"] = np.linalg.norm(shape.footprint, axis=1).max()
         for name, corners in (
             ("bottom", shape.bottom),
             ("top", shape.top),
             ("footprint", shape.footprint),
         ):
-            posed[name][: len(corners)], posed[f"{name}_count"] = corners, len(corners)
+            records[name][: len(corners)], records[f"{name}_count"] = corners, len(corners)
         along = np.roll(shape.footprint, -1, axis=0) - shape.footprint
         normal = (
             np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
         )
-        posed["sides"][: len(normal)] = np.column_stack(
+        records["sides"][: len(normal)] = np.column_stack(
             [normal, (normal * shape.footprint).sum(axis=1)]
         )
-        posed["first_face"], posed["last_face"] = face, last_face
+        records["first_face"], records["last_face"] = face, last_face
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal
         table.corner[corner:last_corner] = shape.surface.corner

@@ -18,9 +18,9 @@ from drake_clutter.scenes.interfaces import (
     Verdict,
 )
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.fallback import FastOrDrakeJudge
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.simulation.hybrid import HybridJudge
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 UPRIGHT = Orientation.UPRIGHT_0
 MARGIN = 0.00205
@@ -29,12 +29,12 @@ STEP = 0.0001
 """m, to which `margins` knows them."""
 
 
-FAST = FastJudge(ClutterConfig())
+FAST = StaticStabilityJudge(ClutterConfig())
 """As the fixture `fast`, for hypothesis, which warns of fixtures that it does not make anew."""
 
 
 def stands(*objects: SceneObject) -> bool:
-    found = FAST.stability(scene_of(*objects))
+    found = FAST.find_instability(scene_of(*objects))
     assert not isinstance(found, InconclusiveVerdict), str(found)
     return found is None
 
@@ -69,14 +69,14 @@ def test_the_margin_grows_with_the_offsets() -> None:
     """3 mm instead of 1 mm: a box that is 4 mm inside the edge may be pushed over it."""
     scene = scene_of(BELOW, resting("sugar_box", xy=(0.111, 0.0), floor=0.060, name="above"))
     wide = world_with("settle.jitter=0.003")
-    assert FAST.stability(scene) is None
+    assert FAST.find_instability(scene) is None
     fallen = Instability(InstabilityReason.UNBALANCED, "above")
     assert (
-        FastJudge(wide).stability(scene)
-        == FastJudge(ClutterConfig(), margin=0.0041).stability(scene)
+        StaticStabilityJudge(wide).find_instability(scene)
+        == StaticStabilityJudge(ClutterConfig(), margin=0.0041).find_instability(scene)
         == fallen
     )
-    assert FastJudge(wide, margin=0.0039).stability(scene) is None
+    assert StaticStabilityJudge(wide, margin=0.0039).find_instability(scene) is None
 
 
 # A box of 514 g that reaches 17 mm too far out, and what may hold it.
@@ -187,7 +187,7 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
 
 @pytest.mark.parametrize(("objects", "reason"), TABLE.values(), ids=list(TABLE))
 def test_known_statics(objects: list[SceneObject], reason: InstabilityReason | None) -> None:
-    assert reason_of(FAST.stability(scene_of(*objects))) is reason
+    assert reason_of(FAST.find_instability(scene_of(*objects))) is reason
 
 
 @pytest.mark.parametrize(("objects", "reason"), TABLE.values(), ids=list(TABLE))
@@ -207,7 +207,7 @@ def test_numerical_noise_is_no_matter(
                 ),
             )
         )
-    assert reason_of(FAST.stability(scene_of(*noisy))) is reason
+    assert reason_of(FAST.find_instability(scene_of(*noisy))) is reason
 
 
 def test_the_verdict_names_what_falls_in_the_first_stack_that_does() -> None:
@@ -216,10 +216,10 @@ def test_the_verdict_names_what_falls_in_the_first_stack_that_does() -> None:
         resting("cracker_box", xy=(0.0, 0.2), name="foot"),
         resting("gelatin_box", xy=(0.0, 0.29), floor=0.060, name="b"),
     ]
-    assert FAST.stability(scene_of(*falling, *other)) == Instability(
+    assert FAST.find_instability(scene_of(*falling, *other)) == Instability(
         InstabilityReason.UNBALANCED, "first"
     )
-    assert FAST.stability(scene_of(*other, *falling)) == Instability(
+    assert FAST.find_instability(scene_of(*other, *falling)) == Instability(
         InstabilityReason.UNBALANCED, "b"
     )
 
@@ -241,14 +241,14 @@ ARCH = scene_of(
 def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -> None:
     """About the edge of its foot a leg is pulled inwards by its weight, 4 N at 3 mm + 2 mm, and by half the bridge, 2 N at up to
     20 mm: 0.06 Nm. The bridge pushes it out at 230 mm with up to 0.3 x 2 N: 0.14 Nm. Without friction nothing does."""
-    assert FastJudge(config).stability(ARCH) is None
+    assert StaticStabilityJudge(config).find_instability(ARCH) is None
     assert judge.judge(ARCH, rng()).stable
     for friction in (0.0, 0.1):  # 0.05 Nm do not suffice either
         assert (
-            reason_of(FastJudge(config, friction=friction).stability(ARCH))
+            reason_of(StaticStabilityJudge(config, friction=friction).find_instability(ARCH))
             is InstabilityReason.UNBALANCED
         )
-    margins = FAST.margins(ARCH)  # under vertical forces
+    margins = FAST.stability_margins(ARCH)  # under vertical forces
     assert not isinstance(margins, InconclusiveVerdict)
     assert max(margins.values()) < 0
 
@@ -327,18 +327,23 @@ def test_what_it_cannot_judge(
     """Whatever is asked. What misses what should carry it falls; the rest may fall or not."""
     scene = scene_of(*objects)
     answer = InconclusiveVerdict(reason, "it")
-    assert FAST.supports(scene) == FAST.margins(scene) == FAST.never_movable(scene) == answer
-    losing = FAST.losing_support(scene, "it")
+    assert (
+        FAST.find_supports(scene)
+        == FAST.stability_margins(scene)
+        == FAST.immovable_objects(scene)
+        == answer
+    )
+    losing = FAST.objects_losing_support(scene, "it")
     if reason is InconclusiveReason.UNSUPPORTED:
         assert losing in (
             answer,
             InconclusiveVerdict(InconclusiveReason.FLOATING, "it"),
         )  # of its group alone, to which the other is not
-        assert FAST.stability(scene) == Instability(InstabilityReason.UNSUPPORTED, "it")
+        assert FAST.find_instability(scene) == Instability(InstabilityReason.UNSUPPORTED, "it")
         return
     assert losing == answer
     generator, untouched = rng(), rng()
-    assert FAST.stability(scene) == FAST.judge(scene, generator) == answer
+    assert FAST.find_instability(scene) == FAST.judge(scene, generator) == answer
     assert (
         generator.random() == untouched.random()
     )  # so that Drake draws the same offsets when it is asked instead
@@ -348,7 +353,7 @@ def test_what_it_cannot_judge(
 @pytest.mark.parametrize("degrees", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("class_name", ["sugar_box", "tomato_soup_can", "large_marker"])
 def test_what_hardly_leans_is_judged(class_name: str, degrees: float) -> None:
-    assert FAST.stability(scene_of(leaning(resting(class_name, name="it"), degrees))) is None
+    assert FAST.find_instability(scene_of(leaning(resting(class_name, name="it"), degrees))) is None
 
 
 # --- The whole verdict, and Drake's ---
@@ -373,7 +378,7 @@ PARTLY = scene_of(
     ids=["hiding", "partly", *STABLE],
 )
 def test_stable_scenes_look_as_drake_says(
-    scene: Scene, config: ClutterConfig, fast: FastJudge, judge: DrakeJudge
+    scene: Scene, config: ClutterConfig, fast: StaticStabilityJudge, judge: DrakeJudge
 ) -> None:
     """The same offsets are drawn; then a marker, and what lies on markers, rolls by what still counts as rest. What Drake has
     settled, the fast judge takes for settled."""
@@ -389,12 +394,12 @@ def test_stable_scenes_look_as_drake_says(
             np.linalg.norm(mine.settled[name].p - drakes.settled[name].p) < config.settle.rest_drift
         )
         assert np.hypot(*(mine.settled[name].p - scene[name].X_TO.p)[:2]) <= 0.001
-    assert fast.stability(scene.with_poses(drakes.settled)) is None
+    assert fast.find_instability(scene.with_poses(drakes.settled)) is None
 
 
 @pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
 def test_what_falls_in_drake(
-    objects: list[SceneObject], reason: InstabilityReason, name: str, fast: FastJudge
+    objects: list[SceneObject], reason: InstabilityReason, name: str, fast: StaticStabilityJudge
 ) -> None:
     verdict = fast.judge(scene_of(*objects), rng())
     if isinstance(verdict, InconclusiveVerdict):
@@ -410,9 +415,11 @@ def test_what_falls_in_drake(
     assert reason is not InstabilityReason.LEFT_TRAY
 
 
-def test_the_same_rng_gives_the_same_verdict(config: ClutterConfig, fast: FastJudge) -> None:
+def test_the_same_rng_gives_the_same_verdict(
+    config: ClutterConfig, fast: StaticStabilityJudge
+) -> None:
     verdict = fast.judge(HIDING, rng(5))
-    assert FastJudge(config).judge(HIDING, rng(5)) == verdict
+    assert StaticStabilityJudge(config).judge(HIDING, rng(5)) == verdict
     other = fast.judge(HIDING, rng(6))
     assert isinstance(other, Verdict)
     assert isinstance(verdict, Verdict)
@@ -421,7 +428,7 @@ def test_the_same_rng_gives_the_same_verdict(config: ClutterConfig, fast: FastJu
 
 def test_the_threshold_of_hidden_is_the_configs(config: ClutterConfig) -> None:
     open_minded = world_with("camera.visibility_threshold=0")
-    verdict = FastJudge(open_minded).judge(HIDING, rng())
+    verdict = StaticStabilityJudge(open_minded).judge(HIDING, rng())
     assert isinstance(verdict, Verdict)
     assert verdict.hidden == ()
     assert verdict.visible_fractions["gelatin"] == 0.0
@@ -432,10 +439,10 @@ def test_what_the_fast_judge_cannot_judge_drake_does(
     name: str, config: ClutterConfig, judge: DrakeJudge
 ) -> None:
     scene = scene_of(*FALLING[name][0])
-    assert FastOrDrakeJudge(config).judge(scene, rng(2)) == judge.judge(scene, rng(2))
+    assert HybridJudge(config).judge(scene, rng(2)) == judge.judge(scene, rng(2))
 
 
 def test_what_the_fast_judge_can_judge_drake_is_not_asked(
-    config: ClutterConfig, fast: FastJudge
+    config: ClutterConfig, fast: StaticStabilityJudge
 ) -> None:
-    assert FastOrDrakeJudge(config).judge(HIDING, rng(2)) == fast.judge(HIDING, rng(2))
+    assert HybridJudge(config).judge(HIDING, rng(2)) == fast.judge(HIDING, rng(2))

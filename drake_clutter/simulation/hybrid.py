@@ -11,40 +11,40 @@ from drake_clutter.scenes.interfaces import (
     Verdict,
 )
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.simulation.judge import DrakeJudge
-from drake_clutter.stability.executor import FastExecutor
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.simulation.settle_executor import SettleExecutor
+from drake_clutter.stability.static_executor import StaticExecutor
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
-class FastOrDrakeJudge:
+class HybridJudge:
     """Judges fast, and asks Drake about what the fast judge cannot judge (a `SceneJudge`)."""
 
     def __init__(self, config: ClutterConfig) -> None:
-        self._fast, self._drake = FastJudge(config), DrakeJudge(config)
+        self._static, self._drake = StaticStabilityJudge(config), DrakeJudge(config)
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
         """See `SceneJudge.judge`."""
-        verdict = self._fast.judge(scene, rng)
+        verdict = self._static.judge(scene, rng)
         return (
             self._drake.judge(scene, rng) if isinstance(verdict, InconclusiveVerdict) else verdict
         )
 
 
-class FastOrDrakeExecutor:
+class HybridExecutor:
     """Carries moves out fast, and asks Drake about what the fast judge cannot judge (a `MoveExecutor`)."""
 
-    def __init__(self, config: ClutterConfig, *, follow_falls: bool = True) -> None:
-        """Makes both; `follow_falls` is Drake's, see `SettleExecutor`."""
-        self._fast, self._settle = (
-            FastExecutor(config),
-            SettleExecutor(config, follow_falls=follow_falls),
+    def __init__(self, config: ClutterConfig, *, simulate_collapse: bool = True) -> None:
+        """Makes both; `simulate_collapse` is Drake's, see `SettleExecutor`."""
+        self._static, self._settle = (
+            StaticExecutor(config),
+            SettleExecutor(config, simulate_collapse=simulate_collapse),
         )
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """See `MoveExecutor.execute`."""
         state = rng.bit_generator.state
-        outcome = self._fast.execute(scene, command, rng)
+        outcome = self._static.execute(scene, command, rng)
         if outcome.result is MoveResult.INCONCLUSIVE:
             rng.bit_generator.state = state  # the same offsets as if Drake had been asked first
             return self._settle.execute(scene, command, rng)

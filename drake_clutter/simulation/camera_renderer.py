@@ -28,11 +28,11 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MAX_DEPTH
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.plant import ScenePlant, add_scene_plant, rigid_transform
+from drake_clutter.simulation.scene_plant import ScenePlant, add_scene_plant, rigid_transform
 
-RENDERER = "vtk"
+RENDERER_NAME = "vtk"
 # Two lamps beside the camera; the second keeps what turns away from the first from going black.
-ENGINE = RenderEngineVtkParams(
+RENDER_ENGINE_PARAMS = RenderEngineVtkParams(
     backend="EGL",
     lights=[
         LightParameter(
@@ -47,7 +47,7 @@ _NO_OBJECT = -1
 
 
 @dataclass(frozen=True)
-class Images:
+class RenderedImages:
     """What the camera renders of a scene.
 
     Attributes:
@@ -62,7 +62,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class RenderCameras:
     """A camera for Drake: what it renders with, and where it is.
 
     Attributes:
@@ -76,15 +76,17 @@ class Intrinsics:
     X_TC: RigidTransform
 
     @staticmethod
-    def of(config: Camera) -> "Intrinsics":
+    def from_camera(config: Camera) -> "RenderCameras":
         """Of a config."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
-        anywhere = RenderCameraCore(RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform())
+        anywhere = RenderCameraCore(
+            RENDERER_NAME, info, ClippingRange(0.05, 20.0), RigidTransform()
+        )
         over_tray = RenderCameraCore(
-            RENDERER, info, _clipping_over_tray(config.X_TC), RigidTransform()
+            RENDERER_NAME, info, _tray_clipping_range(config.X_TC), RigidTransform()
         )
         depth = DepthRenderCamera(anywhere, DepthRange(0.1, MAX_DEPTH))
-        return Intrinsics(
+        return RenderCameras(
             ColorRenderCamera(anywhere, False),
             depth,
             ColorRenderCamera(over_tray, False),
@@ -92,7 +94,7 @@ class Intrinsics:
         )
 
 
-def _clipping_over_tray(X_TC: RigidTransform) -> ClippingRange:
+def _tray_clipping_range(X_TC: RigidTransform) -> ClippingRange:
     """Tight about whatever stands on the tray.
 
     Where two surfaces meet at the middle of a pixel, the engine lets the one win that it draws first, and its order changes
@@ -103,36 +105,38 @@ def _clipping_over_tray(X_TC: RigidTransform) -> ClippingRange:
     return ClippingRange(max(0.05, middle - 0.7 - tilt), max(0.1, middle + 0.5 + tilt))
 
 
-class OverheadCamera:
+class CameraRenderer:
     """Renders scenes with one engine that is kept alive, its objects moved from scene to scene."""
 
-    def __init__(self, config: Camera, engine: RenderEngineVtkParams = ENGINE) -> None:
+    def __init__(
+        self, camera: Camera, engine: RenderEngineVtkParams = RENDER_ENGINE_PARAMS
+    ) -> None:
         """Makes a camera; `engine` sets light, background and shadows."""
-        self.config = config
+        self.camera = camera
         self._engine = engine
         self._counts: Counter[ObjectClass] = Counter()
         self._support: Support | None = None
-        eye = Intrinsics.of(config)
+        render_cameras = RenderCameras.from_camera(camera)
         self._color_camera, self._depth_camera, self._label_camera, self._X_TC = (
-            eye.color,
-            eye.depth,
-            eye.label,
-            eye.X_TC,
+            render_cameras.color,
+            render_cameras.depth,
+            render_cameras.label,
+            render_cameras.X_TC,
         )
         # Behind the camera.
-        self._X_T_parked = RigidTransform(eye.X_TC @ [0.0, 0.0, -5.0])
+        self._X_T_parked = RigidTransform(render_cameras.X_TC @ [0.0, 0.0, -5.0])
 
     def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
         builder = DiagramBuilder()
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, support, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
-        self._scene_plant.scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(self._engine))
+        self._scene_plant.scene_graph.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(self._engine))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._counts, self._support = counts, support
 
-    def _show(self, scene: Scene, shown: Collection[str]) -> dict[int, int]:
+    def _place_objects(self, scene: Scene, shown: Collection[str]) -> dict[int, int]:
         """Puts the named objects of the scene before the camera, and no others.
 
         Returns:
@@ -174,32 +178,32 @@ class OverheadCamera:
     def _world_frame(self) -> FrameId:
         return self._scene_plant.scene_graph.world_frame_id()
 
-    def render(self, scene: Scene, X_TC: Pose | None = None) -> Images:
+    def render(self, scene: Scene, X_TC: Pose | None = None) -> RenderedImages:
         """The three images of a scene.
 
         Args:
             scene: what to render.
             X_TC: another place to look from, for pictures; None for the camera's own.
         """
-        labels = self._show(scene, scene.names)
+        labels = self._place_objects(scene, scene.names)
         X = self._X_TC if X_TC is None else rigid_transform(X_TC)
         color = self._query().RenderColorImage(self._color_camera, self._world_frame(), X)
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), X)
-        return Images(
+        return RenderedImages(
             color.data[..., :3].copy(), depth.data[..., 0].copy(), self._label_image(labels, X)
         )
 
-    def depth_and_label(self, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def render_depth_and_label(self, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The depth image and the label image, without the colour image, which takes longer than both; see `Images`."""
-        labels = self._show(scene, scene.names)
+        labels = self._place_objects(scene, scene.names)
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), self._X_TC)
         return depth.data[..., 0].copy(), self._label_image(labels, self._X_TC)
 
-    def label(self, scene: Scene) -> NDArray[np.int64]:
+    def render_label(self, scene: Scene) -> NDArray[np.int64]:
         """The label image alone, see `Images`."""
-        return self._label_image(self._show(scene, scene.names), self._X_TC)
+        return self._label_image(self._place_objects(scene, scene.names), self._X_TC)
 
-    def visible_shares(
+    def visible_fractions(
         self, scene: Scene, label: NDArray[np.int64] | None = None
     ) -> dict[str, float]:
         """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
@@ -207,31 +211,31 @@ class OverheadCamera:
         An object that is out of the camera's frame is not hidden: its share is 1. `label` is the scene's label image, if it is
         there already.
         """
-        seen = np.bincount(
-            (self.label(scene) if label is None else label).ravel() + 1,
+        visible = np.bincount(
+            (self.render_label(scene) if label is None else label).ravel() + 1,
             minlength=len(scene.objects) + 1,
         )[1:]
-        alone = np.zeros(len(scene.objects), int)
-        for together in self._apart_in_image(scene):
-            labels = self._show(scene, {scene.objects[i].name for i in together})
+        unoccluded = np.zeros(len(scene.objects), int)
+        for group in self._non_overlapping_groups(scene):
+            labels = self._place_objects(scene, {scene.objects[i].name for i in group})
             counts = np.bincount(
                 self._label_image(labels, self._X_TC).ravel() + 1, minlength=len(scene.objects) + 1
             )[1:]
-            alone[together] = counts[together]
+            unoccluded[group] = counts[group]
         return {
-            o.name: float(seen[i] / alone[i]) if alone[i] else 1.0
+            o.name: float(visible[i] / unoccluded[i]) if unoccluded[i] else 1.0
             for i, o in enumerate(scene.objects)
         }
 
-    def hidden(self, shares: Mapping[str, float]) -> tuple[str, ...]:
+    def hidden_objects(self, fractions: Mapping[str, float]) -> tuple[str, ...]:
         """The names whose visible share is below the config's threshold, in order."""
         return tuple(
-            name for name, share in shares.items() if share < self.config.visibility_threshold
+            name for name, share in fractions.items() if share < self.camera.visibility_threshold
         )
 
-    def _apart_in_image(self, scene: Scene) -> list[list[int]]:
+    def _non_overlapping_groups(self, scene: Scene) -> list[list[int]]:
         """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""
-        corners = [self.config.project(o.corners_T) for o in scene.objects]
+        corners = [self.camera.project(o.corners_T) for o in scene.objects]
         lower, upper = [c.min(axis=0) - 2 for c in corners], [c.max(axis=0) + 2 for c in corners]
         overlapping = nx.Graph()
         overlapping.add_nodes_from(range(len(corners)))
@@ -240,6 +244,6 @@ class OverheadCamera:
                 if (np.minimum(upper[i], upper[j]) > np.maximum(lower[i], lower[j])).all():
                     overlapping.add_edge(i, j)
         groups: dict[int, list[int]] = defaultdict(list)
-        for index, colour in nx.greedy_color(overlapping).items():
-            groups[colour].append(index)
+        for index, color in nx.greedy_color(overlapping).items():
+            groups[color].append(index)
         return [sorted(group) for group in groups.values()]

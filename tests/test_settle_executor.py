@@ -12,8 +12,8 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Scene
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.simulation.judge import TOUCHING_MARGIN
+from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
+from drake_clutter.simulation.settle_executor import SettleExecutor
 
 STACKS = scene_of(
     resting("cracker_box", name="below"),

@@ -6,12 +6,12 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def drake_silent_below(level: int) -> Iterator[None]:
+def suppress_drake_log(level: int) -> Iterator[None]:
     """Within it Drake logs nothing that is less than a level of `logging`."""
     logger = logging.getLogger("drake")
-    before = logger.level
+    previous_level = logger.level
     logger.setLevel(level)
     try:
         yield
     finally:
-        logger.setLevel(before)
+        logger.setLevel(previous_level)

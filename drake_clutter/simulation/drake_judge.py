@@ -11,9 +11,9 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, perturb_poses
-from drake_clutter.simulation.camera import OverheadCamera
-from drake_clutter.simulation.settle import Settled, settle
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.settle import SettleResult, settle
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 TOUCHING_MARGIN = 0.003
 """m; objects further apart than this, random offsets included, settle without each other."""
@@ -29,9 +29,11 @@ class DrakeJudge:
 
     def __init__(self, config: ClutterConfig) -> None:
         self._config = config
-        self._camera = OverheadCamera(config.cell.camera)
-        self._fast = FastJudge(config)
-        self._singles: dict[tuple[ObjectClass, Support, float, tuple[float, ...]], Settled] = {}
+        self._renderer = CameraRenderer(config.cell.camera)
+        self._static_judge = StaticStabilityJudge(config)
+        self._single_results: dict[
+            tuple[ObjectClass, Support, float, tuple[float, ...]], SettleResult
+        ] = {}
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
         """The verdict. See `SceneJudge.judge`."""
@@ -40,11 +42,11 @@ class DrakeJudge:
             settled |= result.poses
             if result.instability is not None:
                 return Verdict(result.instability, settled, {}, ())
-        return self.look(scene.with_poses(settled))
+        return self.judge_at_rest(scene.with_poses(settled))
 
     def settle_groups(
         self, scene: Scene, rng: np.random.Generator
-    ) -> Iterator[tuple[tuple[SceneObject, ...], Settled]]:
+    ) -> Iterator[tuple[tuple[SceneObject, ...], SettleResult]]:
         """Settles group after group of objects that may touch, random offsets added; each with how it settled."""
         config = self._config.settle
         groups = group_touching_objects(
@@ -52,34 +54,36 @@ class DrakeJudge:
         )
         for group in sorted(
             groups,
-            key=lambda group: self._fast.stability(replace(scene, objects=tuple(group))) is None,
+            key=lambda group: (
+                self._static_judge.find_instability(replace(scene, objects=tuple(group))) is None
+            ),
         ):
-            alone = len(group) == 1 and _well_inside(group[0], scene.support)
+            is_single = len(group) == 1 and _well_inside(group[0], scene.support)
             yield (
                 tuple(group),
-                self._settle_alone(group[0], scene.support)
-                if alone
+                self._settle_single(group[0], scene.support)
+                if is_single
                 else settle(group, scene.support, config),
             )
 
-    def _settle_alone(self, single: SceneObject, support: Support) -> Settled:
+    def _settle_single(self, single: SceneObject, support: Support) -> SettleResult:
         """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
         x, y, z = single.X_TO.translation
         key = (single.object_class, support, z, single.X_TO.quaternion)
-        if key not in self._singles:
-            centred = replace(single, X_TO=single.X_TO.translated((-x, -y, 0.0)))
-            self._singles[key] = settle([centred], support, self._config.settle)
-        settled = self._singles[key]
+        if key not in self._single_results:
+            centered = replace(single, X_TO=single.X_TO.translated((-x, -y, 0.0)))
+            self._single_results[key] = settle([centered], support, self._config.settle)
+        settled = self._single_results[key]
         (pose,) = settled.poses.values()
         instability = (
             replace(settled.instability, object=single.name) if settled.instability else None
         )
-        return Settled(instability, {single.name: pose.translated((x, y, 0.0))}, ())
+        return SettleResult(instability, {single.name: pose.translated((x, y, 0.0))}, ())
 
-    def look(self, scene: Scene) -> Verdict:
+    def judge_at_rest(self, scene: Scene) -> Verdict:
         """The verdict on a scene that is known to be at rest: what it hides."""
-        shares = self._camera.visible_shares(scene)
-        return Verdict(None, scene.poses, shares, self._camera.hidden(shares))
+        shares = self._renderer.visible_fractions(scene)
+        return Verdict(None, scene.poses, shares, self._renderer.hidden_objects(shares))
 
 
 def _well_inside(scene_object: SceneObject, support: Support) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import executed, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
-from test_executor import STACKS
+from test_settle_executor import STACKS
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -25,19 +25,19 @@ from drake_clutter.scenes.interfaces import (
 )
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.executor import SettleExecutor
-from drake_clutter.simulation.fallback import FastOrDrakeExecutor
-from drake_clutter.stability.executor import FastExecutor
-from drake_clutter.stability.judge import FastJudge
+from drake_clutter.simulation.hybrid import HybridExecutor
+from drake_clutter.simulation.settle_executor import SettleExecutor
+from drake_clutter.stability.static_executor import StaticExecutor
+from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.episode import SteppedBackend
 
 CONFIG = ClutterConfig()
-JUDGE = FastJudge(CONFIG)
-EXECUTOR = FastExecutor(CONFIG, JUDGE)
+JUDGE = StaticStabilityJudge(CONFIG)
+EXECUTOR = StaticExecutor(CONFIG, JUDGE)
 
 
 def seen(scene: Scene) -> Observation:
-    return JUDGE.rays.observe(scene)[0]
+    return JUDGE.ray_caster.observe(scene)[0]
 
 
 def carried_out(
@@ -89,7 +89,7 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
         STACKS.graph,
         STACKS.derivation,
     )
-    assert JUDGE.stability(after) is None
+    assert JUDGE.find_instability(after) is None
 
 
 def test_the_same_rng_gives_the_same_outcome() -> None:
@@ -97,7 +97,7 @@ def test_the_same_rng_gives_the_same_outcome() -> None:
     one = carried_out(STACKS, Move("marker"), 7)
     carried_out(STACKS, Move("above"), 1)
     assert carried_out(STACKS, Move("marker"), 7) == one
-    assert carried_out(STACKS, Move("marker"), 7, FastExecutor(CONFIG)) == one
+    assert carried_out(STACKS, Move("marker"), 7, StaticExecutor(CONFIG)) == one
     assert carried_out(STACKS, Move("marker"), 8).scene != one.scene
 
 
@@ -154,7 +154,7 @@ def test_nothing_stays_on_a_lying_marker(pick: str, seed: int) -> None:
 
 
 def test_where_nothing_balances() -> None:
-    assert JUDGE.stability(OUTSIDE_ONLY) is None
+    assert JUDGE.find_instability(OUTSIDE_ONLY) is None
     outcome = carried_out(OUTSIDE_ONLY, Move("heavy", "over"))
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
@@ -245,7 +245,7 @@ def test_what_a_move_does_not_touch_need_not_be_judged(move: Move) -> None:
     assert outcome.scene["leaning"] == LEANS["leaning"]
 
 
-@pytest.mark.parametrize("executor", [EXECUTOR, FastOrDrakeExecutor(CONFIG)])
+@pytest.mark.parametrize("executor", [EXECUTOR, HybridExecutor(CONFIG)])
 @pytest.mark.parametrize(
     "move",
     [Move("ghost"), Move("marker", "ghost"), Move("can", "marker"), Move("marker", "can")],
@@ -279,7 +279,7 @@ def test_drake_lets_it_go_at_the_same_place(
     mine = executed(EXECUTOR, STACKS, rendered, move, rng(3))
     same = executed(EXECUTOR, STACKS, cast, move, rng(3))
     assert mine == same
-    executor = SettleExecutor(CONFIG, follow_falls=False)
+    executor = SettleExecutor(CONFIG, simulate_collapse=False)
     drakes = executed(executor, STACKS, rendered, move, rng(3))
     assert mine.result is drakes.result is result
     let_go = drakes.motion[0].poses[move.pick]
@@ -289,7 +289,7 @@ def test_drake_lets_it_go_at_the_same_place(
         assert drakes.scene[move.pick].X_TO.p == pytest.approx(
             mine.scene[move.pick].X_TO.p, abs=1e-4
         )
-        assert JUDGE.stability(drakes.scene) is None
+        assert JUDGE.find_instability(drakes.scene) is None
     else:
         assert mine.instability is not None
         assert drakes.instability is not None
@@ -299,7 +299,7 @@ def test_drake_lets_it_go_at_the_same_place(
 def test_drake_is_asked_about_what_cannot_be_judged() -> None:
     """It draws what it would have drawn, had it been asked first."""
     generator, other = rng(5), rng(5)
-    outcome = executed(FastOrDrakeExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), generator)
+    outcome = executed(HybridExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), generator)
     drakes = executed(SettleExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), other)
     assert outcome == drakes
     assert outcome.result is MoveResult.PLACED
@@ -313,7 +313,7 @@ def test_drake_is_asked_about_what_cannot_be_judged() -> None:
 def test_drake_is_not_asked_about_the_rest(move: Move) -> None:
     """Not even about a collapse, of which it would show the motion."""
     generator, other = rng(5), rng(5)
-    outcome = executed(FastOrDrakeExecutor(CONFIG), STACKS, seen(STACKS), move, generator)
+    outcome = executed(HybridExecutor(CONFIG), STACKS, seen(STACKS), move, generator)
     assert outcome == executed(EXECUTOR, STACKS, seen(STACKS), move, other)
     assert outcome.motion == ()
     assert generator.random() == other.random()
@@ -346,7 +346,7 @@ HELD_DOWN = scene_of(
 @pytest.mark.parametrize("seed", range(4))
 def test_no_moves_ever_take_what_can_never_be_moved(seed: int) -> None:
     """Played at random, with loads put down on everything: whoever picks one of them makes the scene collapse."""
-    assert JUDGE.never_movable(HELD_DOWN) == frozenset(FIXED)
+    assert JUDGE.immovable_objects(HELD_DOWN) == frozenset(FIXED)
     scene, generator = HELD_DOWN, rng(seed)
     moved, tried = 0, 0
     for _ in range(25):

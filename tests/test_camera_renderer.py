@@ -10,7 +10,7 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.camera import Images, OverheadCamera
+from drake_clutter.simulation.camera_renderer import CameraRenderer, RenderedImages
 
 UPRIGHT = Orientation.UPRIGHT_0
 BELOW = resting("cracker_box", name="below")  # 230 mm x 160 mm, 60 mm high
@@ -33,7 +33,7 @@ CROWDED = scene_of(
 )
 
 
-def same(one: Images, other: Images) -> bool:
+def same(one: RenderedImages, other: RenderedImages) -> bool:
     """Equal labels; colour and depth equal bit for bit on the objects (along the tray's seams a pixel may go either way)."""
     seen = one.label >= 0
     return bool(
@@ -44,23 +44,23 @@ def same(one: Images, other: Images) -> bool:
     )
 
 
-def test_an_object_under_a_larger_one_is_hidden(camera: OverheadCamera) -> None:
+def test_an_object_under_a_larger_one_is_hidden(camera: CameraRenderer) -> None:
     scene = scene_of(
         resting("gelatin_box", name="gelatin"), resting("cracker_box", floor=0.028, name="cover")
     )
-    shares = camera.visible_shares(scene)
+    shares = camera.visible_fractions(scene)
     assert shares == {"gelatin": 0.0, "cover": 1.0}
-    assert camera.hidden(shares) == ("gelatin",)
+    assert camera.hidden_objects(shares) == ("gelatin",)
 
 
 def test_hidden_is_below_the_threshold_in_order() -> None:
-    camera = OverheadCamera(Camera.overhead(1.6, visibility_threshold=0.25))
-    assert camera.hidden({"b": 0.0, "a": 0.2499, "c": 0.25, "d": 1.0}) == ("b", "a")
+    camera = CameraRenderer(Camera.overhead(1.6, visibility_threshold=0.25))
+    assert camera.hidden_objects({"b": 0.0, "a": 0.2499, "c": 0.25, "d": 1.0}) == ("b", "a")
 
 
-def test_half_covered(camera: OverheadCamera) -> None:
+def test_half_covered(camera: CameraRenderer) -> None:
     """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
-    shares = camera.visible_shares(
+    shares = camera.visible_fractions(
         scene_of(BELOW, resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"))
     )
     assert shares["below"] == pytest.approx(0.5, abs=1 / 92)  # the box is 92 pixels long
@@ -76,31 +76,33 @@ def test_half_covered(camera: OverheadCamera) -> None:
     ],
 )
 def test_a_smaller_box_in_the_middle_hides_what_its_top_covers(
-    name: str, length: float, width: float, height: float, camera: OverheadCamera
+    name: str, length: float, width: float, height: float, camera: CameraRenderer
 ) -> None:
     """Both rectangles as the pinhole sees them: scaled by 1 / distance."""
     covered = length * width / (1.60 - 0.060 - height) ** 2 / (0.230 * 0.160 / (1.60 - 0.060) ** 2)
-    shares = camera.visible_shares(scene_of(BELOW, resting(name, floor=0.060, name="above")))
+    shares = camera.visible_fractions(scene_of(BELOW, resting(name, floor=0.060, name="above")))
     assert shares == {"below": pytest.approx(1 - covered, abs=0.02), "above": 1.0}
 
 
-def test_what_nothing_covers_is_seen_in_full(camera: OverheadCamera) -> None:
-    assert set(camera.visible_shares(SCATTERED).values()) == {1.0}
+def test_what_nothing_covers_is_seen_in_full(camera: CameraRenderer) -> None:
+    assert set(camera.visible_fractions(SCATTERED).values()) == {1.0}
 
 
-def test_shares_are_those_of_each_object_rendered_alone(camera: OverheadCamera) -> None:
+def test_shares_are_those_of_each_object_rendered_alone(camera: CameraRenderer) -> None:
     """Objects that are far apart in the image share a rendering: it must not show."""
-    label = camera.label(CROWDED)
+    label = camera.render_label(CROWDED)
     expected = {}
     for index, o in enumerate(CROWDED.objects):
-        alone = int((camera.label(scene_of(o)) == 0).sum())
+        alone = int((camera.render_label(scene_of(o)) == 0).sum())
         expected[o.name] = float((label == index).sum()) / alone
-    assert camera.visible_shares(CROWDED) == expected
+    assert camera.visible_fractions(CROWDED) == expected
     assert 0.0 < expected["0.0 0.0"] < 1.0
 
 
-def test_an_object_out_of_the_frame_is_not_hidden(camera: OverheadCamera) -> None:
-    shares = camera.visible_shares(scene_of(resting("sugar_box", xy=(5.0, 0.0), name="far"), BELOW))
+def test_an_object_out_of_the_frame_is_not_hidden(camera: CameraRenderer) -> None:
+    shares = camera.visible_fractions(
+        scene_of(resting("sugar_box", xy=(5.0, 0.0), name="far"), BELOW)
+    )
     assert shares == {"far": 1.0, "below": 1.0}
 
 
@@ -114,7 +116,7 @@ def test_an_object_out_of_the_frame_is_not_hidden(camera: OverheadCamera) -> Non
     ],
 )
 def test_depth_in_the_middle_is_the_distance_to_the_top(
-    objects: list[SceneObject], top: float, camera: OverheadCamera
+    objects: list[SceneObject], top: float, camera: CameraRenderer
 ) -> None:
     corner = resting("large_marker", xy=(0.3, 0.3), name="marker")
     images = camera.render(scene_of(*objects, corner))
@@ -123,7 +125,7 @@ def test_depth_in_the_middle_is_the_distance_to_the_top(
     assert (images.label[239:241, 319:321] == (0 if objects else -1)).all()
 
 
-def test_shapes_and_types(camera: OverheadCamera) -> None:
+def test_shapes_and_types(camera: CameraRenderer) -> None:
     images = camera.render(SCATTERED)
     assert images.color.shape == (480, 640, 3)
     assert images.color.dtype == np.dtype(np.uint8)
@@ -131,14 +133,14 @@ def test_shapes_and_types(camera: OverheadCamera) -> None:
     assert images.depth.dtype == np.dtype(np.float32)
     assert set(np.unique(images.label)) == {-1, 0, 1, 2, 3, 4}
     assert np.isinf(images.depth[0, 0])  # beside the tray
-    assert np.array_equal(camera.label(SCATTERED), images.label)
+    assert np.array_equal(camera.render_label(SCATTERED), images.label)
 
 
 def outline(
-    camera: OverheadCamera, o: SceneObject
+    camera: CameraRenderer, o: SceneObject
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners of the object's convex outline in the image, and its centroid, in pixels."""
-    points = camera.config.project(o.corners_T)
+    points = camera.camera.project(o.corners_T)
     around = points[ConvexHull(points).vertices]
     following = np.roll(around, -1, axis=0)
     cross = around[:, 0] * following[:, 1] - following[:, 0] * around[:, 1]
@@ -146,34 +148,34 @@ def outline(
 
 
 @pytest.mark.parametrize("index", range(5), ids=SCATTERED.names)
-def test_project_agrees_with_the_label_image(index: int, camera: OverheadCamera) -> None:
+def test_project_agrees_with_the_label_image(index: int, camera: CameraRenderer) -> None:
     """Up to the pixel: a pixel is the object's if its middle is."""
     corners, centroid = outline(camera, SCATTERED.objects[index])
-    rows, columns = np.nonzero(camera.label(SCATTERED) == index)
+    rows, columns = np.nonzero(camera.render_label(SCATTERED) == index)
     assert np.array([columns.mean(), rows.mean()]) == pytest.approx(centroid, abs=1.0)
     assert np.array([columns.min(), rows.min()]) == pytest.approx(corners.min(axis=0), abs=1.0)
     assert np.array([columns.max(), rows.max()]) == pytest.approx(corners.max(axis=0), abs=1.5)
 
 
-def test_a_picture_from_elsewhere_has_its_own_labels(camera: OverheadCamera) -> None:
+def test_a_picture_from_elsewhere_has_its_own_labels(camera: CameraRenderer) -> None:
     near = camera.render(SCATTERED, Pose((0.0, 0.0, 1.00), (0.0, 1.0, 0.0, 0.0)))
-    here = camera.label(SCATTERED)
+    here = camera.render_label(SCATTERED)
     assert (near.label >= 0).sum() > 1.5 * (here >= 0).sum()
 
 
-def test_project_is_not_shifted(camera: OverheadCamera) -> None:
+def test_project_is_not_shifted(camera: CameraRenderer) -> None:
     shifts = []
-    label = camera.label(SCATTERED)
+    label = camera.render_label(SCATTERED)
     for index, o in enumerate(SCATTERED.objects):
         rows, columns = np.nonzero(label == index)
         shifts.append(np.array([columns.mean(), rows.mean()]) - outline(camera, o)[1])
     assert np.abs(np.mean(shifts, axis=0)).max() < 0.25  # pixels
 
 
-def test_project_by_hand(camera: OverheadCamera) -> None:
+def test_project_by_hand(camera: CameraRenderer) -> None:
     """x to the right, y up in the image; a point at half the altitude is twice as far from the middle, half a pixel off."""
-    f = camera.config.focal_length
-    points = camera.config.project(
+    f = camera.camera.focal_length
+    points = camera.camera.project(
         np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.0, 0.16, 0.0], [0.16, 0.16, 0.8]])
     )
     middle = np.array([319.0, 239.0])
@@ -184,14 +186,14 @@ def test_project_by_hand(camera: OverheadCamera) -> None:
 
 def test_images_do_not_depend_on_what_was_rendered_before(config_camera: Camera) -> None:
     """Scene A, then one that needs a larger pool, then A again; a camera that has seen only A; one that began with the other."""
-    camera = OverheadCamera(config_camera)
+    camera = CameraRenderer(config_camera)
     first = camera.render(SCATTERED)
     crowded = camera.render(CROWDED)
     assert same(camera.render(SCATTERED), first)
-    other = OverheadCamera(config_camera)
+    other = CameraRenderer(config_camera)
     assert same(other.render(CROWDED), crowded)
     assert same(other.render(SCATTERED), first)
-    assert other.visible_shares(SCATTERED) == camera.visible_shares(SCATTERED)
+    assert other.visible_fractions(SCATTERED) == camera.visible_fractions(SCATTERED)
     assert not same(first, crowded)
 
 
@@ -200,7 +202,7 @@ def config_camera() -> Camera:
     return Camera.overhead(1.6, width=320, height=240)
 
 
-def test_the_order_of_objects_changes_labels_alone(camera: OverheadCamera) -> None:
+def test_the_order_of_objects_changes_labels_alone(camera: CameraRenderer) -> None:
     backwards = Scene(SCATTERED.objects[::-1], SCATTERED.support)
     one, other = camera.render(SCATTERED), camera.render(backwards)
     assert np.array_equal(one.color, other.color)
@@ -208,16 +210,16 @@ def test_the_order_of_objects_changes_labels_alone(camera: OverheadCamera) -> No
     assert np.array_equal(np.where(one.label >= 0, 4 - one.label, -1), other.label)
 
 
-def test_another_tray_is_drawn(camera: OverheadCamera) -> None:
+def test_another_tray_is_drawn(camera: CameraRenderer) -> None:
     """The floor ends at the rim, 25 mm high: the depth along a row through the tray tells its side."""
     for side in (0.50, 0.70):
         depth = camera.render(scene_of(resting("large_marker", name="m"), side=side)).depth[200]
         floor = np.flatnonzero(np.abs(depth - 1.60) < 0.001)
-        visible = (floor[-1] - floor[0]) / camera.config.focal_length * 1.60
+        visible = (floor[-1] - floor[0]) / camera.camera.focal_length * 1.60
         assert visible == pytest.approx(side, abs=0.02)
 
 
-def test_a_picture_from_elsewhere(camera: OverheadCamera) -> None:
+def test_a_picture_from_elsewhere(camera: CameraRenderer) -> None:
     """From the overhead camera's own place the pictures are its own; from lower down everything is nearer."""
     down = (0.0, 1.0, 0.0, 0.0)  # half a turn about x
     assert same(camera.render(SCATTERED, Pose((0.0, 0.0, 1.60), down)), camera.render(SCATTERED))
