@@ -1,0 +1,1 @@
+"""Scene generators and exploration policies, trained and rule-based, and their training."""

@@ -1,0 +1,1 @@
+"""Simulation in Drake: plants, settling, rendering, and the judge that uses them."""
