@@ -8,7 +8,35 @@ from collections.abc import Callable, Mapping
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-PAGES: Mapping[str, Callable[[], str]] = {}
+import api_page
+import cli_page
+import configuration_page
+import environments_page
+import results_arm
+import results_calibration
+import results_closed_loop
+import results_exploration
+import results_generation
+import results_index
+import results_judge_agreement
+import results_negative
+import results_perception
+
+PAGES: Mapping[str, Callable[[], str]] = {
+    "reference/api.md": api_page.page,
+    "reference/environments.md": environments_page.page,
+    "reference/cli.md": cli_page.page,
+    "reference/configuration.md": configuration_page.page,
+    "results/index.md": results_index.page,
+    "results/generation.md": results_generation.page,
+    "results/exploration.md": results_exploration.page,
+    "results/closed_loop.md": results_closed_loop.page,
+    "results/arm.md": results_arm.page,
+    "results/perception.md": results_perception.page,
+    "results/judge_agreement.md": results_judge_agreement.page,
+    "results/calibration.md": results_calibration.page,
+    "results/negative_results.md": results_negative.page,
+}
 """Functions that return the Markdown of a page, by its path below `docs`."""
 
 

@@ -1,0 +1,145 @@
+"""The page docs/results/arm.md."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from markdown_text import number, quantiles, section, significant, table
+from results_files import read_benchmark_results
+
+RUNS = (
+    ("arm_moves.json", "SNOPT, 5 ms"),
+    ("arm_moves_2_5_ms.json", "SNOPT, 2.5 ms"),
+    ("arm_moves_convex.json", "convex, 2.5 ms"),
+)
+"""Results files of random moves, with trajectory optimizer and simulation time step."""
+GRASPS = {"JointHold": "weld (locked joint)", "HexapodHold": "compliant (hexapod)"}
+"""Grasp constraints by their names in results files of version 0.1."""
+PARTS = {
+    "inverse kinematics of a pose, eight branches": "inverse kinematics of a pose, all branches",
+    "forward kinematics of a pose": "forward kinematics",
+    "distances at joint angles": "signed distances at a configuration",
+    "distances with gradients": "signed distances with gradients",
+    "timing of a path without load": "time-optimal parameterization of a path",
+    "sure plan": "plan without optimization",
+    "optimised plan": "plan with optimization",
+    "scene of distances": "collision model of a scene",
+    "simulation, built": "simulation, built",
+    "simulation, run": "simulation, run",
+}
+"""Names of the timed parts, by their names in the results file, from quick to slow."""
+
+
+def _fraction(part: Mapping[str, Any]) -> str:
+    low, high = part["interval"]
+    successes = round(part["share"] * part["of"])
+    return f"{part['share']:.3f} ({low:.3f} to {high:.3f}), {successes} of {part['of']}"
+
+
+def _moves() -> str:
+    runs = [(label, read_benchmark_results(name)) for name, label in RUNS]
+    text = section(
+        "Random pick-and-place moves",
+        "Legal moves drawn uniformly in stable RG scenes of 25 nodes, ten per scene, UR10 with "
+        "EPick. *Planned*: of the moves of which some grasp has collision-free endpoints. "
+        "*Executed*: within 5 mm and 3 deg of the target, no other object moved by 5 mm; moves "
+        "after "
+        "which the pile collapses under teleportation too are not counted. Columns: trajectory "
+        "optimizer and simulation time step; the last is the current configuration.",
+        command="python benchmarks/pick_place.py moves --count 160 --nodes 25 --seed 31 --workers 2"
+        " --out FILE",
+        seed="17, 29, 31",
+        results=[f"benchmarks/results/{name}" for name, _ in RUNS],
+    )
+    lines: list[tuple[str, Any]] = [
+        ("moves", lambda run: str(sum(run["results"].values()))),
+        ("planned", lambda run: _fraction(run["planned_of_possible"])),
+        ("executed", lambda run: _fraction(run["carried_out_unless_unstable_anyway"])),
+        (
+            "executed, of all planned",
+            lambda run: f"{run['results']['carried out']} of {run['carried_out_of_planned']['of']}",
+        ),
+        ("optimized transfer kept", lambda run: _fraction(run["optimised_carry_kept"])),
+        ("optimized segments kept", lambda run: _fraction(run["optimised_phases_kept"])),
+        ("duration / unoptimized, median", lambda run: number(run["motion_of_sure"]["p50"])),
+        ("duration, median [s]", lambda run: number(run["motion_s"]["p50"], 1)),
+        ("unoptimized duration, median [s]", lambda run: number(run["sure_motion_s"]["p50"], 1)),
+        (
+            "planning without optimization, median / 95th [s]",
+            lambda run: quantiles(run["sure_planning_s"], 3),
+        ),
+        ("planning, median / 95th [s]", lambda run: quantiles(run["planning_s"], 2)),
+        ("simulation, median / 95th [s]", lambda run: quantiles(run["simulation_wall_s"], 2)),
+        (
+            "placement error, median / 99th [mm]",
+            lambda run: (
+                f"{1000 * run['place_error_m']['p50']:.2f}"
+                f" / {1000 * run['place_error_m']['p99']:.1f}"
+            ),
+        ),
+        ("least clearance [mm]", lambda run: number(1000 * run["least_clearance_m"], 1)),
+    ]
+    body = [[name, *(cell(run) for _, run in runs)] for name, cell in lines]
+    text += table(["", *(label for label, _ in runs)], body)
+    reasons = sorted({reason for _, run in runs for reason in run["results"]})
+    text += "\n### Outcomes\n\nNumber of moves by outcome.\n\n"
+    return text + table(
+        ["outcome", *(label for label, _ in runs)],
+        [[reason, *(str(run["results"].get(reason, 0)) for _, run in runs)] for reason in reasons],
+    )
+
+
+def _parts() -> str:
+    seconds = read_benchmark_results("arm_parts.json")["seconds"]
+    text = section(
+        "Times of the parts",
+        "One process, no other work; measured with the SNOPT optimizer and 5 ms steps.",
+        command="python benchmarks/pick_place.py parts --count 20 --seed 3 --out FILE",
+        seed=3,
+        results=["benchmarks/results/arm_parts.json"],
+    )
+    return text + table(
+        ["part", "median [ms]", "95th percentile [ms]"],
+        [
+            [name, *(significant(1000 * seconds[key][quantile]) for quantile in ("p50", "p95"))]
+            for key, name in PARTS.items()
+        ],
+    )
+
+
+def _grasps() -> str:
+    rows = read_benchmark_results("arm_holds.json")["rows"]
+    text = section(
+        "Grasp constraints",
+        "Optimized moves with the two constraints between cup and object; medians.",
+        command="python benchmarks/pick_place.py holds --count 20 --seed 0 --out FILE",
+        seed=0,
+        results=["benchmarks/results/arm_holds.json"],
+    )
+    head = ["scenes", "constraint", "executed", "other outcomes", "slip [mm]"]
+    return text + table(
+        [*head, "placement error [mm]", "wall time [s]"], [_grasp_row(r) for r in rows]
+    )
+
+
+def _grasp_row(row: Mapping[str, Any]) -> list[str]:
+    others = [f"{count} {reason}" for reason, count in row["results"].items()]
+    others = [text for text in others if not text.endswith("carried out")]
+    return [
+        row["scenes"],
+        GRASPS.get(row["hold"], row["hold"]),
+        f"{row['results'].get('carried out', 0)} of {row['moves']}",
+        ", ".join(others) or "none",
+        number(1000 * row["slip_m"]["p50"], 3),
+        number(1000 * row["place_error_m"]["p50"]),
+        number(row["wall_s"]["p50"], 1),
+    ]
+
+
+def page() -> str:
+    """Return the page."""
+    intro = (
+        "# Arm\n\nPlanning and simulated execution of pick-and-place moves "
+        "([motion planning](../explanation/motion_planning.md), "
+        "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %.\n\n"
+    )
+    return intro + "\n".join([_moves(), _parts(), _grasps()])

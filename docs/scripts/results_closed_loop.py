@@ -1,0 +1,112 @@
+"""The page docs/results/closed_loop.md."""
+
+from typing import Any
+
+from markdown_text import estimate, number, section, table
+from results_files import (
+    TRAINING,
+    read_benchmark_results,
+    read_episodes,
+    read_training_results,
+)
+
+FAILURES = {
+    "what is left lies behind what no cup holds": "remaining objects unreachable by suction"
+}
+"""Current wording of reasons in results files of version 0.1."""
+_SETUP = ["scene set", "perception", "motion", "episodes"]
+
+
+def _setup(row: dict[str, Any]) -> list[str]:
+    return [row["scenes"], row["perception"], row["motion"], str(row["episodes"])]
+
+
+def failures_text(row: dict[str, Any]) -> str:
+    """Return the numbers of failed episodes by reason."""
+    reasons = row["failed_of"].items()
+    return (
+        ", ".join(f"{count} {FAILURES.get(reason, reason)}" for reason, count in reasons) or "none"
+    )
+
+
+def _episodes() -> str:
+    rows = read_training_results("closed_loop.json")["rows"]
+    text = section(
+        "Success rates",
+        "Episodes of at most 20 moves on frozen scenes that neither policy nor detector was "
+        "trained on. *Motion*: the arm in the Drake Diagram, or teleported objects settled by "
+        "Drake. "
+        "*Reachable by suction*: fraction of the scenes in which no object stays hidden behind "
+        "objects that the cup cannot hold. Intervals are 95 %.",
+        command="python training/evaluate_closed_loop.py runs/closed_loop --workers 2",
+        seed="number of the scene",
+        results=["training/results/closed_loop.json", "training/results/closed_loop/"],
+    )
+    head = [*_SETUP, "success", "reachable by suction", "success of these", "failures"]
+    text += table(
+        head,
+        [
+            [
+                *_setup(row),
+                estimate(row, "success", "success_ci95"),
+                number(row["arm_can"]),
+                estimate(row, "success_of_arm_can", "success_of_arm_can_ci95"),
+                failures_text(row),
+            ]
+            for row in rows
+        ],
+    )
+    text += (
+        "\n### Objects found and times\n\n"
+        "*Recall*, *precision*: of the list of objects that the policy knows by class and place "
+        "when all have been in view. *Moves*: mean over the successes. *Robot time*: simulated "
+        "motion, median. *Wall time*: per episode, median, on two cores shared with other work.\n\n"
+    )
+    head = [*_SETUP, "fraction found", "recall", "precision", "moves"]
+    return text + table(
+        [*head, "robot time [min]", "wall time [s]"],
+        [
+            [
+                *_setup(row),
+                number(row["found_of_hidden"]),
+                number(row.get("list_recall")),
+                number(row.get("list_precision")),
+                number(row["moves_of_successes"], 1),
+                number(row["robot_minutes"], 1) if row["motion"] == "arm" else "",
+                number(row["wall_seconds"], 0),
+            ]
+            for row in rows
+        ],
+    )
+
+
+def _wall_time() -> str:
+    row = read_benchmark_results("closed_loop_alone.json")["rows"][0]
+    text = section(
+        "Wall time without other work",
+        "Scenes of sg_star_25 from number 60 on, one process, nothing else on the machine.",
+        command="python training/evaluate_closed_loop.py runs/alone --only "
+        "sg_star_25_student_depth_arm"
+        " --count 9 --out runs/closed_loop_alone.json",
+        seed="number of the scene",
+        results=["benchmarks/results/closed_loop_alone.json"],
+    )
+    cells = [*_setup(row), number(row["robot_minutes"], 1), number(row["wall_seconds"], 0)]
+    return text + table([*_SETUP, "robot time [min]", "wall time [s]"], [cells])
+
+
+def page() -> str:
+    """Return the page."""
+    intro = (
+        "# Closed loop\n\n"
+        "Camera images in, arm motion out, in one Drake Diagram "
+        "([closed loop](../explanation/closed_loop.md)). *labels*: perfect detections; *depth*, "
+        "*depth-color*: the shipped detectors on noisy images.\n\n"
+    )
+    return intro + _episodes() + "\n" + _wall_time()
+
+
+def closed_loop_episodes(name: str) -> dict[int, dict[str, Any]]:
+    """Return the episodes of a run of training/results/closed_loop, by number of the scene."""
+    path = TRAINING / f"closed_loop/{name}.jsonl.gz"
+    return {episode["number"]: episode for episode in read_episodes(path)}

@@ -1,0 +1,119 @@
+"""Generated pages of the documentation: numbers of results files, and references to the code."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import cli_page
+import configuration_page
+import environments_page
+import results_arm
+import results_calibration
+import results_closed_loop
+import results_exploration
+import results_generation
+import results_index
+import results_judge_agreement
+import results_negative
+import results_perception
+from markdown_text import estimate, number, table
+
+ROOT = Path(__file__).parents[1]
+RESULTS = {
+    module.__name__: module.page
+    for module in (
+        results_arm,
+        results_calibration,
+        results_closed_loop,
+        results_exploration,
+        results_generation,
+        results_index,
+        results_judge_agreement,
+        results_negative,
+        results_perception,
+    )
+}
+FILE = re.compile(r"`((?:training|benchmarks)/[\w./-]+)`")
+COMMAND = re.compile(r"- Command: `python ((?:training|benchmarks)/\w+\.py)")
+
+
+def rows_of(text: str, *cells: str) -> list[list[str]]:
+    """Return the table rows of a page that begin with these cells."""
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
+    return [row for row in rows if row[: len(cells)] == list(cells)]
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_pages_of_results_name_files_that_exist(name: str) -> None:
+    text = RESULTS[name]()
+    named = FILE.findall(text) + COMMAND.findall(text)
+    assert named
+    assert [path for path in named if not (ROOT / path).exists()] == []
+    images = re.findall(r"\]\(\.\./images/([\w.]+)\)", text)
+    assert [image for image in images if not (ROOT / "docs/images" / image).exists()] == []
+
+
+def test_generation_page_has_the_rows_of_table_one() -> None:
+    row, diversity, *_ = rows_of(results_generation.page(), "SG\\*", "ycb7", "25")
+    assert row[3:6] == ["1000", "0.98 (0.96 to 0.98)", "0.88"]
+    assert row[6:8] == ["10.1 (10.0 to 10.3)", "7.45"]
+    assert diversity[3:5] == ["0.98", "1.00"]
+
+
+def test_exploration_page_has_the_rows_of_tables_two_and_three() -> None:
+    text = results_exploration.page()
+    success, found, *_ = rows_of(text, "paper_hardness", "SE\\*")
+    assert success[2:5] == ["300", "0.91 (0.88 to 0.94)", "0.91"]
+    assert found[2:6] == ["7.3", "7.0", "5.8", "7.1"]
+    row = rows_of(text, "sg_star_25", "10", "SE\\*, DAgger", "SE^r")[0]
+    assert row[4:] == ["23", "3", "9e-05"]  # paired by scene, two-sided sign test
+
+
+def test_closed_loop_page_words_reasons_as_the_code_does() -> None:
+    row = rows_of(results_closed_loop.page(), "sg_star_25", "depth", "arm", "100")[0]
+    assert row[4:7] == ["0.71 (0.61 to 0.79)", "0.83", "0.86 (0.76 to 0.92)"]
+    assert row[7].startswith("15 collapsed, 13 remaining objects unreachable by suction")
+
+
+def test_missing_numbers_are_empty_cells() -> None:
+    assert number(None) == ""
+    assert estimate({"rate": 0.5}, "rate", "interval") == "0.50"
+    row = {"rate": 0.5, "interval": (0.25, 0.75)}
+    assert estimate(row, "rate", "interval") == "0.50 (0.25 to 0.75)"
+    assert results_generation.layout_rate({"count": 3}) == ""
+    failures = {"stack too high": 1}
+    assert results_generation.layout_rate({"count": 3, "layout_failures": failures}) == "0.75"
+
+
+def test_tables_align_numbers_to_the_right() -> None:
+    text = table(["name", "rate"], [["a", "0.5 (0.2 to 0.8)"], ["b", ""]])
+    assert text.splitlines()[1] == "| --- | ---: |"
+    with pytest.raises(ValueError, match="another length"):
+        table(["name", "rate"], [["a"]])
+
+
+def test_command_line_page_has_every_option() -> None:
+    text = cli_page.page()
+    for option in ("--scenario FILE", "--cell FILE", "--set FIELD=VALUE", "--workers"):
+        assert f"`{option}" in text
+    assert rows_of(text, "`--seed <int range>`")[0][2] == "default: 0; x>=0"
+
+
+def test_configuration_page_has_types_defaults_and_ranges() -> None:
+    text = configuration_page.page()
+    assert rows_of(text, "`standing_gap`")[0][1:4] == ["number", "0.05", "≥ 0"]
+    assert rows_of(text, "`nodes`")[0][1:4] == ["integer", "25", "3 to 1000"]
+    assert rows_of(text, "`size`")[0][1:4] == ["list of 2 numbers", "required", "0.1 to 2"]
+    assert rows_of(text, "`ik`")[0][3] == "`ur`, `numerical`"
+
+
+def test_environments_page_describes_both_observation_spaces() -> None:
+    text = environments_page.page()
+    assert "<!--" not in text
+    assert rows_of(text, "`position`")[0][1:4] == ["(25, 3)", "float32", "-0.7 to 0.7"]
+    assert "`MultiDiscrete([25 25])`" in text
