@@ -1,0 +1,1 @@
+"""Motion planning for picking and placing: collision model, search, timing, optimization."""

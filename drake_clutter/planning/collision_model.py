@@ -1,4 +1,7 @@
-"""How far the arm, and what it holds, is from everything else."""
+"""Signed distances and their gradients between the arm, an attached object and obstacles.
+
+Frames: T is the support and the world, F is the flange, G is the gripper, O is an object.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,11 +39,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SignedDistance:
-    """A signed distance.
+    """Signed distance between two collision geometries.
 
     Attributes:
-        distance: m, negative where there is penetration.
-        pair: the names of what is so close, the arm's side first.
+        distance: Distance [m]; negative in penetration.
+        pair: Names of the two geometries' owners; a part of the arm or the attached object is
+            first.
     """
 
     distance: float
@@ -48,11 +52,15 @@ class SignedDistance:
 
 
 class CollisionModel:
-    """Signed distances between the arm, what it holds, and what stands around; objects stay where they were put.
+    """Collision model of the arm in its cell, with objects at given poses.
+
+    The configuration of the arm is an argument of the queries. One object can be attached to the
+    gripper; it then moves with the arm.
 
     Attributes:
-        arm_names: of the bodies of arm and tool.
-        fixture_tops: Heights of the highest points of the cell's fixtures [m].
+        plant: Plant of arm, cell and objects.
+        arm_names: Names of the bodies of robot and gripper.
+        fixture_tops: Height of the highest point of each fixture [m].
     """
 
     def __init__(
@@ -61,83 +69,92 @@ class CollisionModel:
         objects: Sequence[tuple[str, ObjectClass]],
         occluded: Sequence[OccludedBox] = (),
     ) -> None:
-        """Makes a plant of the arm, named objects, and space that must be taken for full."""
+        """Build the model.
+
+        Args:
+            cell: Work cell with the arm.
+            objects: Name and class of each object.
+            occluded: Occluded volumes, which count as obstacles.
+        """
         builder = DiagramBuilder()
-        made = add_scene_plant(builder, objects, cell.support, 0.0, visuals=False)
-        self.plant, self._bodies = made.plant, made.bodies
-        self._arm: Arm = add_work_cell(
-            made.plant, made.scene_graph, cell, compliant=False, visuals=False
-        )
-        for k, block in enumerate(occluded):
-            X_TB = RigidTransform(RotationMatrix.MakeZRotation(block.yaw), block.center)
-            made.plant.RegisterCollisionGeometry(
-                made.plant.world_body(),
+        scene_plant = add_scene_plant(builder, objects, cell.support, 0.0, visuals=False)
+        self.plant = plant = scene_plant.plant
+        self._bodies = scene_plant.bodies
+        self._scene_graph = scene_graph = scene_plant.scene_graph
+        self._arm: Arm = add_work_cell(plant, scene_graph, cell, compliant=False, visuals=False)
+        for k, box in enumerate(occluded):
+            X_TB = RigidTransform(RotationMatrix.MakeZRotation(box.yaw), box.center)
+            plant.RegisterCollisionGeometry(
+                plant.world_body(),
                 X_TB,
-                Box(*block.size),
+                Box(*box.size),
                 f"unseen_{k}",
                 CoulombFriction(1.0, 1.0),
             )
-        made.plant.Finalize()
+        plant.Finalize()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
-        self._context = made.plant.GetMyMutableContextFromRoot(self._root)
-        self._scene_graph, self._geometry_context = (
-            made.scene_graph,
-            made.scene_graph.GetMyMutableContextFromRoot(self._root),
-        )
-        self._query_port = made.scene_graph.get_query_output_port()
-        self._q = self.plant.GetPositions(self._context)
-        self._q_indices, self._v_indices = joint_state_indices(self.plant, self._arm)
+        self._context = plant.GetMyMutableContextFromRoot(self._root)
+        self._geometry_context = scene_graph.GetMyMutableContextFromRoot(self._root)
+        self._query_port = scene_graph.get_query_output_port()
+        self._q = plant.GetPositions(self._context)
+        self._q_indices, self._v_indices = joint_state_indices(plant, self._arm)
         self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).link_depths)
-        self._fixed = (*self._arm.fixed, get_support_body(self.plant))
+        self._fixed = (*self._arm.fixed, get_support_body(plant))
         self._names = self._name_geometries()
         self._geometry_owners = {
             geometry: (name, geometry in self._geometry_depths)
             for geometry, name in self._names.items()
         }
-        self._filters = made.scene_graph.collision_filter_manager(self._geometry_context)
-        standing = self._geometries(*self._fixed, *self._bodies.values())
-        self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(standing))
+        self._filters = scene_graph.collision_filter_manager(self._geometry_context)
+        obstacles = self._geometries(*self._fixed, *self._bodies.values())
+        self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(obstacles))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
         self.fixture_tops = self._highest_points({fixture.name for fixture in cell.fixtures})
         self._attached: tuple[str, Floats] | None = None
         self._attachment_filters: list[object] = []
 
     def _geometries(self, *bodies: RigidBody) -> GeometrySet:
-        found = GeometrySet()
+        geometries = GeometrySet()
         for body in bodies:
-            found.Add(self.plant.GetCollisionGeometriesForBody(body))
-        return found
+            geometries.Add(self.plant.GetCollisionGeometriesForBody(body))
+        return geometries
 
     def _find_geometry_depths(self, link_depths: Mapping[str, int]) -> dict[GeometryId, int]:
-        """Return how many of the joints, from the base on, move each geometry of arm and tool.
+        """Return the number of joints between the base and each geometry of robot and gripper.
 
-        By geometry, as a link of the arm, one of the tool and an object may have one name.
+        The key is the geometry, because a link, a part of the gripper and an object may share a
+        name.
+
+        Args:
+            link_depths: Number of joints between the base and each link of the robot, by name.
         """
-        found = dict[GeometryId, int]()
+        depths = dict[GeometryId, int]()
         for body in self._arm.bodies:
-            moved_by = (
-                link_depths[body.name()]
-                if body.model_instance() == self._arm.robot
-                else len(self._q_indices)
-            )
-            found |= dict.fromkeys(self.plant.GetCollisionGeometriesForBody(body), moved_by)
-        return found
+            is_link = body.model_instance() == self._arm.robot
+            depth = link_depths[body.name()] if is_link else len(self._q_indices)
+            depths |= dict.fromkeys(self.plant.GetCollisionGeometriesForBody(body), depth)
+        return depths
 
     def _name_geometries(self) -> dict[GeometryId, str]:
+        """Return the name of each geometry's owner.
+
+        The owner is an object, a fixture or a link; geometries of the world and of the support
+        have names of their own.
+        """
         names = dict[GeometryId, str]()
-        owners = {body.index(): name for name, body in self._bodies.items()}
+        object_names = {body.index(): name for name, body in self._bodies.items()}
         fixtures = {body.index(): body for body in self._arm.fixed[1:]}
         inspector = self._scene_graph.model_inspector()
-        shapes = {body.index() for body in self._fixed} - set(fixtures)
+        named_by_geometry = {body.index() for body in self._fixed} - set(fixtures)
         for index in map(BodyIndex, range(self.plant.num_bodies())):
             body = self.plant.get_body(index)
-            name = owners.get(index, body.name())
+            name = object_names.get(index, body.name())
             if index in fixtures:
                 name = fixture_name(self.plant, fixtures[index])
             for geometry in self.plant.GetCollisionGeometriesForBody(body):
-                of_its_own = inspector.GetName(geometry).split("::")[-1]
-                names[geometry] = of_its_own if index in shapes else name
+                geometry_name = inspector.GetName(geometry).split("::")[-1]
+                names[geometry] = geometry_name if index in named_by_geometry else name
         return names
 
     def _highest_points(self, names: Collection[str]) -> tuple[float, ...]:
@@ -152,33 +169,43 @@ class CollisionModel:
         return tuple(tops.values())
 
     def set_object_poses(self, objects: Sequence[SceneObject]) -> None:
-        """Puts objects at their poses; the arm holds nothing any more."""
+        """Detach the attached object and set the poses of objects."""
         self.detach_object()
         for o in objects:
             self.plant.SetFreeBodyPose(self._context, self._bodies[o.name], rigid_transform(o.X_TO))
         self._q = self.plant.GetPositions(self._context)
 
     def set_object_pose(self, name: str, X_TO: Pose) -> None:
-        """Puts one object elsewhere."""
+        """Set the pose of one object."""
         self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
     def attach_object(self, name: str, X_OG: RigidTransform) -> None:
-        """From now on the object moves with the gripper."""
+        """Attach an object to the gripper.
+
+        Distances between the object and obstacles are reported, distances between the object and
+        the gripper are not.
+
+        Args:
+            name: Name of the object.
+            X_OG: Pose of the gripper in the object.
+        """
         self.detach_object()
-        held = self._geometries(self._bodies[name])
+        attached = self._geometries(self._bodies[name])
         others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
-        tool = self._geometries(
+        gripper = self._geometries(
             *(body for body in self._arm.bodies if body.model_instance() == self._arm.tool)
         )
         declaration = (
-            CollisionFilterDeclaration().ExcludeBetween(held, tool).AllowBetween(held, others)
+            CollisionFilterDeclaration()
+            .ExcludeBetween(attached, gripper)
+            .AllowBetween(attached, others)
         )
         self._attachment_filters.append(self._filters.ApplyTransient(declaration))
         self._attached = name, invert_pose(X_OG.GetAsMatrix4())
 
     def detach_object(self) -> None:
-        """Holds nothing any more."""
+        """Detach the attached object, if any; it stays at its last pose."""
         while self._attachment_filters:
             self._filters.RemoveDeclaration(self._attachment_filters.pop())
         self._attached = None
@@ -192,56 +219,75 @@ class CollisionModel:
             self.plant.SetFreeBodyPose(
                 self._context, self._bodies[name], RigidTransform(X_TG @ X_GO)
             )
-        found: list[SignedDistancePair] = self._query_port.Eval(
-            self._geometry_context
-        ).ComputeSignedDistancePairwiseClosestPoints(max_distance)
-        return found
+        query = self._query_port.Eval(self._geometry_context)
+        pairs: list[SignedDistancePair] = query.ComputeSignedDistancePairwiseClosestPoints(
+            max_distance
+        )
+        return pairs
 
     def _to_signed_distance(self, pair: SignedDistancePair) -> SignedDistance:
-        (first, of_arm), (second, _) = (
-            self._geometry_owners[pair.id_A],
-            self._geometry_owners[pair.id_B],
-        )
-        moves = of_arm or (self._attached is not None and first == self._attached[0])
-        return SignedDistance(float(pair.distance), (first, second) if moves else (second, first))
+        first, first_is_arm = self._geometry_owners[pair.id_A]
+        second, _ = self._geometry_owners[pair.id_B]
+        first_moves = first_is_arm or (self._attached is not None and first == self._attached[0])
+        names = (first, second) if first_moves else (second, first)
+        return SignedDistance(float(pair.distance), names)
 
     def distances_below(self, q: Floats, max_distance: float) -> list[SignedDistance]:
-        """At joint positions (n,): all that is closer than `max_distance`, m."""
+        """Return the signed distances below a threshold.
+
+        Args:
+            q: Joint positions of the arm. Shape (n,).
+            max_distance: Threshold [m].
+        """
         return [self._to_signed_distance(pair) for pair in self._pairs_below(q, max_distance)]
 
     def distances_and_gradients(
         self, q: Floats, max_distance: float
     ) -> list[tuple[SignedDistance, Floats]]:
-        """As `close`, each with how the distance changes with the joint positions, (n,) m/rad."""
+        """Return the signed distances below a threshold with their gradients.
+
+        Args:
+            q: Joint positions of the arm. Shape (n,).
+            max_distance: Threshold [m].
+
+        Returns:
+            Pairs of a signed distance and its derivatives by the joint positions [m/rad], shape
+            (n,), in the order of `distances_below`.
+        """
         pairs = self._pairs_below(q, max_distance)
         if not pairs:
             return []
-        query, world = self._query_port.Eval(self._geometry_context), self.plant.world_frame()
+        query = self._query_port.Eval(self._geometry_context)
+        world = self.plant.world_frame()
         J = self.plant.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, self._arm.flange, np.zeros(3), world, world
         )[:, self._v_indices]
         p_TF = self._arm.flange.CalcPoseInWorld(self._context).translation()
-        found = []
+        distances = []
         for pair in pairs:
             gradient = np.zeros(len(self._q_indices))
-            for geometry, p_S, sign in (
+            for geometry, p_GeometryC, sign in (
                 (pair.id_A, pair.p_ACa, 1.0),
                 (pair.id_B, pair.p_BCb, -1.0),
             ):
-                if joints := self._num_moving_joints(geometry):
+                if depth := self._num_moving_joints(geometry):
                     nx, ny, nz = sign * pair.nhat_BA_W
-                    x, y, z = query.GetPoseInWorld(geometry).multiply(p_S) - p_TF
+                    x, y, z = query.GetPoseInWorld(geometry).multiply(p_GeometryC) - p_TF
                     moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
-                    gradient[:joints] += (*moment, nx, ny, nz) @ J[:, :joints]
-            found.append((self._to_signed_distance(pair), gradient))
-        return found
+                    gradient[:depth] += (*moment, nx, ny, nz) @ J[:, :depth]
+            distances.append((self._to_signed_distance(pair), gradient))
+        return distances
 
     def gripper_position(self) -> Floats:
-        """(3,) m, of the cup in T at the joint angles of the last question."""
+        """Return p_TG at the joint positions of the last distance query [m]. Shape (3,)."""
         return np.asarray(self._arm.cup.CalcPoseInWorld(self._context).translation())
 
     def gripper_jacobian(self, q: Floats) -> Floats:
-        """(6, n) at joint positions (n,): how the cup turns (first three rows) and moves, in T."""
+        """Return the spatial Jacobian of G in T, angular rows first. Shape (6, n).
+
+        Args:
+            q: Joint positions of the arm. Shape (n,).
+        """
         self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
         world = self.plant.world_frame()
@@ -251,9 +297,8 @@ class CollisionModel:
         return np.asarray(J[:, self._v_indices])
 
     def _num_moving_joints(self, geometry: GeometryId) -> int:
-        name, of_arm = self._geometry_owners[geometry]
-        if of_arm:
+        name, is_arm = self._geometry_owners[geometry]
+        if is_arm:
             return self._geometry_depths[geometry]
-        return (
-            len(self._q_indices) if self._attached is not None and name == self._attached[0] else 0
-        )
+        is_attached = self._attached is not None and name == self._attached[0]
+        return len(self._q_indices) if is_attached else 0

@@ -1,8 +1,10 @@
-"""What a planner answers: how a move is carried out, or why it cannot be.
+"""Results of the pick-and-place planner: a plan, or the reason why there is none.
 
-Frames: T the tray, G the cup, O the picked object. A move is three paths between rests: `approach` from home to the grasp,
-`carry` from there to where the object is let go, `retreat` back home. Between the last two there may be a guarded descent, for
-who does not know how tall things are.
+Frames: T is the support, G is the gripper, O is the picked object.
+
+A plan has three trajectory segments that start and end at rest: `approach` from the home
+configuration to the grasp, `carry` to the place pose, and `retreat` to the home configuration. A
+guarded descent may follow `carry`. It lowers an object of uncertain height until contact.
 """
 
 import math
@@ -18,11 +20,11 @@ from drake_clutter.planning.collision_model import SignedDistance
 from drake_clutter.scenes.scene import Pose
 
 DESCENT_SPEED = 0.02
-"""m/s, of a guarded descent; half a millimetre between two of the executor's looks for a touch."""
+"""Speed of a guarded descent [m/s]: 0.5 mm between two contact checks of the executor."""
 
 
 class PlanningFailureReason(Enum):
-    """Why there is no plan."""
+    """Reasons why the planner returns no plan."""
 
     NO_FREE_SPOT = "no free spot"
     NO_SEAL = "no seal"
@@ -36,13 +38,15 @@ class PlanningFailureReason(Enum):
 
 @dataclass(frozen=True)
 class PlanningFailure:
-    """No plan, and what stands behind that.
+    """The reason why there is no plan.
 
     Attributes:
-        reason: of the attempt that came furthest.
-        detail: what is in the way, what lies on the object, which pose is out of reach.
-        value: m of unevenness under the best grasp, kg, m of penetration, s; as the reason has it.
-        planning_time: that were spent.
+        reason: Failure of the attempt that came closest to a plan.
+        detail: Names of the colliding geometries, of the objects on top, or of the pose that is
+            out of reach.
+        value: Quantity that the reason refers to: flatness deviation of the surface under the best
+            grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]. NaN if there is none.
+        planning_time: Wall time spent [s].
     """
 
     reason: PlanningFailureReason
@@ -56,13 +60,14 @@ class PlanningFailure:
 
 @dataclass(frozen=True)
 class TrajectorySegment:
-    """A part of a plan that begins and ends at rest.
+    """A part of a plan that starts and ends at rest.
 
     Attributes:
-        name: approach, carry or retreat.
-        trajectory: q (n,) rad over time, s.
-        min_distance: the least along it, densely checked, from what was not allowed to touch; the arm's own parts left out.
-        unoptimized_duration: s, that the sure way takes; the duration, unless the way was optimised.
+        name: `approach`, `carry` or `retreat`.
+        trajectory: Joint positions over time. Shape (n,).
+        min_distance: Smallest signed distance along the trajectory, without self-collision pairs
+            and pairs that are allowed to touch.
+        unoptimized_duration: Duration before trajectory optimization [s].
     """
 
     name: str
@@ -72,23 +77,28 @@ class TrajectorySegment:
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Duration [s]."""
         return float(self.trajectory.end_time())
 
 
 @dataclass(frozen=True)
 class PickPlacePlan:
-    """How a move is carried out.
+    """Trajectories that pick an object and place it at another pose.
 
     Attributes:
-        pick: the object's name; X_TO_pick, X_TO_place: where it is, and where it is let go.
-        X_OG: The grasp.
-        mass: kg, of the object; p_GCm: (3,) m, its centre of mass in the cup's frame.
-        segments: in order.
-        guarded_descent: q (n,) rad over time, s: straight down from the place at `DESCENT_SPEED`, until the
-            object touches something; or None.
-        num_attempts: grasps and branches that were looked at.
-        planning_time: that planning took.
+        pick: Name of the object.
+        X_TO_pick: Pose of the object before the move.
+        X_TO_place: Pose at which the object is released, without guarded descent.
+        X_OG: Grasp: pose of the gripper in the object.
+        mass: Mass of the object [kg].
+        p_GCm: Center of mass of the object in the gripper frame [m]. Shape (3,).
+        segments: `approach`, `carry` and `retreat`.
+        num_attempts: Number of combinations of grasp, inverse kinematics solution and transfer
+            height that were tried.
+        planning_time: Wall time spent [s].
+        guarded_descent: Joint positions over time, shape (n,), that lower the gripper vertically
+            from the place pose at `DESCENT_SPEED`. The executor stops it at contact. None without
+            guarded descent.
     """
 
     pick: str
@@ -104,34 +114,35 @@ class PickPlacePlan:
 
     @property
     def duration(self) -> float:
-        """s, of the motion, but for the descent."""
-        return sum(phase.duration for phase in self.segments)
+        """Duration without dwell times and guarded descent [s]."""
+        return sum(segment.duration for segment in self.segments)
 
     @property
     def max_descent(self) -> float:
-        """m, of the descent."""
-        return (
-            0.0
-            if self.guarded_descent is None
-            else DESCENT_SPEED * float(self.guarded_descent.end_time())
-        )
+        """Distance of the guarded descent if no contact occurs [m]."""
+        if self.guarded_descent is None:
+            return 0.0
+        return DESCENT_SPEED * float(self.guarded_descent.end_time())
 
     @property
     def unoptimized_duration(self) -> float:
-        """s, of the motion along the sure ways."""
-        return sum(phase.unoptimized_duration for phase in self.segments)
+        """Duration before trajectory optimization [s]."""
+        return sum(segment.unoptimized_duration for segment in self.segments)
 
     def __deepcopy__(self, memo: object) -> "PickPlacePlan":
-        """Itself: it never changes, and Drake copies abstract values again and again."""
+        """Return the plan itself: it is immutable, and Drake copies abstract values often."""
         return self
 
 
 def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:
-    """A plan as a document: its phases' ways sampled at 100 Hz (s, rad); or why there is none."""
+    """Return a planning result as a JSON document.
+
+    Returns:
+        The reason of a failure, or the plan with its segments sampled at 100 Hz [s, rad].
+    """
     if isinstance(plan, PlanningFailure):
-        value = (
-            plan.value if math.isfinite(plan.value) else None
-        )  # infinite: the lip is partly in the air
+        # The flatness deviation is infinite where a part of the lip has no surface below.
+        value = plan.value if math.isfinite(plan.value) else None
         return {
             "planned": False,
             "reason": plan.reason.value,
@@ -139,21 +150,6 @@ def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:
             "value": value,
             "planning_time": plan.planning_time,
         }
-    segments = []
-    for segment in plan.segments:
-        times = np.linspace(0.0, segment.duration, math.ceil(100 * segment.duration) + 1)
-        near = math.isfinite(segment.min_distance.distance)
-        segments.append(
-            {
-                "name": segment.name,
-                "duration": segment.duration,
-                "unoptimized_duration": segment.unoptimized_duration,
-                "min_distance": segment.min_distance.distance if near else None,
-                "closest_pair": list(segment.min_distance.pair) if near else [],
-                "time": times.tolist(),
-                "q": segment.trajectory.vector_values(times).T.tolist(),
-            }
-        )
     pose = plan.X_TO_place
     return {
         "planned": True,
@@ -161,7 +157,21 @@ def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:
         "X_OG": plan.X_OG.GetAsMatrix4().tolist(),
         "duration": plan.duration,
         "max_descent": plan.max_descent,
-        "segments": segments,
+        "segments": [_segment_to_dict(segment) for segment in plan.segments],
         "num_attempts": plan.num_attempts,
         "planning_time": plan.planning_time,
+    }
+
+
+def _segment_to_dict(segment: TrajectorySegment) -> dict[str, Any]:
+    times = np.linspace(0.0, segment.duration, math.ceil(100 * segment.duration) + 1)
+    has_pair = math.isfinite(segment.min_distance.distance)
+    return {
+        "name": segment.name,
+        "duration": segment.duration,
+        "unoptimized_duration": segment.unoptimized_duration,
+        "min_distance": segment.min_distance.distance if has_pair else None,
+        "closest_pair": list(segment.min_distance.pair) if has_pair else [],
+        "time": times.tolist(),
+        "q": segment.trajectory.vector_values(times).T.tolist(),
     }

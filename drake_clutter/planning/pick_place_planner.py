@@ -1,6 +1,6 @@
-"""Finds plans of moves: grasp, way and timing.
+"""Pick-and-place planner: grasp selection, collision-free paths and time-optimal trajectories.
 
-Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object.
+Frames: T is the support, G is the gripper, O is the picked object.
 """
 
 import time
@@ -26,16 +26,26 @@ from drake_clutter.simulation.scene_plant import rigid_transform
 
 
 class PickPlacePlanner:
-    """Plans moves of objects among objects; the same question has the same answer.
+    """Deterministic pick-and-place planner for one work cell.
 
     Attributes:
-        cell: What stands around the objects.
-        config: How plans are searched.
-        tool: Kinematics of the gripper.
+        cell: Work cell.
+        config: Parameters of the planner.
+        tool: Kinematics of robot and gripper.
     """
 
     def __init__(self, cell: WorkCell, config: PlannerConfig) -> None:
-        self.cell, self.config = cell, config
+        """Load the robot of a work cell.
+
+        Args:
+            cell: Work cell.
+            config: Parameters of the planner.
+
+        Raises:
+            InputError: The robot's model cannot be used.
+        """
+        self.cell = cell
+        self.config = config
         self.tool = ToolKinematics(cell)
         self._gripper: Gripper = cell.gripper
         self._collision_models: dict[Hashable, CollisionModel] = {}
@@ -44,15 +54,22 @@ class PickPlacePlanner:
     def collision_model(
         self, objects: Sequence[SceneObject], occluded: Sequence[OccludedBox] = ()
     ) -> CollisionModel:
-        """The objects and the arm; the latest of each set of objects is kept."""
-        named = tuple((o.name, o.object_class) for o in objects)
-        key = named, tuple(occluded)
+        """Return the collision model of arm and objects, with the objects at their poses.
+
+        The last model is reused if the objects have the same names and classes.
+
+        Args:
+            objects: Objects in the scene.
+            occluded: Occluded volumes, which count as obstacles.
+        """
+        named_classes = tuple((o.name, o.object_class) for o in objects)
+        key = named_classes, tuple(occluded)
         if key not in self._collision_models:
             self._collision_models.clear()
-            self._collision_models[key] = CollisionModel(self.cell, named, occluded)
-        scene = self._collision_models[key]
-        scene.set_object_poses(objects)
-        return scene
+            self._collision_models[key] = CollisionModel(self.cell, named_classes, occluded)
+        model = self._collision_models[key]
+        model.set_object_poses(objects)
+        return model
 
     def plan(
         self,
@@ -61,23 +78,23 @@ class PickPlacePlanner:
         X_TO_place: Pose,
         occluded: Sequence[OccludedBox] = (),
     ) -> PickPlacePlan | PlanningFailure:
-        """Plans to carry an object to a pose that differs by a shift and a turn about the vertical.
+        """Plan to move an object to a pose that differs by a translation and a yaw.
 
         Args:
-            objects: all that is known to stand around, the picked one included.
-            pick: its name.
-            X_TO_place: where it is let go.
-            occluded: space that must be taken for full, where not all is known.
+            objects: All known objects, including the picked one.
+            pick: Name of the picked object.
+            X_TO_place: Pose at which the object is released.
+            occluded: Occluded volumes, which count as obstacles.
         """
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         picked = next(o for o in objects if o.name == pick)
-        for above in dict.fromkeys(
-            (self.config.descent_start_offset, 0.0)
-        ):  # once if they are the same
-            found = self._plan(objects, picked, X_TO_place.translated((0.0, 0.0, above)), occluded)
-            if isinstance(found, PlanningFailure) or found.max_descent >= above:
+        # Try the offset first, then the place pose itself; only once if the offset is 0.
+        for offset in dict.fromkeys((self.config.descent_start_offset, 0.0)):
+            X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
+            plan = self._plan(objects, picked, X_TO_start, occluded)
+            if isinstance(plan, PlanningFailure) or plan.max_descent >= offset:
                 break
-        return replace(found, planning_time=time.perf_counter() - begun)
+        return replace(plan, planning_time=time.perf_counter() - start_time)
 
     def _plan(
         self,
@@ -86,7 +103,7 @@ class PickPlacePlanner:
         X_TO_place: Pose,
         occluded: Sequence[OccludedBox],
     ) -> PickPlacePlan | PlanningFailure:
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         if carried := objects_resting_on(picked, objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
         grasps = self._grasps(picked)
@@ -94,62 +111,77 @@ class PickPlacePlanner:
             return grasps
         if self.cell.pedestal_overlaps_support:
             return PlanningFailure(PlanningFailureReason.IN_COLLISION, "pedestal and tray")
-        scene = self.collision_model(objects, occluded)
-        if hit := scene.distances_below(self.tool.robot.home, self.config.min_distance):
-            nearest = min(hit, key=lambda here: here.distance)
+        model = self.collision_model(objects, occluded)
+        if pairs := model.distances_below(self.tool.robot.home, self.config.min_distance):
+            nearest = min(pairs, key=lambda pair: pair.distance)
             return PlanningFailure(
                 PlanningFailureReason.IN_COLLISION,
                 f"at home: {' and '.join(nearest.pair)}",
                 nearest.distance,
             )
-        tops = [*scene.fixture_tops, *(block.top_height for block in occluded)]
-        attempt = PickPlaceSearch(self.cell, self.config, scene, objects, picked, X_TO_place, tops)
+        tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
+        search = PickPlaceSearch(self.cell, self.config, model, objects, picked, X_TO_place, tops)
         for grasp in grasps:
-            for q_pick, q_place, yaw in attempt.ik_candidates(grasp):
-                if attempt.num_attempts >= self.config.max_attempts:
-                    return attempt.furthest_failure
-                if time.perf_counter() - begun > self.config.time_limit:
+            for q_pick, q_place, yaw in search.ik_candidates(grasp):
+                if search.num_attempts >= self.config.max_attempts:
+                    return search.furthest_failure
+                if time.perf_counter() - start_time > self.config.time_limit:
                     return PlanningFailure(
                         PlanningFailureReason.TIME_OUT,
-                        str(attempt.furthest_failure),
+                        str(search.furthest_failure),
                         self.config.time_limit,
                     )
-                found = attempt.plan_grasp(grasp, q_pick, q_place, yaw)
-                if found is not None:
-                    return found
-        return attempt.furthest_failure
+                plan = search.plan_grasp(grasp, q_pick, q_place, yaw)
+                if plan is not None:
+                    return plan
+        return search.furthest_failure
 
     def can_grasp(self, scene_object: SceneObject) -> bool:
-        """Whether the gripper takes an object somewhere and can carry it."""
+        """Return whether the gripper has a grasp on an object that holds its weight."""
         return not isinstance(self._grasps(scene_object), PlanningFailure)
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
-        """Whether the cup can hold an object, and none of the others rests on it: without that, no plan is worth asking for."""
+        """Return whether an object can be grasped and no other object rests on it.
+
+        This is a necessary condition for a plan, and much faster than planning.
+
+        Args:
+            scene_object: Object to pick.
+            objects: All known objects.
+        """
         return not objects_resting_on(scene_object, objects) and self.can_grasp(scene_object)
 
     def _find_grasps(self, picked: SceneObject) -> tuple[Grasp, ...] | PlanningFailure:
-        """Where the gripper takes an object and can hold it, the nearest to its middle first."""
-        object_class, config = picked.object_class, self.config
+        """Return the feasible grasps of an object, closest to the center of its top first."""
+        object_class = picked.object_class
+        config = self.config
         if object_class.mass + self._gripper.mass > self.cell.robot.payload:
             return PlanningFailure(PlanningFailureReason.TOO_HEAVY, picked.name, object_class.mass)
         sampling = GraspSampling(
             config.grasp_spacing, config.max_grasps, config.min_payload_acceleration
         )
-        found = self._gripper.sample_grasps(object_class, rigid_transform(picked.X_TO), sampling)
-        if isinstance(found, GraspFailure):
-            return PlanningFailure(
-                PlanningFailureReason(found.reason.value), picked.name, found.value
-            )
-        return found
+        grasps = self._gripper.sample_grasps(object_class, rigid_transform(picked.X_TO), sampling)
+        if isinstance(grasps, GraspFailure):
+            reason = PlanningFailureReason(grasps.reason.value)
+            return PlanningFailure(reason, picked.name, grasps.value)
+        return grasps
 
     def are_endpoints_reachable(
         self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose
     ) -> bool:
-        """Whether any grasp that holds reaches both ends of a move without collision: what no plan can do without."""
+        """Return whether a grasp reaches the pick and the place pose without collision.
+
+        This is a necessary condition for a plan.
+
+        Args:
+            objects: All objects, including the picked one.
+            pick: Name of the picked object.
+            X_TO_place: Pose at which the object is released.
+        """
         picked = next(o for o in objects if o.name == pick)
         grasps = self._grasps(picked)
         if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
             return False
-        scene = self.collision_model(objects)
-        attempts = PickPlaceSearch(self.cell, self.config, scene, objects, picked, X_TO_place)
-        return any(attempts.has_candidate(grasp) for grasp in grasps)
+        model = self.collision_model(objects)
+        search = PickPlaceSearch(self.cell, self.config, model, objects, picked, X_TO_place)
+        return any(search.has_candidate(grasp) for grasp in grasps)

@@ -1,6 +1,6 @@
-"""The search for the ways of one move: grasps, yaws, branches and heights, until one is free.
+"""Search for a pick-and-place plan over grasps, yaw angles, IK solutions and transfer heights.
 
-Frames: T the tray, B the arm's base, F the flange, G the cup, O the picked object.
+Frames: T is the support, G is the gripper, O is the picked object.
 """
 
 import math
@@ -51,26 +51,30 @@ Floats = NDArray[np.float64]
 
 
 MAX_REPORTED_DISTANCE = 0.03
-"""m; what is further away than this counts as free."""
+"""Distances above this are not computed when a path is checked [m]."""
 CONTACT_TOLERANCE = 0.0005
-"""m, by which the held object may come closer to what it touches at an end of its way."""
+"""The attached object may come closer by this to what it touches at its pick and place poses [m]:
+poses of objects at rest have slight penetrations."""
 OPTIMIZATION_MARGIN = 0.005
-"""m, that an optimised way is kept further away than it must be: it is looked at in few points."""
+"""Distance that trajectory optimization keeps in addition to `PlannerConfig.min_distance` [m]. It
+imposes distances at few points; the check afterwards is dense."""
 INFLUENCE_DISTANCE = 0.06
-"""m; what is further away is not looked at when a way is optimised."""
+"""Distances above this are ignored by trajectory optimization [m]."""
 _DESCENT_STEP = 0.005
-"""m, between the points of a guarded descent."""
+"""Distance between checked points of a guarded descent [m]."""
 MAX_CARRY_TILT = math.radians(0.5)
-"""By which the gripper's axis may leave the vertical while it carries something [rad]."""
+"""Largest tilt of the gripper while it carries an object [rad]; the suction cup is planned for
+vertical loads."""
 
 
 @dataclass(frozen=True)
 class EndpointContext:
-    """Where the object is picked up or let go.
+    """Distances that are allowed near the pick or the place pose.
 
     Attributes:
-        p_TG_xy: (2,) m, of the cup there, seen from above.
-        allowed_distances: m, how close the object, while it is held, may be there to what it touches, by name.
+        p_TG_xy: Horizontal position of the gripper at the endpoint [m]. Shape (2,).
+        allowed_distances: Allowed distance at the endpoint between the attached object and each
+            body that it touches there, by name [m].
     """
 
     p_TG_xy: Floats
@@ -82,7 +86,12 @@ def _to_matrix(X_AB: RigidTransform) -> Floats:
 
 
 class PickPlaceSearch:
-    """The search for one move: grasps, yaws, branches and heights, until a way is free."""
+    """Search for a plan of one move.
+
+    Attributes:
+        num_attempts: Number of combinations of grasp, IK solution and transfer height tried so far.
+        furthest_failure: Failure of the attempt that came closest to a plan.
+    """
 
     def __init__(
         self,
@@ -94,37 +103,39 @@ class PickPlaceSearch:
         X_TO_place: Pose,
         obstacle_tops: Sequence[float] = (),
     ) -> None:
-        """Nothing is tried yet; `obstacle_tops` are heights of what else there is [m]."""
-        self._cell, self._config, self._collision_model, self._picked = (
-            cell,
-            config,
-            collision_model,
-            picked,
-        )
-        self._tool, self._X_TO_goal = ToolKinematics(cell), X_TO_place
+        """Prepare the search.
+
+        Args:
+            cell: Work cell.
+            config: Parameters of the planner.
+            collision_model: Collision model with the objects at their poses.
+            objects: All known objects, including the picked one.
+            picked: Object to pick.
+            X_TO_place: Pose at which the object is released.
+            obstacle_tops: Heights of the highest points of fixtures and occluded volumes [m].
+        """
+        self._cell = cell
+        self._config = config
+        self._collision_model = collision_model
+        self._picked = picked
+        self._tool = ToolKinematics(cell)
         self._robot = self._tool.robot
+        self._X_TO_goal = X_TO_place
         self._X_TO = _to_matrix(rigid_transform(picked.X_TO))
         self._X_TO_place = _to_matrix(rigid_transform(X_TO_place))
         self._grasp_contacts = [(link, picked.name) for link in cell.gripper.contact_links]
-        self.num_attempts, self.furthest_failure = (
-            0,
-            PlanningFailure(PlanningFailureReason.UNREACHABLE, "the grasp"),
-        )
+        self.num_attempts = 0
+        self.furthest_failure = PlanningFailure(PlanningFailureReason.UNREACHABLE, "the grasp")
         self._progress = -1
         placed = replace(picked, X_TO=X_TO_place)
         others = [o for o in objects if o is not picked]
+        # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
-        obstacle_tops = sorted(
-            {
-                round(top, 3)
-                for top in (*obstacle_tops, *(o.top_height for o in others))
-                if top > bottom
-            }
-        )
-        rise = self._config.lift_height
-        self._transfer_heights = [bottom + rise] + [
-            top + rise for top in obstacle_tops if top > bottom
-        ]
+        all_tops = (*obstacle_tops, *(o.top_height for o in others))
+        tops = sorted({round(top, 3) for top in all_tops if top > bottom})
+        lift_height = self._config.lift_height
+        self._transfer_heights = [bottom + lift_height]
+        self._transfer_heights += [top + lift_height for top in tops if top > bottom]
 
     def record_failure(
         self,
@@ -133,130 +144,146 @@ class PickPlaceSearch:
         detail: str,
         value: float = math.nan,
     ) -> None:
-        """Remembers why an attempt failed, if it came further than those before."""
+        """Record a failure as the furthest one if no earlier attempt came as far.
+
+        Args:
+            progress: Stage of planning that failed; later stages are larger.
+            reason: Reason of the failure.
+            detail: See `PlanningFailure`.
+            value: See `PlanningFailure`.
+        """
         if progress > self._progress:
-            self._progress, self.furthest_failure = progress, PlanningFailure(reason, detail, value)
+            self._progress = progress
+            self.furthest_failure = PlanningFailure(reason, detail, value)
 
     def ik_candidates(self, grasp: Grasp) -> list[tuple[Floats, Floats, float]]:
-        """q (n,) at the grasp and at the place, and yaw, the quickest way first."""
+        """Return pairs of inverse kinematics solutions at the grasp and at the place pose.
+
+        Returns:
+            Joint positions at the grasp, shape (n,), joint positions at the place pose, shape (n,),
+            and yaw of the gripper [rad]; the candidate with the shortest travel time first.
+        """
+        home = self._robot.home
         yaws = np.arange(self._config.num_yaws) * (2 * math.pi / self._config.num_yaws)
         X_pick = [raise_pose(downward_pose(yaw, grasp.p_TG), self._config.lip_gap) for yaw in yaws]
         X_place = [self._gripper_pose_at_place(X) for X in X_pick]
-        q_pick, q_place = (
-            self._tool.solve_ik(np.array(X_pick)),
-            self._tool.solve_ik(np.array(X_place)),
-        )
+        q_pick = self._tool.solve_ik(np.array(X_pick))
+        q_place = self._tool.solve_ik(np.array(X_place))
         q_place = self._robot.ik.match(q_pick, q_place)
-        reached = np.isfinite(q_pick[..., 0])
-        if (reached & ~np.isfinite(q_place[..., 0])).any():
+        is_pick_reachable = np.isfinite(q_pick[..., 0])
+        if (is_pick_reachable & ~np.isfinite(q_place[..., 0])).any():
             self.record_failure(0, PlanningFailureReason.UNREACHABLE, "the place")
-        at_pick = self._robot.unwrap(q_pick, self._robot.home)
-        at_place = self._robot.unwrap(q_place, at_pick)
-        home = self._robot.home
-        turns = np.array([at_pick - home, at_place - at_pick, at_place - home])
+        q_pick = self._robot.unwrap(q_pick, home)
+        q_place = self._robot.unwrap(q_place, q_pick)
+        displacements = np.array([q_pick - home, q_place - q_pick, q_place - home])
         with np.errstate(invalid="ignore"):
-            length = min_travel_time(turns, self._robot).sum(axis=0)
-        order = np.argsort(length, axis=None, kind="stable")  # what is not finite comes last
-        solutions = self._robot.ik.num_solutions
-        chosen = [divmod(int(k), solutions) for k in order[: np.isfinite(length).sum()]]
-        return [(at_pick[k], at_place[k], float(yaws[k[0]])) for k in chosen]
+            travel_time = min_travel_time(displacements, self._robot).sum(axis=0)
+        order = np.argsort(travel_time, axis=None, kind="stable")  # unreachable (NaN) last
+        num_candidates = np.isfinite(travel_time).sum()
+        num_solutions = self._robot.ik.num_solutions
+        indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
+        return [(q_pick[k], q_place[k], float(yaws[k[0]])) for k in indices]
 
     def _gripper_pose_at_place(self, X_TG: Floats) -> Floats:
+        """Return X_TG at the place pose for X_TG at the grasp. Shapes (4, 4)."""
         return np.asarray(self._X_TO_place @ invert_pose(self._X_TO) @ X_TG)
 
     def _min_distance_along(
         self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
     ) -> SignedDistance | None:
-        """The least clearance along a way; None, and the reason is remembered, if it is less than it must be.
+        """Return the smallest distance along a path to obstacles that it may not touch.
 
         Args:
-            path: (m, n) rad.
-            endpoint: to which the way is near.
-            progress: see `fail`.
-            stage: the way is.
+            path: Configurations. Shape (m, n).
+            endpoint: Endpoint near which smaller distances are allowed.
+            progress: Stage of planning, see `record_failure`.
+            stage: Name of the stage for the failure.
+
+        Returns:
+            The distance, infinite if nothing is near, or None after recording a failure if a
+            distance is too small.
         """
-        found, least = SignedDistance(math.inf), self._config.min_distance
+        closest = SignedDistance(math.inf)
+        min_distance = self._config.min_distance
         for q in path:
-            for here in self._collision_model.distances_below(q, MAX_REPORTED_DISTANCE):
-                allowed = self._required_distance(here, endpoint, least)
-                if here.distance < allowed:
+            for distance in self._collision_model.distances_below(q, MAX_REPORTED_DISTANCE):
+                required = self._required_distance(distance, endpoint, min_distance)
+                if distance.distance < required:
                     self.record_failure(
                         progress,
                         PlanningFailureReason.IN_COLLISION,
-                        f"{stage}: {' and '.join(here.pair)}",
-                        here.distance,
+                        f"{stage}: {' and '.join(distance.pair)}",
+                        distance.distance,
                     )
                     return None
                 if (
-                    allowed == least
-                    and here.distance < found.distance
-                    and here.pair[1] not in self._collision_model.arm_names
+                    required == min_distance
+                    and distance.distance < closest.distance
+                    and distance.pair[1] not in self._collision_model.arm_names
                 ):
-                    found = here
-        return found
+                    closest = distance
+        return closest
 
     def _required_distance(
-        self, pair_distance: SignedDistance, endpoint: EndpointContext, min_distance: float
+        self, distance: SignedDistance, endpoint: EndpointContext, min_distance: float
     ) -> float:
-        """m, that two parts must be apart, at the joint angles that the scene was last asked about.
+        """Return the required distance of a pair at the configuration of the last query [m].
 
-        The cup may come close to its object, and the held object to what it touches at the end of its way; but as much further
-        away as they are aside of that end, at least.
+        The gripper may touch the picked object, and the attached object may touch its neighbors at
+        the endpoint. The required distance grows with the horizontal distance from the endpoint.
+
+        Args:
+            distance: Distance of the pair.
+            endpoint: Endpoint near which smaller distances are allowed.
+            min_distance: Required distance of all other pairs [m].
         """
-        if pair_distance.pair in self._grasp_contacts:
-            close = self._config.lip_gap / 2
-        elif (
-            pair_distance.pair[0] == self._picked.name
-            and pair_distance.pair[1] in endpoint.allowed_distances
-        ):
-            close = endpoint.allowed_distances[pair_distance.pair[1]]
+        first, second = distance.pair
+        if distance.pair in self._grasp_contacts:
+            allowed = self._config.lip_gap / 2
+        elif first == self._picked.name and second in endpoint.allowed_distances:
+            allowed = endpoint.allowed_distances[second]
         else:
             return min_distance
-        return min(
-            min_distance,
-            close
-            + float(
-                np.linalg.norm(self._collision_model.gripper_position()[:2] - endpoint.p_TG_xy)
-            ),
-        )
+        offset = self._collision_model.gripper_position()[:2] - endpoint.p_TG_xy
+        return min(min_distance, allowed + float(np.linalg.norm(offset)))
 
     def _grasp_poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, RigidTransform]:
-        """X_TG at the grasp and at the place, (4, 4) each, and X_OG."""
+        """Return X_TG at the grasp and at the place pose, shapes (4, 4), and X_OG."""
         X_pick = raise_pose(downward_pose(yaw, grasp.p_TG), self._config.lip_gap)
-        return (
-            X_pick,
-            self._gripper_pose_at_place(X_pick),
-            RigidTransform(invert_pose(self._X_TO) @ X_pick),
-        )
+        X_place = self._gripper_pose_at_place(X_pick)
+        return X_pick, X_place, RigidTransform(invert_pose(self._X_TO) @ X_pick)
 
     def _pick_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
-        """The start of the object's way; None if the arm is in collision there."""
+        """Return the endpoint at the pick pose, or None if the arm is in collision there."""
         self._set_up_segment("approach", X_OG)
-        at = (self._X_TO @ _to_matrix(X_OG))[:2, 3]
-        if self._min_distance_along(q[None], EndpointContext(at, {}), 1, "at the grasp") is None:
+        p_TG_xy = (self._X_TO @ _to_matrix(X_OG))[:2, 3]
+        context = EndpointContext(p_TG_xy, {})
+        if self._min_distance_along(q[None], context, 1, "at the grasp") is None:
             return None
         self._set_up_segment("carry", X_OG)
-        return EndpointContext(at, self._contact_distances(q))
+        return EndpointContext(p_TG_xy, self._contact_distances(q))
 
     def _place_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
-        """The end of the object's way; None if the arm or the object is in collision there."""
+        """Return the endpoint at the place pose, or None if arm or object are in collision."""
         self._set_up_segment("carry", X_OG)
-        end = EndpointContext(
-            (self._X_TO_place @ _to_matrix(X_OG))[:2, 3], self._contact_distances(q)
-        )
-        return None if self._min_distance_along(q[None], end, 2, "at the place") is None else end
+        p_TG_xy = (self._X_TO_place @ _to_matrix(X_OG))[:2, 3]
+        context = EndpointContext(p_TG_xy, self._contact_distances(q))
+        distance = self._min_distance_along(q[None], context, 2, "at the place")
+        return None if distance is None else context
 
     def _contact_distances(self, q: Floats) -> dict[str, float]:
+        """Return the allowed distances of the attached object to its neighbors, by name [m]."""
         name = self._picked.name
-        near = self._collision_model.distances_below(q, self._config.min_distance)
-        close = [here for here in near if here.pair[0] == name]
+        distances = self._collision_model.distances_below(q, self._config.min_distance)
+        of_object = [distance for distance in distances if distance.pair[0] == name]
+        # A neighbor may have several geometries: the smallest distance is the last and is kept.
         return {
-            here.pair[1]: here.distance - CONTACT_TOLERANCE
-            for here in sorted(close, key=lambda here: -here.distance)
+            distance.pair[1]: distance.distance - CONTACT_TOLERANCE
+            for distance in sorted(of_object, key=lambda distance: -distance.distance)
         }
 
     def has_candidate(self, grasp: Grasp) -> bool:
-        """Whether some yaw and branch reach both ends without collision."""
+        """Return whether a grasp reaches both endpoints without collision."""
         for q_pick, q_place, yaw in self.ik_candidates(grasp):
             X_OG = self._grasp_poses(grasp, yaw)[2]
             if self._pick_endpoint(X_OG, q_pick) and self._place_endpoint(X_OG, q_place):
@@ -266,31 +293,42 @@ class PickPlaceSearch:
     def plan_grasp(
         self, grasp: Grasp, q_pick: Floats, q_place: Floats, yaw: float
     ) -> PickPlacePlan | None:
-        """A plan with this grasp, yaw and branch, at the least height that is free; None if there is none."""
+        """Return a plan with one candidate of `ik_candidates`, at the lowest feasible height.
+
+        Args:
+            grasp: Grasp of the object.
+            q_pick: Joint positions at the grasp. Shape (n,).
+            q_place: Joint positions at the place pose. Shape (n,).
+            yaw: Yaw of the gripper [rad].
+
+        Returns:
+            The plan, or None after recording a failure.
+        """
         self.num_attempts += 1
         X_pick, X_place, X_OG = self._grasp_poses(grasp, yaw)
-        pick, place = self._pick_endpoint(X_OG, q_pick), None
+        pick = self._pick_endpoint(X_OG, q_pick)
         if pick is None:
             return None
-        chosen = self._robot.vertical_tool_rows is not None  # else the way decides how it arrives
-        if chosen and (place := self._place_endpoint(X_OG, q_place)) is None:
+        # Without linear rows the configuration at the place pose results from the path.
+        place = None
+        ends_at_q_place = self._robot.vertical_tool_rows is not None
+        if ends_at_q_place and (place := self._place_endpoint(X_OG, q_place)) is None:
             return None
-        hangs = X_pick[2, 3] - self._picked.bounds_T[0][2]
+        gripper_height = X_pick[2, 3] - self._picked.bounds_T[0][2]
         for bottom in self._transfer_heights:
             self.num_attempts += 1
-            way = self._tool.carry_path(X_pick, X_place, bottom + hangs, q_pick, q_place)
-            if isinstance(way, str):
-                self.record_failure(3, PlanningFailureReason.UNREACHABLE, way, bottom + hangs)
+            height = bottom + gripper_height
+            carry_path = self._tool.carry_path(X_pick, X_place, height, q_pick, q_place)
+            if isinstance(carry_path, str):
+                self.record_failure(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
                 return None
-            if (
-                not chosen
-                and (place := self._place_endpoint(X_OG, way.reversed_lowering[0])) is None
-            ):
+            q_end = carry_path.reversed_lowering[0]
+            if not ends_at_q_place and (place := self._place_endpoint(X_OG, q_end)) is None:
                 continue
             assert place is not None
-            phases = self._plan_segments(grasp, X_OG, way, (pick, place))
-            if phases is not None:
-                return self._make_plan(X_OG, phases, way.reversed_lowering[0])
+            segments = self._plan_segments(grasp, X_OG, carry_path, (pick, place))
+            if segments is not None:
+                return self._make_plan(X_OG, segments, q_end)
         return None
 
     def _make_plan(
@@ -298,37 +336,44 @@ class PickPlaceSearch:
     ) -> PickPlacePlan:
         x, y, z = (float(v) for v in invert_pose(X_OG.GetAsMatrix4())[:3, 3])
         return PickPlacePlan(
-            self._picked.name,
-            self._picked.X_TO,
-            self._X_TO_goal,
-            X_OG,
-            self._picked.object_class.mass,
-            (x, y, z),
-            segments,
-            self.num_attempts,
-            0.0,
-            self._guarded_descent(X_OG, q_place),
+            pick=self._picked.name,
+            X_TO_pick=self._picked.X_TO,
+            X_TO_place=self._X_TO_goal,
+            X_OG=X_OG,
+            mass=self._picked.object_class.mass,
+            p_GCm=(x, y, z),
+            segments=segments,
+            num_attempts=self.num_attempts,
+            planning_time=0.0,
+            guarded_descent=self._guarded_descent(X_OG, q_place),
         )
 
     def _guarded_descent(self, X_OG: RigidTransform, q_place: Floats) -> Trajectory | None:
-        """Straight down from the place as far as it is asked for, and the arm is free; what it holds may touch anything."""
-        X_place, way = self._X_TO_place @ _to_matrix(X_OG), [q_place]
+        """Return the vertical descent from the place pose, as far as the arm is collision-free.
+
+        The attached object is ignored: it is expected to touch something.
+        """
+        X_place = self._X_TO_place @ _to_matrix(X_OG)
+        path = [q_place]
         heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
         self._set_up_segment("retreat", X_OG)
         self._collision_model.set_object_pose(
             self._picked.name, self._X_TO_goal.translated((0.0, 0.0, -10.0))
         )
-        for before, height in pairwise(heights):
-            X = np.array([raise_pose(X_place, -before), raise_pose(X_place, -height)])
-            step = self._tool.track(X, way[-1])
-            end = EndpointContext(X_place[:2, 3], {})
-            if step is None or self._min_distance_along(step[1:], end, 0, "the descent") is None:
+        for previous, height in pairwise(heights):
+            X_TG = np.array([raise_pose(X_place, -previous), raise_pose(X_place, -height)])
+            step = self._tool.track(X_TG, path[-1])
+            context = EndpointContext(X_place[:2, 3], {})
+            if (
+                step is None
+                or self._min_distance_along(step[1:], context, 0, "the descent") is None
+            ):
                 break
-            way.append(step[1])
-        if len(way) == 1:
+            path.append(step[1])
+        if len(path) == 1:
             return None
         return PiecewisePolynomial.FirstOrderHold(
-            heights[: len(way)] / DESCENT_SPEED, np.array(way).T
+            heights[: len(path)] / DESCENT_SPEED, np.array(path).T
         )
 
     def _plan_segments(
@@ -338,29 +383,34 @@ class PickPlaceSearch:
         carry_path: CarryPath,
         endpoints: tuple[EndpointContext, EndpointContext],
     ) -> tuple[TrajectorySegment, ...] | None:
-        empty, up, down = Payload(), carry_path.lift, carry_path.reversed_lowering
-        to_grasp, to_home = (self._tool.paths_home(column[-1]) for column in (up, down))
-        ways = {
+        """Return approach, carry and retreat, or None after recording a failure."""
+        empty = Payload()
+        lift = carry_path.lift
+        lowering = carry_path.reversed_lowering
+        paths_from_lift = self._tool.paths_home(lift[-1])
+        paths_from_lowering = self._tool.paths_home(lowering[-1])
+        # Candidate waypoints and payload of each segment, in the order of planning.
+        candidates = {
             "carry": ([carry_path.waypoints], grasp.payload),
-            "approach": ([np.vstack([up, home[1:]])[::-1] for home in to_grasp], empty),
-            "retreat": ([np.vstack([down, home[1:]]) for home in to_home], empty),
+            "approach": ([np.vstack([lift, home[1:]])[::-1] for home in paths_from_lift], empty),
+            "retreat": ([np.vstack([lowering, home[1:]]) for home in paths_from_lowering], empty),
         }
-        found = {}
-        for progress, (name, (choices, payload)) in enumerate(ways.items(), start=4):
-            made = (
-                self._plan_segment(name, choice, payload, X_OG, endpoints, progress)
-                for choice in choices
+        segments = {}
+        for progress, (name, (paths, payload)) in enumerate(candidates.items(), start=4):
+            attempts = (
+                self._plan_segment(name, waypoints, payload, X_OG, endpoints, progress)
+                for waypoints in paths
             )
-            phase = next((phase for phase in made if phase), None)
-            if phase is None:
+            segment = next((attempt for attempt in attempts if attempt), None)
+            if segment is None:
                 return None
-            found[name] = phase
+            segments[name] = segment
         if self._config.optimize:
-            found = {
-                name: self._optimize_segment(found[name], payload, X_OG, endpoints)
-                for name, (_, payload) in ways.items()
+            segments = {
+                name: self._optimize_segment(segments[name], payload, X_OG, endpoints)
+                for name, (_, payload) in candidates.items()
             }
-        return found["approach"], found["carry"], found["retreat"]
+        return segments["approach"], segments["carry"], segments["retreat"]
 
     def _plan_segment(
         self,
@@ -371,24 +421,23 @@ class PickPlaceSearch:
         endpoints: tuple[EndpointContext, EndpointContext],
         progress: int,
     ) -> TrajectorySegment | None:
-        """A phase along a way; None if that is not free, or too much for the arm."""
+        """Return the segment along waypoints, or None after recording a failure."""
         path = bspline_path(waypoints)
-        clearance = self._check_segment(name, path, X_OG, endpoints, progress)
-        if clearance is None:
+        min_distance = self._check_segment(name, path, X_OG, endpoints, progress)
+        if min_distance is None:
             return None
         trajectory = parameterize_time_optimal(path, self._cell, payload)
         if trajectory is None:
             self.record_failure(progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, name)
             return None
-        return TrajectorySegment(name, trajectory, clearance, trajectory.end_time())
+        return TrajectorySegment(name, trajectory, min_distance, trajectory.end_time())
 
     def _set_up_segment(self, segment_name: str, X_OG: RigidTransform) -> None:
-        """The scene as it is during a phase."""
+        """Set the pose of the picked object in the collision model for a segment."""
         name = self._picked.name
+        X_TO = self._X_TO_goal if segment_name == "retreat" else self._picked.X_TO
         self._collision_model.detach_object()
-        self._collision_model.set_object_pose(
-            name, self._X_TO_goal if segment_name == "retreat" else self._picked.X_TO
-        )
+        self._collision_model.set_object_pose(name, X_TO)
         if segment_name == "carry":
             self._collision_model.attach_object(name, X_OG)
 
@@ -401,28 +450,49 @@ class PickPlaceSearch:
         progress: int,
         spacing: float = MAX_JOINT_STEP / 2,
     ) -> SignedDistance | None:
-        """The least clearance along a path, looked at every so many radians; None if it is too little."""
+        """Return the smallest distance along a path, or None after recording a failure.
+
+        Args:
+            segment_name: `approach`, `carry` or `retreat`.
+            path: Path or trajectory in joint space.
+            X_OG: Grasp.
+            endpoints: Pick and place endpoint.
+            progress: Stage of planning, see `record_failure`.
+            spacing: Distance between checked configurations [rad].
+        """
         self._set_up_segment(segment_name, X_OG)
         points = sample_path(path, spacing)
         if segment_name == "carry" and self._exceeds_tilt(points, progress):
             return None
         if segment_name != "carry":
-            return self._min_distance_along(
-                points,
-                EndpointContext(endpoints[int(segment_name == "retreat")].p_TG_xy, {}),
-                progress,
-                segment_name,
-            )
-        half = len(points) // 2  # what it touched at the start it has left by then
-        found = [self._min_distance_along(points[:half], endpoints[0], progress, segment_name)]
-        if found[0] is not None:
-            found.append(
-                self._min_distance_along(points[half:], endpoints[1], progress, segment_name)
-            )
-        return None if None in found else min((c for c in found if c), key=lambda c: c.distance)
+            context = self._arm_context(segment_name, endpoints)
+            return self._min_distance_along(points, context, progress, segment_name)
+        half = len(points) // 2
+        from_pick = self._min_distance_along(points[:half], endpoints[0], progress, segment_name)
+        if from_pick is None:
+            return None
+        to_place = self._min_distance_along(points[half:], endpoints[1], progress, segment_name)
+        if to_place is None:
+            return None
+        return min((from_pick, to_place), key=lambda distance: distance.distance)
+
+    @staticmethod
+    def _arm_context(
+        segment_name: str, endpoints: tuple[EndpointContext, EndpointContext]
+    ) -> EndpointContext:
+        """Return the endpoint of a segment on which no object is attached."""
+        endpoint = endpoints[1] if segment_name == "retreat" else endpoints[0]
+        return EndpointContext(endpoint.p_TG_xy, {})
 
     def _exceeds_tilt(self, path: Floats, progress: int) -> bool:
-        """Whether the gripper leaves the vertical at points (m, n); never with linear rows."""
+        """Return whether the gripper tilts more than `MAX_CARRY_TILT`, and record the failure.
+
+        Paths of robots with `vertical_tool_rows` do not tilt the gripper.
+
+        Args:
+            path: Configurations. Shape (m, n).
+            progress: Stage of planning, see `record_failure`.
+        """
         if self._robot.vertical_tool_rows is not None:
             return False
         tilt = float(np.linalg.norm(self._tool.axis(path)[:, :2], axis=1).max())
@@ -439,43 +509,43 @@ class PickPlaceSearch:
         X_OG: RigidTransform,
         endpoints: tuple[EndpointContext, EndpointContext],
     ) -> TrajectorySegment:
-        """The phase along a quicker way; as it is if none is found."""
+        """Return a faster trajectory of a segment, or the segment itself if none is found."""
         self._set_up_segment(segment.name, X_OG)
-        least, carried = self._config.min_distance + OPTIMIZATION_MARGIN, segment.name == "carry"
-        away = EndpointContext(endpoints[int(segment.name == "retreat")].p_TG_xy, {})
+        min_distance = self._config.min_distance + OPTIMIZATION_MARGIN
+        is_carry = segment.name == "carry"
+        arm_context = self._arm_context(segment.name, endpoints)
 
-        def nearby_distances(q: Floats, along: float) -> list[LinearizedDistance]:
-            found = []
-            for here, gradient in self._collision_model.distances_and_gradients(
+        def nearby_distances(q: Floats, s: float) -> list[LinearizedDistance]:
+            context = endpoints[int(s >= 0.5)] if is_carry else arm_context
+            linearized = []
+            for distance, gradient in self._collision_model.distances_and_gradients(
                 q, INFLUENCE_DISTANCE
             ):
-                needed = self._required_distance(
-                    here, endpoints[int(along >= 0.5)] if carried else away, least
-                )
-                if (
-                    np.abs(gradient).max() > 1e-6
-                ):  # some of the wrist's parts are always as far apart
-                    found.append(LinearizedDistance(gradient, here.distance - needed))
-            return found
+                required = self._required_distance(distance, context, min_distance)
+                # Distances between neighboring wrist links are constant.
+                if np.abs(gradient).max() > 1e-6:
+                    linearized.append(LinearizedDistance(gradient, distance.distance - required))
+            return linearized
 
-        upright = segment.name != "approach", segment.name != "retreat"  # at home it may go any way
-        acceleration, jacobian = (
-            payload.max_axis_acceleration,
-            self._collision_model.gripper_jacobian,
+        problem = TrajectoryOptimizationProblem(
+            initial_trajectory=segment.trajectory,
+            robot=self._robot,
+            vertical_start=segment.name != "approach",
+            vertical_end=segment.name != "retreat",
+            keep_tool_vertical=is_carry,
+            max_tool_acceleration=payload.max_axis_acceleration,
+            nearby_distances=nearby_distances,
+            tool_jacobian=self._collision_model.gripper_jacobian,
+            tool_axis=self._tool.axis,
         )
-        ends_of = segment.trajectory, self._robot, upright, carried
-        quick = optimize_trajectory(
-            TrajectoryOptimizationProblem(
-                *ends_of, acceleration, nearby_distances, jacobian, self._tool.axis
-            )
-        )
-        trajectory = scale_to_limits(quick, self._cell, payload) if quick else None
+        optimized = optimize_trajectory(problem)
+        trajectory = scale_to_limits(optimized, self._cell, payload) if optimized else None
         if trajectory is None or trajectory.end_time() >= segment.unoptimized_duration:
             return segment
-        # It goes round edges as near as it may: looked at more closely than a way that rises over everything.
-        clearance = self._check_segment(
+        # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
+        closest = self._check_segment(
             segment.name, trajectory, X_OG, endpoints, 0, MAX_JOINT_STEP / 4
         )
-        if clearance is None:
+        if closest is None:
             return segment
-        return TrajectorySegment(segment.name, trajectory, clearance, segment.unoptimized_duration)
+        return TrajectorySegment(segment.name, trajectory, closest, segment.unoptimized_duration)

@@ -1,4 +1,4 @@
-"""How plans are searched."""
+"""Parameters of the pick-and-place planner."""
 
 from typing import Annotated
 
@@ -18,21 +18,28 @@ from drake_clutter.validation import Flag, InRange, NonNegative, config_class, r
     optimise="optimize",
 )
 class PlannerConfig:
-    """How plans are searched.
+    """Parameters of the pick-and-place planner.
 
     Attributes:
-        min_distance: Kept from everything, but for what the held object is closer to at an end of its way [m].
-        lift_height: By which the held object is lifted over what it must pass [m].
-        lip_gap: Between lip and face when the vacuum is switched on [m].
-        grasp_spacing: Between the points of a face that are tried [m].
-        max_grasps: Points of a face that are tried at most.
-        num_yaws: Of the cup, that are tried.
-        max_attempts: Of grasp, yaw, branch and height, at most.
-        min_payload_acceleration: That a grasp must bear [m/s^2].
-        time_limit: So long that it decides nothing: the same question has the same answer on any machine [s].
-        max_guarded_descent: By which an object is lowered at most, until it touches something [m]; 0: not at all.
-        descent_start_offset: Over its place, where this descent begins [m]; 0 if there is no room to go down.
-        optimize: Whether a plan is made quicker by trajectory optimization, see `planning/trajectory_optimization.py`.
+        min_distance: Smallest allowed distance between collision geometries [m]. The attached
+            object may be closer to what it touches at its pick and place poses.
+        lift_height: Height of the attached object above the obstacles that it passes over [m].
+        lip_gap: Gap between the lip of the suction cup and the object when the vacuum is switched
+            on [m].
+        grasp_spacing: Spacing of the sampled grasp points on the top of the object [m].
+        max_grasps: Largest number of grasp points.
+        num_yaws: Number of yaw angles of the gripper for each grasp point.
+        max_attempts: Largest number of combinations of grasp, yaw, inverse kinematics solution and
+            transfer height.
+        min_payload_acceleration: A grasp must hold the object at this acceleration in any
+            direction [m/s^2].
+        time_limit: Time after which planning fails [s]. The default is never reached in practice,
+            so that results do not depend on the speed of the machine.
+        max_guarded_descent: Largest distance by which the object is lowered below its place pose
+            until contact is detected [m]. 0 disables the guarded descent.
+        descent_start_offset: Height above the place pose at which the guarded descent starts [m].
+            If the arm cannot descend by this much, the object is released at the place pose.
+        optimize: Whether trajectory optimization shortens the duration of a plan.
     """
 
     min_distance: NonNegative = 0.005

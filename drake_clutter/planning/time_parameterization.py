@@ -1,4 +1,7 @@
-"""From joint angles along a way to a trajectory that respects the arm's limits."""
+"""Time parameterization: from waypoints in joint space to trajectories within the limits.
+
+Frames: B is the robot's base, F is the flange, G is the gripper, Cm is the load's center of mass.
+"""
 
 import math
 from functools import lru_cache
@@ -26,14 +29,18 @@ from drake_clutter.robots.robot_plant import add_robot
 Floats = NDArray[np.float64]
 
 LIMIT_FRACTION = 0.97
-"""Share of the limits that is used: between the points at which they are imposed a trajectory may exceed them a little."""
+"""Fraction of the joint limits that is used. Limits are imposed at grid points; a trajectory may
+exceed them slightly in between."""
 MAX_JOINT_STEP = 0.08
-"""rad, that a joint turns at most from one point of a way to the next."""
-_SPLINE_ORDER = 4
+"""Largest change of a joint between neighboring waypoints of a path [rad]; it also bounds the
+rotation of the gripper between neighboring poses."""
 SMOOTHING_TIME = 0.1
-"""s, see `softened`."""
+"""Width of the moving average of `smooth_time_scaling` [s]: the period at which 0.5 kg oscillates
+on the bellows of the default suction cup (2000 N/m)."""
+_SPLINE_ORDER = 4
+"""Order of the B-splines: cubic, so that accelerations are continuous."""
 _NUM_GRID_POINTS = 300
-"""Points of a path at which the limits are imposed."""
+"""Points of a path at which limits are imposed."""
 
 
 @lru_cache(maxsize=64)
@@ -55,40 +62,60 @@ def _cached_dynamics_plant(
 
 
 def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
-    """Return the arm with a rigid gripper and the load, without surroundings."""
+    """Return a plant of arm, rigid gripper and load, without the other parts of the cell."""
     return _cached_dynamics_plant(cell, payload.mass, payload.p_GCm)
 
 
 def min_travel_time(displacements: Floats, robot: RobotModel) -> Floats:
-    """Return in which time (...) [s] joints turn so far, from rest to rest.
+    """Return the minimum time of joint displacements from rest to rest [s].
+
+    Only limits of velocity and acceleration count (trapezoidal velocity profile); the slowest
+    joint determines the time.
 
     Args:
-        displacements: Shape (..., n).
-        robot: Its limits of velocity and acceleration alone.
+        displacements: Changes of the joint positions. Shape (..., n).
+        robot: Robot with the limits.
+
+    Returns:
+        Times [s]. Shape (...).
     """
-    far, speed, acceleration = (
-        np.abs(displacements),
-        robot.velocity_limits,
-        robot.acceleration_limits,
-    )
-    reaches_no_cruise = far < speed**2 / acceleration
-    triangle, trapezoid = 2 * np.sqrt(far / acceleration), far / speed + speed / acceleration
-    return np.asarray(np.where(reaches_no_cruise, triangle, trapezoid).max(axis=-1))
+    distance = np.abs(displacements)
+    speed = robot.velocity_limits
+    acceleration = robot.acceleration_limits
+    is_triangular = distance < speed**2 / acceleration
+    triangular = 2 * np.sqrt(distance / acceleration)
+    trapezoidal = distance / speed + speed / acceleration
+    return np.asarray(np.where(is_triangular, triangular, trapezoidal).max(axis=-1))
 
 
 def linear_joint_path(start: Floats, end: Floats) -> Floats:
-    """(m, n) rad, from one configuration to another, `SPACING` apart at most."""
-    steps = max(2, math.ceil(np.abs(end - start).max() / MAX_JOINT_STEP) + 1)
-    return np.linspace(start, end, steps)
+    """Return a straight line in joint space with steps of at most `MAX_JOINT_STEP`.
+
+    Args:
+        start: First configuration. Shape (n,).
+        end: Last configuration. Shape (n,).
+
+    Returns:
+        Waypoints. Shape (m, n).
+    """
+    count = max(2, math.ceil(np.abs(end - start).max() / MAX_JOINT_STEP) + 1)
+    return np.linspace(start, end, count)
 
 
 def bspline_path(waypoints: Floats) -> BsplineTrajectory:
-    """A twice differentiable path of which the points (m, n) of a way are the control points: it cuts the corners."""
-    distinct = np.concatenate([[True], np.abs(np.diff(waypoints, axis=0)).max(axis=1) > 1e-9])
-    points = waypoints[distinct]
+    """Return a cubic B-spline that has the waypoints as control points.
+
+    The path starts at the first and ends at the last waypoint, and blends the corners.
+
+    Args:
+        waypoints: Configurations. Shape (m, n).
+    """
+    is_distinct = np.concatenate([[True], np.abs(np.diff(waypoints, axis=0)).max(axis=1) > 1e-9])
+    points = waypoints[is_distinct]
     while len(points) < _SPLINE_ORDER - 2:
         points = np.insert(points, 1, (points[0] + points[1]) / 2, axis=0)
-    # A third of the first and last step away, else the path parameter would run three times as fast at the ends.
+    # Control points at a third of the first and last step. Without them the derivative by the path
+    # parameter would be three times as large at the ends as elsewhere.
     points = np.insert(
         points,
         [1, len(points) - 1],
@@ -100,7 +127,15 @@ def bspline_path(waypoints: Floats) -> BsplineTrajectory:
 
 
 def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats:
-    """(m, n) rad along a trajectory, about `spacing` apart."""
+    """Return configurations at uniform parameters, whose mean distance is about `spacing`.
+
+    Args:
+        path: Path or trajectory in joint space.
+        spacing: Mean distance, as the largest change of a joint [rad].
+
+    Returns:
+        Configurations. Shape (m, n).
+    """
     coarse = path.vector_values(np.linspace(path.start_time(), path.end_time(), 60)).T
     count = max(20, math.ceil(np.abs(np.diff(coarse, axis=0)).max(axis=1).sum() / spacing))
     return np.asarray(path.vector_values(np.linspace(path.start_time(), path.end_time(), count)).T)
@@ -109,122 +144,179 @@ def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats
 def parameterize_time_optimal(
     path: Trajectory, cell: WorkCell, payload: Payload
 ) -> Trajectory | None:
-    """The path as fast as velocity, acceleration, torque and the cup's hold allow; None if they do not."""
-    plant, robot = dynamics_plant(cell, payload), load_robot(cell.robot)
-    torque_limit = LIMIT_FRACTION * robot.torque_limits
+    """Return the time-optimal trajectory along a path from rest to rest.
+
+    Limits: joint velocity, acceleration and torque, and the acceleration at which the gripper
+    holds the payload. With a payload, `smooth_time_scaling` is applied.
+
+    Args:
+        path: Path in joint space.
+        cell: Work cell with robot and gripper.
+        payload: Load of the gripper.
+
+    Returns:
+        The trajectory, or None if the limits cannot be satisfied.
+    """
+    plant = dynamics_plant(cell, payload)
+    robot = load_robot(cell.robot)
+    torque_limits = LIMIT_FRACTION * robot.torque_limits
     grid = np.linspace(path.start_time(), path.end_time(), _NUM_GRID_POINTS)
-    velocity = path.MakeDerivative(1)
-    q, slope, curve = (
-        path.vector_values(grid).T,
-        velocity.vector_values(grid).T,
-        velocity.MakeDerivative(1).vector_values(grid).T,
-    )
+    derivative = path.MakeDerivative(1)
+    q = path.vector_values(grid).T
+    dq_ds = derivative.vector_values(grid).T
+    d2q_ds2 = derivative.MakeDerivative(1).vector_values(grid).T
     with np.errstate(divide="ignore"):
-        fastest = ((LIMIT_FRACTION * robot.velocity_limits / np.abs(slope)) ** 2).min(axis=1)
-    limit = np.broadcast_to(LIMIT_FRACTION * robot.acceleration_limits, slope.shape)
-    rows = [(slope, curve, -limit, limit)]
+        speed_ratios = LIMIT_FRACTION * robot.velocity_limits / np.abs(dq_ds)
+        max_squared_speeds = (speed_ratios**2).min(axis=1)
+    # Rows (a, b, lower, upper) of lower <= a u + b x <= upper, see `toppra`.
+    limits = np.broadcast_to(LIMIT_FRACTION * robot.acceleration_limits, dq_ds.shape)
+    rows = [(dq_ds, d2q_ds2, -limits, limits)]
     if math.isfinite(payload.max_acceleration):
         p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
-        limit = np.full(p_BCm.shape, payload.max_axis_acceleration)
-        of_load = np.gradient(p_BCm, grid, axis=0, edge_order=2)
-        rows.append((of_load, np.gradient(of_load, grid, axis=0, edge_order=2), -limit, limit))
+        limits = np.full(p_BCm.shape, payload.max_axis_acceleration)
+        dp_ds = np.gradient(p_BCm, grid, axis=0, edge_order=2)
+        rows.append((dp_ds, np.gradient(dp_ds, grid, axis=0, edge_order=2), -limits, limits))
 
     def solve() -> Trajectory | None:
         a, b, lower, upper = (np.hstack(column) for column in zip(*rows, strict=True))
-        x = solve_toppra(grid[1] - grid[0], a, b, lower, upper, fastest)
+        x = solve_toppra(grid[1] - grid[0], a, b, lower, upper, max_squared_speeds)
         speed = np.sqrt(x)
         if not (speed[1:-1] > 0).all():
             return None
         times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speed[1:] + speed[:-1]))])
-        along = PiecewisePolynomial.CubicHermite(times, grid[None], speed[None])
+        scaling = PiecewisePolynomial.CubicHermite(times, grid[None], speed[None])
         return PathParameterizedTrajectory(
-            path, smooth_time_scaling(along) if payload.mass else along
+            path, smooth_time_scaling(scaling) if payload.mass else scaling
         )
 
-    trajectory, rest = solve(), np.zeros_like(q)
-    if (
-        trajectory is None
-        or (np.abs(inverse_dynamics(plant, *sample_motion(trajectory, 40))) <= torque_limit).all()
-    ):
-        return trajectory
-    held = inverse_dynamics(
-        plant, q, rest, rest
-    )  # the torques' limits are rarely needed, and take most of the time
-    if (np.abs(held) > torque_limit).any():
+    # Torque limits are rarely active and dominate the computation time: without them first.
+    trajectory = solve()
+    if trajectory is None:
         return None
-    lower, upper = -torque_limit - held, torque_limit - held
+    torques = inverse_dynamics(plant, *sample_motion(trajectory, 40))
+    if (np.abs(torques) <= torque_limits).all():
+        return trajectory
+    rest = np.zeros_like(q)
+    gravity = inverse_dynamics(plant, q, rest, rest)
+    if (np.abs(gravity) > torque_limits).any():
+        return None
     rows.append(
         (
-            inverse_dynamics(plant, q, rest, slope) - held,
-            inverse_dynamics(plant, q, slope, curve) - held,
-            lower,
-            upper,
+            inverse_dynamics(plant, q, rest, dq_ds) - gravity,
+            inverse_dynamics(plant, q, dq_ds, d2q_ds2) - gravity,
+            -torque_limits - gravity,
+            torque_limits - gravity,
         )
     )
     return solve()
 
 
 def smooth_time_scaling(time_scaling: Trajectory) -> Trajectory:
-    """A path's parameter over time, averaged over `SWING` s, by which it takes longer.
+    """Return a time scaling averaged over `SMOOTHING_TIME`, by which its duration increases.
 
-    Accelerations then rise and fall; one that jumps makes a load swing on the elastic cup, twice as far.
+    Accelerations then change continuously. A step of the acceleration would excite an oscillation
+    of the load on the elastic cup with twice the static deflection.
+
+    Args:
+        time_scaling: Path parameter over time. Shape (1,).
     """
-    step, half = 0.005, round(SMOOTHING_TIME / 0.01)
-    times = np.arange(-2 * half, math.ceil(time_scaling.end_time() / step) + 2 * half + 1) * step
+    step = 0.005
+    half_width = round(SMOOTHING_TIME / 0.01)
+    last = math.ceil(time_scaling.end_time() / step) + 2 * half_width
+    times = np.arange(-2 * half_width, last + 1) * step
     values = time_scaling.vector_values(np.clip(times, 0.0, time_scaling.end_time())).ravel()
-    mean = np.convolve(values, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
-    rest = np.zeros((1, 1))
+    width = 2 * half_width + 1
+    mean = np.convolve(values, np.full(width, 1 / width), mode="valid")
+    zero = np.zeros((1, 1))
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
-        np.arange(len(mean)) * step, mean[None], rest, rest
+        np.arange(len(mean)) * step, mean[None], zero, zero
     )
 
 
 def scale_to_limits(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
-    """The same motion, evenly slower until velocity, acceleration, torque and the cup's hold allow it; None if they never do."""
-    plant, end = dynamics_plant(cell, payload), trajectory.end_time()
+    """Return a trajectory slowed down uniformly until it satisfies the limits.
+
+    The limits are those of `parameterize_time_optimal`.
+
+    Args:
+        trajectory: Joint positions over time.
+        cell: Work cell with robot and gripper.
+        payload: Load of the gripper.
+
+    Returns:
+        The trajectory, or None if the limits cannot be satisfied at any speed.
+    """
+    plant = dynamics_plant(cell, payload)
     robot = load_robot(cell.robot)
-    count = max(200, math.ceil(end / 0.005))
+    end_time = trajectory.end_time()
+    count = max(200, math.ceil(end_time / 0.005))
     q, v, a = sample_motion(trajectory, count)
-    held = inverse_dynamics(plant, q, np.zeros_like(q), np.zeros_like(q))
-    moving = inverse_dynamics(plant, q, v, a) - held
-    room = LIMIT_FRACTION * robot.torque_limits - np.sign(moving) * held
-    if (room <= 0).any():
+    gravity = inverse_dynamics(plant, q, np.zeros_like(q), np.zeros_like(q))
+    dynamic = inverse_dynamics(plant, q, v, a) - gravity
+    torque_reserve = LIMIT_FRACTION * robot.torque_limits - np.sign(dynamic) * gravity
+    if (torque_reserve <= 0).any():
         return None
-    square = (np.abs(v) / robot.velocity_limits / LIMIT_FRACTION).max() ** 2
-    square = max(square, (np.abs(a) / robot.acceleration_limits / LIMIT_FRACTION).max())
-    square = max(square, (np.abs(moving) / room).max())
+    # Accelerations and dynamic torques are inversely proportional to the squared time scale.
+    squared_scale = (np.abs(v) / robot.velocity_limits / LIMIT_FRACTION).max() ** 2
+    squared_scale = max(
+        squared_scale, (np.abs(a) / robot.acceleration_limits / LIMIT_FRACTION).max()
+    )
+    squared_scale = max(squared_scale, (np.abs(dynamic) / torque_reserve).max())
     if math.isfinite(payload.max_acceleration):
         p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
-        of_load = np.diff(p_BCm, 2, axis=0) / (end / (count - 1)) ** 2
-        square = max(square, np.linalg.norm(of_load, axis=1).max() / payload.max_acceleration)
-    by = max(1.0, math.sqrt(square))
+        accelerations = np.diff(p_BCm, 2, axis=0) / (end_time / (count - 1)) ** 2
+        squared_scale = max(
+            squared_scale, np.linalg.norm(accelerations, axis=1).max() / payload.max_acceleration
+        )
+    scale = max(1.0, math.sqrt(squared_scale))
     return PathParameterizedTrajectory(
-        trajectory, PiecewisePolynomial.FirstOrderHold([0.0, by * end], [[0.0, end]])
+        trajectory, PiecewisePolynomial.FirstOrderHold([0.0, scale * end_time], [[0.0, end_time]])
     )
 
 
 def sample_motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
-    """q rad, v rad/s and a rad/s^2, (count, n) each, at times equally far apart, both ends among them."""
+    """Return samples of a trajectory at uniform times, including both ends.
+
+    Args:
+        trajectory: Joint positions over time.
+        count: Number of samples, m.
+
+    Returns:
+        Positions [rad], velocities [rad/s] and accelerations [rad/s^2]. Shapes (m, n).
+    """
     times = np.linspace(trajectory.start_time(), trajectory.end_time(), count)
     v, a = (trajectory.MakeDerivative(order).vector_values(times).T for order in (1, 2))
     return trajectory.vector_values(times).T, v, a
 
 
 def _p_FCm(cell: WorkCell, payload: Payload) -> Floats:
+    """Return the load's center of mass in homogeneous coordinates [m]. Shape (4,)."""
     return np.asarray(cell.gripper.X_FG.GetAsMatrix4() @ np.array([*payload.p_GCm, 1.0]))
 
 
 @lru_cache(maxsize=64)
-def _context(plant: MultibodyPlant) -> Context:
+def _cached_context(plant: MultibodyPlant) -> Context:
     return plant.CreateDefaultContext()
 
 
 def inverse_dynamics(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
-    """(m, n) N m, that motions (m, n) each, take."""
-    context, forces, found = _context(plant), MultibodyForces(plant), np.empty_like(q)
+    """Return the joint torques of a motion.
+
+    Args:
+        plant: Plant of `dynamics_plant`.
+        q: Positions [rad]. Shape (m, n).
+        v: Velocities [rad/s]. Shape (m, n).
+        a: Accelerations [rad/s^2]. Shape (m, n).
+
+    Returns:
+        Torques [N m]. Shape (m, n).
+    """
+    context = _cached_context(plant)
+    forces = MultibodyForces(plant)
+    torques = np.empty_like(q)
     for k in range(len(q)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])
         plant.CalcForceElementsContribution(context, forces)
-        found[k] = plant.CalcInverseDynamics(context, a[k], forces)
-    return found
+        torques[k] = plant.CalcInverseDynamics(context, a[k], forces)
+    return torques

@@ -1,7 +1,7 @@
-"""Kinematics of a cell's gripper, and ways of the robot along poses of it.
+"""Kinematics of robot and gripper, and paths along poses of the gripper.
 
-Frames: T the support; B the robot's base; F its flange; G the gripper. Poses are arrays here, as
-the robot's compiled kinematics takes them in batches.
+Frames: T is the support, B is the robot's base, F is its flange, G is the gripper. Poses are
+arrays, because the compiled kinematics of the robot takes them in batches.
 """
 
 import math
@@ -17,11 +17,11 @@ from drake_clutter.robots.robot_model import RobotModel, load_robot
 Floats = NDArray[np.float64]
 
 _MAX_POSE_STEP = 0.02
-"""Between neighboring poses of a straight line [m]."""
+"""Largest distance between neighboring poses of a straight line [m]."""
 
 
 def invert_pose(X_AB: Floats) -> Floats:
-    """Return X_BA, (4, 4), of X_AB (4, 4)."""
+    """Return X_BA of X_AB. Shapes (4, 4)."""
     X_AB = np.ascontiguousarray(X_AB)
     X = np.eye(4)
     X[:3, :3] = X_AB[:3, :3].T
@@ -30,11 +30,11 @@ def invert_pose(X_AB: Floats) -> Floats:
 
 
 def downward_pose(yaw: float, p_TG: Floats) -> Floats:
-    """Return X_TG, (4, 4), of a gripper that points down.
+    """Return X_TG of a gripper that points down. Shape (4, 4).
 
     Args:
-        yaw: About the vertical [rad].
-        p_TG: [m]. Shape (3,).
+        yaw: Angle about the vertical [rad].
+        p_TG: Position [m]. Shape (3,).
     """
     c, s = math.cos(yaw), math.sin(yaw)
     X = np.eye(4)
@@ -44,48 +44,51 @@ def downward_pose(yaw: float, p_TG: Floats) -> Floats:
 
 
 def raise_pose(X_TG: Floats, height: float) -> Floats:
-    """Return a pose (4, 4) that is higher by `height` [m]."""
+    """Return a pose raised by a height [m]. Shapes (4, 4)."""
     X = X_TG.copy()
     X[2, 3] += height
     return X
 
 
 def _vertical_line(X_TG: Floats, top: float) -> Floats:
-    """Return poses (m, 4, 4) straight up to a height [m]."""
-    heights = np.linspace(
-        X_TG[2, 3], top, max(2, math.ceil((top - X_TG[2, 3]) / _MAX_POSE_STEP) + 1)
-    )
+    """Return poses from X_TG vertically up to a height [m]. Shape (m, 4, 4)."""
+    count = max(2, math.ceil((top - X_TG[2, 3]) / _MAX_POSE_STEP) + 1)
+    heights = np.linspace(X_TG[2, 3], top, count)
     X = np.broadcast_to(X_TG, (len(heights), 4, 4)).copy()
     X[:, 2, 3] = heights
     return X
 
 
 def _straight_line(X_TG: Floats, X_TG_end: Floats) -> Floats:
-    """Return poses (m, 4, 4) on a straight line that turn evenly about the vertical."""
-    turn = X_TG_end[:3, :3] @ X_TG[:3, :3].T
-    angle, shift = math.atan2(turn[1, 0], turn[0, 0]), X_TG_end[:3, 3] - X_TG[:3, 3]
-    count = max(
-        2,
-        math.ceil(max(float(np.linalg.norm(shift)) / _MAX_POSE_STEP, abs(angle) / MAX_JOINT_STEP))
-        + 1,
+    """Return poses on a straight line with a uniform rotation about the vertical.
+
+    Returns:
+        Poses from X_TG to X_TG_end. Shape (m, 4, 4).
+    """
+    rotation = X_TG_end[:3, :3] @ X_TG[:3, :3].T
+    angle = math.atan2(rotation[1, 0], rotation[0, 0])
+    translation = X_TG_end[:3, 3] - X_TG[:3, 3]
+    num_steps = max(
+        float(np.linalg.norm(translation)) / _MAX_POSE_STEP, abs(angle) / MAX_JOINT_STEP
     )
+    count = max(2, math.ceil(num_steps) + 1)
     X = np.empty((count, 4, 4))
-    for k, share in enumerate(np.linspace(0.0, 1.0, count)):
-        c, s = math.cos(share * angle), math.sin(share * angle)
+    for k, fraction in enumerate(np.linspace(0.0, 1.0, count)):
+        c, s = math.cos(fraction * angle), math.sin(fraction * angle)
         X[k] = X_TG
         X[k, :3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ X_TG[:3, :3]
-        X[k, :3, 3] += share * shift
+        X[k, :3, 3] += fraction * translation
     return X
 
 
 @dataclass(frozen=True)
 class CarryPath:
-    """A way from a grasp over a height to a place.
+    """Joint-space path from the grasp to the place pose over a transfer height.
 
     Attributes:
-        lift: Straight up from the grasp. Shape (k, n).
-        transfer: From the end of `lift` to that of `reversed_lowering`. Shape (l, n).
-        reversed_lowering: Straight up from the place. Shape (m, n).
+        lift: Vertically up from the grasp. Shape (k, n).
+        transfer: From the end of `lift` to the end of `reversed_lowering`. Shape (l, n).
+        reversed_lowering: Vertically up from the place pose; traversed in reverse. Shape (m, n).
     """
 
     lift: Floats
@@ -94,42 +97,63 @@ class CarryPath:
 
     @property
     def waypoints(self) -> Floats:
-        """From the grasp to the place, each configuration once."""
+        """Configurations from the grasp to the place pose without duplicates. Shape (j, n)."""
         return np.vstack([self.lift, self.transfer[1:-1], self.reversed_lowering[::-1]])
 
 
 class ToolKinematics:
-    """Kinematics of a cell's gripper.
+    """Forward and inverse kinematics of the gripper of a work cell.
 
     Attributes:
-        robot: That carries it.
+        robot: Robot that carries the gripper.
     """
 
     def __init__(self, cell: WorkCell) -> None:
         """Load the robot.
 
+        Args:
+            cell: Work cell with robot and gripper.
+
         Raises:
             InputError: The robot's model cannot be used.
         """
         self.robot: RobotModel = load_robot(cell.robot)
-        X_TB, X_FG = self.robot.X_TB, cell.gripper.X_FG
-        self._X_TB, self._X_FG = X_TB.GetAsMatrix4(), X_FG.GetAsMatrix4()
-        self._X_BT, self._X_GF = X_TB.inverse().GetAsMatrix4(), X_FG.inverse().GetAsMatrix4()
+        X_TB = self.robot.X_TB
+        X_FG = cell.gripper.X_FG
+        self._X_TB = X_TB.GetAsMatrix4()
+        self._X_FG = X_FG.GetAsMatrix4()
+        self._X_BT = X_TB.inverse().GetAsMatrix4()
+        self._X_GF = X_FG.inverse().GetAsMatrix4()
 
     def pose(self, q: Floats) -> Floats:
-        """Return X_TG, (..., 4, 4), at joint positions (..., n)."""
+        """Return X_TG, shape (..., 4, 4), at joint positions of shape (..., n)."""
         return np.asarray(self._X_TB @ self.robot.forward_kinematics(q) @ self._X_FG)
 
     def axis(self, q: Floats) -> Floats:
-        """Return the gripper's z axis in T, (..., 3), at joint positions (..., n)."""
+        """Return the z axis of G in T, shape (..., 3), at joint positions of shape (..., n)."""
         return self.pose(q)[..., :3, 2]
 
     def solve_ik(self, X_TG: Floats) -> Floats:
-        """Return joint positions (..., K, n) at poses (..., 4, 4), see `InverseKinematics`."""
+        """Return all inverse kinematics solutions, see `InverseKinematics.solve`.
+
+        Args:
+            X_TG: Poses of the gripper. Shape (..., 4, 4).
+
+        Returns:
+            Joint positions; NaN in rows without a solution. Shape (..., K, n).
+        """
         return self.robot.ik.solve(self._flange_pose(X_TG))
 
     def track(self, X_TG: Floats, q_start: Floats) -> Floats | None:
-        """Return the path (m, n) along poses (m, 4, 4), see `InverseKinematics`."""
+        """Return the continuous joint path along poses, see `InverseKinematics.track`.
+
+        Args:
+            X_TG: Closely spaced poses of the gripper. Shape (m, 4, 4).
+            q_start: Joint positions at the first pose. Shape (n,).
+
+        Returns:
+            Joint positions, shape (m, n), or None if there is no continuous path.
+        """
         return self.robot.ik.track(self._flange_pose(X_TG), q_start)
 
     def _flange_pose(self, X_TG: Floats) -> Floats:
@@ -143,48 +167,58 @@ class ToolKinematics:
         q_pick: Floats,
         q_place: Floats,
     ) -> CarryPath | str:
-        """Return a way from a grasp to a place on which the gripper points down.
+        """Return a path from a grasp to a place pose along which the gripper points down.
 
-        A robot with `vertical_tool_rows` keeps it so on a straight line in joint space. Any other
-        robot follows a straight line in space, and arrives at the place as that leads it.
+        A robot with `vertical_tool_rows` keeps the gripper vertical on a straight line in joint
+        space. Any other robot follows a straight line of the gripper; its configuration at the
+        place pose results from the path.
 
         Args:
             X_pick: X_TG at the grasp. Shape (4, 4).
-            X_place: X_TG at the place. Shape (4, 4).
-            transfer_height: Height of G in between [m].
-            q_pick: At the grasp. Shape (n,).
-            q_place: At the place, for a robot with `vertical_tool_rows`. Shape (n,).
+            X_place: X_TG at the place pose. Shape (4, 4).
+            transfer_height: Height of G between the two [m].
+            q_pick: Joint positions at the grasp. Shape (n,).
+            q_place: Joint positions at the place pose; used only with `vertical_tool_rows`. Shape
+                (n,).
 
         Returns:
-            The way, or what is out of reach.
+            The path, or a description of the part that is out of reach.
         """
-        up = self.track(_vertical_line(X_pick, transfer_height), q_pick)
-        if up is None:
+        lift = self.track(_vertical_line(X_pick, transfer_height), q_pick)
+        if lift is None:
             return "above the grasp"
-        above = _vertical_line(X_place, transfer_height)
+        above_place = _vertical_line(X_place, transfer_height)
         if self.robot.vertical_tool_rows is not None:
-            down = self.track(above, q_place)
-            if down is None:
+            reversed_lowering = self.track(above_place, q_place)
+            if reversed_lowering is None:
                 return "above the place"
-            return CarryPath(up, linear_joint_path(up[-1], down[-1]), down)
-        across = self.track(
-            _straight_line(_vertical_line(X_pick, transfer_height)[-1], above[-1]), up[-1]
-        )
-        if across is None:
+            transfer = linear_joint_path(lift[-1], reversed_lowering[-1])
+            return CarryPath(lift, transfer, reversed_lowering)
+        X_lifted = _vertical_line(X_pick, transfer_height)[-1]
+        tracked = self.track(_straight_line(X_lifted, above_place[-1]), lift[-1])
+        if tracked is None:
             return "between grasp and place"
-        lowered = self.track(above[::-1], across[-1])
-        return "above the place" if lowered is None else CarryPath(up, across, lowered[::-1])
+        lowering = self.track(above_place[::-1], tracked[-1])
+        if lowering is None:
+            return "above the place"
+        return CarryPath(lift, tracked, lowering[::-1])
 
     def paths_home(self, q: Floats) -> list[Floats]:
-        """Return ways home, (m, n) each.
+        """Return candidate paths to the home configuration. Shapes (m, n).
 
-        The first is straight. The second stays at the same height until G is, seen from above,
-        where it is at home.
+        The first is a straight line in joint space. The second first moves the gripper at its
+        height to the horizontal position that it has at home.
+
+        Args:
+            q: Joint positions at the start. Shape (n,).
         """
         home = self.robot.home
-        X_TG_home, X_TG = self.pose(home), self.pose(q)
+        X_TG_home = self.pose(home)
+        X_TG = self.pose(q)
         X_TG[:2, 3] = X_TG_home[:2, 3]
-        back, direct = self.robot.ik.follow(self._flange_pose(X_TG), q), linear_joint_path(q, home)
-        if back is None:
+        q_retracted = self.robot.ik.follow(self._flange_pose(X_TG), q)
+        direct = linear_joint_path(q, home)
+        if q_retracted is None:
             return [direct]
-        return [direct, np.vstack([linear_joint_path(q, back), linear_joint_path(back, home)[1:]])]
+        retract = linear_joint_path(q, q_retracted)
+        return [direct, np.vstack([retract, linear_joint_path(q_retracted, home)[1:]])]

@@ -1,12 +1,18 @@
-"""Shorter ways than the sure one, by trajectory optimisation.
+"""Minimum-time trajectory optimization by sequential convex programming.
 
-A cubic spline over joint angles is made as quick as the joints' limits and the cup's hold allow, while it keeps clear of
-everything. Distances are linear in the joint angles for a small step, and so in the spline's control points: each round takes
-them at the last round's spline, and moves no control point by more than a step (as in Schulman et al. 2014, "Motion planning with
-sequential convex optimization and convex collision checking"). So are the limits of speed and acceleration, in the control points
-and the square of the duration T: over a parameter that goes from 0 to 1, q'' is bounded by a T^2, and q' by v T. Of T the tangent
-to the root of T^2 is taken, which is a little more, until the rounds settle. The result is a proposal: who asks checks it, and
-slows it down to its limits.
+A cubic B-spline in joint space is optimized for minimum duration T under limits of joint velocity,
+joint acceleration and tool acceleration, and under signed-distance constraints. Signed distances
+are linear in the joint positions for small steps, and so in the control points of the spline. Each
+convex subproblem linearizes them at the previous solution, and a trust region bounds the change of
+the control points (Schulman et al. 2014, "Motion planning with sequential convex optimization and
+convex collision checking").
+
+The variables are the control points over the parameter s in [0, 1], and T^2. The limits are linear
+in these: q'' is bounded by a_max T^2, and q' by v_max T. The square root T of T^2 is replaced by
+its tangent at the previous solution, which is slightly larger until convergence.
+
+The result is not guaranteed to satisfy the constraints between samples. The caller checks it for
+collisions and scales it to the limits.
 """
 
 import math
@@ -27,43 +33,60 @@ from drake_clutter.robots.robot_model import RobotModel
 Floats = NDArray[np.float64]
 
 NUM_CONTROL_POINTS = 28
+"""Control points of the spline."""
 TRUST_REGION_RADII = (0.8, 0.4, 0.2)
-"""rad, by which a control point may move in each round."""
+"""Largest change of a control point in each subproblem [rad]."""
 LINEARIZED_TILT_RADII = (0.4, 0.2, 0.1, 0.05, 0.03)
-"""The same, where a tool stays vertical to first order only."""
+"""Trust region radii where the tool is kept vertical by a linearized constraint [rad]."""
 NUM_COLLISION_SAMPLES = 50
-"""Points of a spline at which distances are taken, and at every second of them how the cup is accelerated."""
+"""Points of the spline at which distances are imposed; tool accelerations at every second one."""
 CONVERGENCE_TOLERANCE = 0.02
-"""rad; a round that moves no control point further, and changes the duration by no larger a share, is the last."""
+"""Change of the control points [rad], and relative change of the duration, at convergence."""
 MIN_VERTICAL_TRAVEL = 0.002
-"""m, that the cup moves straight up from a grasp, and straight down to a place."""
+"""Vertical travel of the tool after the grasp and before the place pose [m]: an object that moves
+sideways while it is lifted drags its neighbors along."""
 ENDPOINT_FRACTION = 0.15
-"""Share of a way at either end, where it may stay as close as it is: there the ends leave it no choice."""
+"""Fraction of the path at either end where distances below the required ones are not increased: the
+fixed endpoints leave no freedom there."""
 _SPLINE_ORDER = 4
 _SMOOTHNESS_WEIGHT = 1e-4
-"""Weight of the squared accelerations beside T^2: of ways that are as quick it takes the smoothest."""
+"""Weight of the squared accelerations relative to T^2. It selects the smoothest of the trajectories
+with nearly minimal duration."""
+_MIN_DURATION = 0.05
+"""Lower bound of the duration [s]; keeps the subproblems well conditioned."""
 _BASIS = BsplineBasis(_SPLINE_ORDER, NUM_CONTROL_POINTS, KnotVectorType.kClampedUniform, 0.0, 1.0)
 _BASIS_SPLINE = BsplineTrajectory(_BASIS, np.eye(NUM_CONTROL_POINTS))
+"""Spline whose values are the basis functions."""
 _SAMPLE_PARAMETERS = np.linspace(0.0, 1.0, NUM_COLLISION_SAMPLES + 2)[1:-1]
+"""Parameters s of the samples. Shape (NUM_COLLISION_SAMPLES,)."""
 _VALUE_WEIGHTS = _BASIS_SPLINE.vector_values(_SAMPLE_PARAMETERS).T
+"""Maps control points to values at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
 _SECOND_DERIVATIVE_WEIGHTS = _BASIS_SPLINE.MakeDerivative(2).vector_values(_SAMPLE_PARAMETERS).T
-"""(LOOKED_AT, 28) each: from control points to the spline's values and second derivatives."""
+"""Maps control points to second derivatives at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
 
 
 @lru_cache(maxsize=16)
-def _derivative_matrix(order: int, joints: int) -> sparse.csr_matrix:
-    """From all control points, row by row, to those of a derivative, ((28 - order) n, 28 n)."""
-    of_one = np.array(_BASIS_SPLINE.MakeDerivative(order).control_points())[..., 0]
-    return sparse.csr_matrix(np.kron(of_one, np.eye(joints)))
+def _derivative_matrix(order: int, num_joints: int) -> sparse.csr_matrix:
+    """Return the matrix from all control points to the control points of a derivative.
+
+    Args:
+        order: Order of the derivative.
+        num_joints: Number of joints, n.
+
+    Returns:
+        Sparse matrix; control points are flattened row by row. Shape ((28 - order) n, 28 n).
+    """
+    one_joint = np.array(_BASIS_SPLINE.MakeDerivative(order).control_points())[..., 0]
+    return sparse.csr_matrix(np.kron(one_joint, np.eye(num_joints)))
 
 
 @dataclass(frozen=True)
 class LinearizedDistance:
-    """A distance, to first order.
+    """First-order model of a signed distance.
 
     Attributes:
-        gradient: (n,) m/rad.
-        slack: m, by which it is larger than it must be.
+        gradient: Derivative by the joint positions [m/rad]. Shape (n,).
+        slack: Distance minus required distance [m].
     """
 
     gradient: Floats
@@ -72,22 +95,27 @@ class LinearizedDistance:
 
 @dataclass(frozen=True)
 class TrajectoryOptimizationProblem:
-    """What is to be shortened.
+    """Input of one trajectory optimization.
 
     Attributes:
-        initial_trajectory: The way that is known, timed.
-        robot: Its limits, and how its joints keep a tool vertical.
-        upright: Whether it begins, and ends, straight above a face.
-        keep_tool_vertical: Whether the cup keeps pointing down, for the sake of what hangs on it.
-        max_tool_acceleration: Greatest of the cup along each axis [m/s^2].
-        nearby_distances: What is near, at joint positions (n,) and a share of the way in 0 to 1.
-        tool_jacobian: Of the cup at joint positions (n,), turning first. Shape (6, n).
-        tool_axis: Of the cup, z in T, at joint positions (n,). Shape (3,).
+        initial_trajectory: Collision-free, time-parameterized initial guess.
+        robot: Robot with its joint limits.
+        vertical_start: Whether the tool first moves vertically up.
+        vertical_end: Whether the tool last moves vertically down.
+        keep_tool_vertical: Whether the tool axis stays vertical.
+        max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
+        nearby_distances: Returns all distances below the influence distance, from joint positions
+            of shape (n,) and the path parameter s in [0, 1].
+        tool_jacobian: Returns the spatial Jacobian of the tool, angular rows first, shape (6, n),
+            from joint positions of shape (n,).
+        tool_axis: Returns the z axis of the tool in T, shape (3,), from joint positions of shape
+            (n,).
     """
 
     initial_trajectory: Trajectory
     robot: RobotModel
-    upright: tuple[bool, bool]
+    vertical_start: bool
+    vertical_end: bool
     keep_tool_vertical: bool
     max_tool_acceleration: float
     nearby_distances: Callable[[Floats, float], list[LinearizedDistance]]
@@ -96,67 +124,94 @@ class TrajectoryOptimizationProblem:
 
     @property
     def num_fixed_control_points(self) -> int:
-        """Control points that are one at either end: two, and it is at rest there; three, and what it carries is not jerked."""
+        """Equal control points at either end.
+
+        Two give zero velocity at the ends. Three also give zero acceleration, so that a load does
+        not oscillate on the elastic cup.
+        """
         return 3 if self.keep_tool_vertical else 2
 
 
 def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajectory | None:
-    """A quicker way, and how it is run through; None if none was found."""
+    """Return a trajectory that is faster than the initial one, or None if none is found."""
+    initial_duration = problem.initial_trajectory.end_time()
     points = _fit_control_points(problem.initial_trajectory, problem.num_fixed_control_points)
-    duration = problem.initial_trajectory.end_time()
-    exact = not problem.keep_tool_vertical or problem.robot.vertical_tool_rows is not None
-    for step in TRUST_REGION_RADII if exact else LINEARIZED_TILT_RADII:
-        found = _solve_subproblem(problem, points, duration, step)
-        if found is None:
+    duration = initial_duration
+    is_exact = not problem.keep_tool_vertical or problem.robot.vertical_tool_rows is not None
+    for radius in TRUST_REGION_RADII if is_exact else LINEARIZED_TILT_RADII:
+        solution = _solve_subproblem(problem, points, duration, radius)
+        if solution is None:
             break
-        settled = (
-            np.abs(found[0] - points).max() < CONVERGENCE_TOLERANCE
-            and abs(found[1] - duration) < CONVERGENCE_TOLERANCE * duration
+        new_points, new_duration = solution
+        has_converged = (
+            np.abs(new_points - points).max() < CONVERGENCE_TOLERANCE
+            and abs(new_duration - duration) < CONVERGENCE_TOLERANCE * duration
         )
-        points, duration = found
-        if settled:
+        points, duration = solution
+        if has_converged:
             break
-    if duration >= problem.initial_trajectory.end_time():
+    if duration >= initial_duration:
         return None
-    return BsplineTrajectory(
-        BsplineBasis(_SPLINE_ORDER, duration * np.array(_BASIS.knots())), points.T
-    )
+    knots = duration * np.array(_BASIS.knots())
+    return BsplineTrajectory(BsplineBasis(_SPLINE_ORDER, knots), points.T)
 
 
 def _fit_control_points(trajectory: Trajectory, num_fixed: int) -> Floats:
-    """Control points (28, n) of the spline that is nearest to a timed way; `num_fixed` at either end are one."""
+    """Return the control points of the least-squares fit to a trajectory.
+
+    Args:
+        trajectory: Joint positions over time.
+        num_fixed: Number of equal control points at either end.
+
+    Returns:
+        Control points. Shape (28, n).
+    """
     s = np.linspace(0.0, 1.0, 120)
     q = trajectory.vector_values(s * trajectory.end_time()).T
     B = _BASIS_SPLINE.vector_values(s).T
     points = np.empty((NUM_CONTROL_POINTS, q.shape[1]))
-    points[:num_fixed], points[-num_fixed:] = q[0], q[-1]
-    at_ends = [*range(num_fixed), *range(NUM_CONTROL_POINTS - num_fixed, NUM_CONTROL_POINTS)]
+    points[:num_fixed] = q[0]
+    points[-num_fixed:] = q[-1]
+    fixed = [*range(num_fixed), *range(NUM_CONTROL_POINTS - num_fixed, NUM_CONTROL_POINTS)]
     points[num_fixed:-num_fixed] = np.linalg.lstsq(
-        B[:, num_fixed:-num_fixed], q - B[:, at_ends] @ points[at_ends], rcond=None
+        B[:, num_fixed:-num_fixed], q - B[:, fixed] @ points[fixed], rcond=None
     )[0]
     return points
 
 
 class _LinearConstraints:
-    """Linear inequalities A x <= b of x, which is all control points, (28, n) row by row, and then T^2."""
+    """Linear inequalities of the control points p, flattened row by row, and T^2."""
 
     def __init__(self) -> None:
-        self._A, self._b = list[sparse.csr_matrix](), list[Floats]()
+        self._A = list[sparse.csr_matrix]()
+        self._b = list[Floats]()
 
     def add(self, A_points: sparse.csr_matrix, A_square: Floats, b: Floats) -> None:
-        """Some more: (m, 28 n), (m,) and (m,)."""
+        """Add A_points p + A_square T^2 <= b.
+
+        Args:
+            A_points: Coefficients of p. Shape (m, 28 n).
+            A_square: Coefficients of T^2. Shape (m,).
+            b: Upper bounds. Shape (m,).
+        """
         self._A.append(sparse.hstack([A_points, sparse.csr_matrix(A_square[:, None])]))
         self._b.append(b)
 
     def add_two_sided(
         self, A_points: sparse.csr_matrix, bound: Floats, b: Floats | None = None
     ) -> None:
-        """-bound T^2 - b <= A p <= bound T^2 + b."""
+        """Add -bound T^2 - b <= A_points p <= bound T^2 + b.
+
+        Args:
+            A_points: Coefficients of p. Shape (m, 28 n).
+            bound: Coefficients of T^2. Shape (m,).
+            b: Constant bounds; None for 0. Shape (m,).
+        """
         for sign in (1, -1):
             self.add(sign * A_points, -bound, np.zeros_like(bound) if b is None else b)
 
     def add_to(self, prog: MathematicalProgram, x: NDArray[np.object_]) -> None:
-        """Adds them to a program."""
+        """Add the constraints to a program with the variables x = (p, T^2)."""
         b = np.concatenate(self._b)
         prog.AddLinearConstraint(
             sparse.vstack(self._A, format="csc"), np.full(len(b), -np.inf), b, x
@@ -164,7 +219,15 @@ class _LinearConstraints:
 
 
 def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matrix:
-    """(m, 28 n), from all control points to what splines of these weights (m, 28) go in directions (m, n)."""
+    """Return the matrix from all control points to directional components of spline values.
+
+    Args:
+        weights: Weights of the control points in each value. Shape (m, 28).
+        directions: Direction of each component. Shape (m, n).
+
+    Returns:
+        Sparse matrix. Shape (m, 28 n).
+    """
     return sparse.csr_matrix(
         (weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1)
     )
@@ -173,42 +236,48 @@ def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matri
 def _limit_constraints(
     problem: TrajectoryOptimizationProblem, points: Floats, duration: float
 ) -> _LinearConstraints:
-    """Of speed, acceleration and distances, at a spline near which they hold."""
-    rows, q = _LinearConstraints(), _VALUE_WEIGHTS @ points
-    # T is at most the tangent to the root of its square, at the last round's.
-    n, robot = problem.robot.num_joints, problem.robot
+    """Return limits and distance constraints, linearized at a spline.
+
+    Args:
+        problem: Trajectory optimization problem.
+        points: Control points. Shape (28, n).
+        duration: Duration T [s].
+    """
+    constraints = _LinearConstraints()
+    q = _VALUE_WEIGHTS @ points
+    robot = problem.robot
+    n = robot.num_joints
     speeds = np.tile(LIMIT_FRACTION * robot.velocity_limits, NUM_CONTROL_POINTS - 1)
     accelerations = np.tile(LIMIT_FRACTION * robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
-    rows.add_two_sided(_derivative_matrix(1, n), speeds / (2 * duration), speeds * duration / 2)
-    rows.add_two_sided(_derivative_matrix(2, n), accelerations)
-    if seen := [
-        (k, wall)
+    # T is at most the tangent of sqrt(T^2): T^2 / (2 T_previous) + T_previous / 2.
+    constraints.add_two_sided(
+        _derivative_matrix(1, n), speeds / (2 * duration), speeds * duration / 2
+    )
+    constraints.add_two_sided(_derivative_matrix(2, n), accelerations)
+    samples = [
+        (k, distance)
         for k, s in enumerate(_SAMPLE_PARAMETERS)
-        for wall in problem.nearby_distances(q[k], s)
-    ]:
-        at, gradients = (
-            np.array([k for k, _ in seen]),
-            np.array([wall.gradient for _, wall in seen]),
-        )
-        room = np.array([wall.slack for _, wall in seen])
-        room = np.where(
-            np.minimum(_SAMPLE_PARAMETERS, 1 - _SAMPLE_PARAMETERS)[at] < ENDPOINT_FRACTION,
-            np.maximum(room, 0.0),
-            room,
-        )
-        rows.add(
-            _directional_matrix(-_VALUE_WEIGHTS[at], gradients),
-            np.zeros(len(at)),
-            room - (gradients * q[at]).sum(axis=1),
+        for distance in problem.nearby_distances(q[k], s)
+    ]
+    if samples:
+        index = np.array([k for k, _ in samples])
+        gradients = np.array([distance.gradient for _, distance in samples])
+        slack = np.array([distance.slack for _, distance in samples])
+        is_near_end = np.minimum(_SAMPLE_PARAMETERS, 1 - _SAMPLE_PARAMETERS) < ENDPOINT_FRACTION
+        slack = np.where(is_near_end[index], np.maximum(slack, 0.0), slack)
+        constraints.add(
+            _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
+            np.zeros(len(index)),
+            slack - (gradients * q[index]).sum(axis=1),
         )
     if math.isfinite(problem.max_tool_acceleration):
-        at = np.repeat(np.arange(0, NUM_COLLISION_SAMPLES, 2), 3)
-        J = np.vstack([problem.tool_jacobian(q[k])[3:] for k in at[::3]])
-        rows.add_two_sided(
-            _directional_matrix(_SECOND_DERIVATIVE_WEIGHTS[at], J),
-            np.full(len(at), problem.max_tool_acceleration),
+        index = np.repeat(np.arange(0, NUM_COLLISION_SAMPLES, 2), 3)
+        J = np.vstack([problem.tool_jacobian(q[k])[3:] for k in index[::3]])
+        constraints.add_two_sided(
+            _directional_matrix(_SECOND_DERIVATIVE_WEIGHTS[index], J),
+            np.full(len(index), problem.max_tool_acceleration),
         )
-    return rows
+    return constraints
 
 
 def _add_vertical_tool_constraints(
@@ -217,22 +286,60 @@ def _add_vertical_tool_constraints(
     prog: MathematicalProgram,
     control: NDArray[np.object_],
 ) -> None:
-    """Keeps the tool vertical: exactly, or at control points to first order of the last round's.
+    """Add the constraint that the tool stays vertical.
 
-    In the latter case not at those that are fixed, or move straight up, which are vertical already.
+    It is exact for robots with `vertical_tool_rows`. For other robots it is linearized at the
+    previous control points, except for those at the ends that are fixed or on a vertical line.
+
+    Args:
+        problem: Trajectory optimization problem.
+        points: Previous control points. Shape (28, n).
+        prog: Program to which the constraint is added.
+        control: Variables of the control points. Shape (28, n).
     """
     rows = problem.robot.vertical_tool_rows
     if rows is not None:
         for q in control:
             prog.AddLinearEqualityConstraint(rows, rows @ points[0], q)
         return
-    for k in range(
-        problem.num_fixed_control_points + 2,
-        NUM_CONTROL_POINTS - problem.num_fixed_control_points - 2,
-    ):
-        (x, y, z), turning = problem.tool_axis(points[k]), problem.tool_jacobian(points[k])[:3]
-        tilts = np.array([z * turning[1] - y * turning[2], x * turning[2] - z * turning[0]])
+    num_vertical = problem.num_fixed_control_points + 2
+    for k in range(num_vertical, NUM_CONTROL_POINTS - num_vertical):
+        x, y, z = problem.tool_axis(points[k])
+        J_rotation = problem.tool_jacobian(points[k])[:3]
+        # Derivatives of x and y of the tool axis: the first two rows of w x axis.
+        tilts = np.array(
+            [z * J_rotation[1] - y * J_rotation[2], x * J_rotation[2] - z * J_rotation[0]]
+        )
         prog.AddLinearEqualityConstraint(tilts, tilts @ points[k] - [x, y], control[k])
+
+
+def _add_vertical_motion_constraints(
+    problem: TrajectoryOptimizationProblem,
+    points: Floats,
+    prog: MathematicalProgram,
+    control: NDArray[np.object_],
+) -> None:
+    """Add the constraint that the tool moves vertically at the start and at the end.
+
+    Args:
+        problem: Trajectory optimization problem.
+        points: Previous control points. Shape (28, n).
+        prog: Program to which the constraint is added.
+        control: Variables of the control points. Shape (28, n).
+    """
+    num_fixed = problem.num_fixed_control_points
+    for is_vertical, end, inwards in (
+        (problem.vertical_start, 0, 1),
+        (problem.vertical_end, NUM_CONTROL_POINTS - 1, -1),
+    ):
+        if not is_vertical:
+            continue
+        J = problem.tool_jacobian(points[end])
+        q = points[end]
+        for k, min_height in ((num_fixed, 0.0), (num_fixed + 1, MIN_VERTICAL_TRAVEL)):
+            variables = control[end + inwards * k]
+            prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, variables)
+            prog.AddLinearConstraint(J[5:], J[5:] @ q + min_height, [np.inf], variables)
 
 
 def _solve_subproblem(
@@ -241,38 +348,38 @@ def _solve_subproblem(
     duration: float,
     trust_region_radius: float,
 ) -> tuple[Floats, float] | None:
+    """Solve the convex subproblem at a spline.
+
+    Args:
+        problem: Trajectory optimization problem.
+        points: Previous control points. Shape (28, n).
+        duration: Previous duration [s].
+        trust_region_radius: Largest change of a control point [rad].
+
+    Returns:
+        New control points, shape (28, n), and duration [s]; None if the subproblem is infeasible.
+    """
     n = problem.robot.num_joints
-    reach = np.full((NUM_CONTROL_POINTS, n), trust_region_radius)
-    reach[: problem.num_fixed_control_points] = reach[-problem.num_fixed_control_points :] = 0.0
+    num_fixed = problem.num_fixed_control_points
+    radius = np.full((NUM_CONTROL_POINTS, n), trust_region_radius)
+    radius[:num_fixed] = radius[-num_fixed:] = 0.0
     prog = MathematicalProgram()
     x = prog.NewContinuousVariables(points.size + 1)
     lower, upper = problem.robot.position_limits.T
-    nearest, furthest = np.maximum(points - reach, lower), np.minimum(points + reach, upper)
-    prog.AddBoundingBoxConstraint(nearest.ravel(), furthest.ravel(), x[:-1])
-    prog.AddBoundingBoxConstraint(0.05**2, (2 * duration + 0.1) ** 2, x[-1:])
+    points_min = np.maximum(points - radius, lower)
+    points_max = np.minimum(points + radius, upper)
+    prog.AddBoundingBoxConstraint(points_min.ravel(), points_max.ravel(), x[:-1])
+    prog.AddBoundingBoxConstraint(_MIN_DURATION**2, (2 * duration + 0.1) ** 2, x[-1:])
     control = x[:-1].reshape(NUM_CONTROL_POINTS, n)
-    for upright, end, inwards in (
-        (problem.upright[0], 0, 1),
-        (problem.upright[1], NUM_CONTROL_POINTS - 1, -1),
-    ):
-        if upright:
-            J, q = problem.tool_jacobian(points[end]), points[end]
-            for k, least in (
-                (problem.num_fixed_control_points, 0.0),
-                (problem.num_fixed_control_points + 1, MIN_VERTICAL_TRAVEL),
-            ):
-                prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, control[end + inwards * k])
-                prog.AddLinearConstraint(
-                    J[5:], J[5:] @ q + least, [np.inf], control[end + inwards * k]
-                )
+    _add_vertical_motion_constraints(problem, points, prog, control)
     if problem.keep_tool_vertical:
         _add_vertical_tool_constraints(problem, points, prog, control)
     _limit_constraints(problem, points, duration).add_to(prog, x)
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
     limits = np.tile(LIMIT_FRACTION * problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
-    curved = sparse.diags(1 / limits) @ _derivative_matrix(2, n) / duration**2
+    relative_accelerations = sparse.diags(1 / limits) @ _derivative_matrix(2, n) / duration**2
     prog.AddQuadraticCost(
-        2 * _SMOOTHNESS_WEIGHT * (curved.T @ curved).toarray(),
+        2 * _SMOOTHNESS_WEIGHT * (relative_accelerations.T @ relative_accelerations).toarray(),
         np.zeros(points.size),
         x[:-1],
         is_convex=True,
@@ -280,5 +387,5 @@ def _solve_subproblem(
     result = ClarabelSolver().Solve(prog)
     if not result.is_success():
         return None
-    found = result.GetSolution(x)
-    return found[:-1].reshape(points.shape), math.sqrt(found[-1])
+    solution = result.GetSolution(x)
+    return solution[:-1].reshape(points.shape), math.sqrt(solution[-1])
