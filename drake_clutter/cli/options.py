@@ -1,4 +1,4 @@
-"""Options that several commands take."""
+"""Options that several commands share."""
 
 from enum import Enum
 from pathlib import Path
@@ -8,39 +8,37 @@ import typer
 
 
 class Fidelity(Enum):
-    """How moves are carried out."""
+    """Physical fidelity at which moves are executed."""
 
     FAST = "fast"
     SETTLE = "settle"
     ARM = "arm"
 
 
-SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A scene file.")]
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Scene file.")]
 OutOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="Folder for the results; new or empty.")
+    Path, typer.Option("--out", metavar="DIR", help="Output folder; must be new or empty.")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same result.")]
+SeedOption = Annotated[
+    int, typer.Option("--seed", min=0, help="Random seed; the same seed gives the same result.")
+]
 HtmlOption = Annotated[
     Path | None,
-    typer.Option("--html", metavar="FILE", help="Write a page instead of showing it live."),
+    typer.Option("--html", metavar="FILE", help="Write an HTML file instead of a live view."),
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON on standard output.")
 ]
 CatalogOption = Annotated[
     Path | None,
-    typer.Option(
-        "--catalog",
-        metavar="DIR",
-        help="An asset folder with object classes of your own.",
-    ),
+    typer.Option("--catalog", metavar="DIR", help="Asset folder with your own object classes."),
 ]
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
         "--config",
         metavar="FILE",
-        help="YAML with the config's fields that differ from the defaults.",
+        help="YAML file with the configuration fields that differ from the defaults.",
     ),
 ]
 CellOption = Annotated[
@@ -48,7 +46,8 @@ CellOption = Annotated[
     typer.Option(
         "--cell",
         metavar="FILE",
-        help="Work cell: robot, gripper, cameras, fixtures; without it the one that the scene was made with.",
+        help="Work cell file: robot, gripper, support, cameras, fixtures. "
+        "Default: the cell stored with the scene, else the UR10 cell.",
     ),
 ]
 SetOption = Annotated[
@@ -56,44 +55,56 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="FIELD=VALUE",
-        help="A field of the cell or config, such as robot.base.z=0.4 or settle.max_time=3; may be repeated.",
+        help="Set one field of the cell or the configuration, such as `robot.base.z=0.4` or "
+        "`settle.max_time=3`. May be repeated.",
     ),
 ]
 ObjectsOption = Annotated[
-    str, typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your catalog's.")
+    str,
+    typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your own catalog."),
 ]
 MaxMovesOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Moves after which a search ends; the config's (10) if not given."),
+    typer.Option(
+        min=1,
+        help="Maximum number of moves per episode. Default: `exploration.max_moves`, which is 10.",
+    ),
 ]
 ExplorerOption = Annotated[
     str,
     typer.Option(
         "--agent",
-        help="Who chooses the moves: random, largest-first, largest-clear; student, student-dagger, student-14, student-rg, "
-        "teacher (trained); or the file of a checkpoint that you trained.",
+        help="Exploration policy: random, largest-first or largest-clear (rules); student, "
+        "student-dagger, student-14, student-rg or teacher (trained); or a checkpoint file.",
     ),
 ]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, help="Processes; the result is the same for any number.")
+    int,
+    typer.Option(
+        "--workers", min=1, help="Number of worker processes; the result does not depend on it."
+    ),
 ]
 RayOption = Annotated[
     str | None,
     typer.Option(
         "--ray",
         metavar="ADDRESS",
-        help="Put the workers on this Ray cluster, e.g. auto, instead of here.",
+        help="Address of a Ray cluster that runs the workers, such as auto. Default: run locally.",
     ),
 ]
 FidelityOption = Annotated[
     Fidelity,
     typer.Option(
-        help="arm: the robot carries every move out. Else objects are teleported; settle: Drake settles what a move touched; "
-        "fast: by equilibrium, Drake in doubt."
+        help="How moves are executed. arm: the simulated arm carries the object. settle: the "
+        "object is teleported, then Drake simulates the scene until it is at rest. fast: the "
+        "object is teleported and static equilibrium decides, or Drake where that is inconclusive."
     ),
 ]
 NodesOption = Annotated[
-    int, typer.Option("--nodes", help="Size of the graph, all kinds of nodes counted; 3 or more.")
+    int,
+    typer.Option(
+        "--nodes", help="Number of nodes of the scene graph, counting all node types; at least 3."
+    ),
 ]
 InitialPosesOption = Annotated[
     bool, typer.Option("--initial-poses", help="Use initial poses instead of settled poses.")

@@ -1,9 +1,9 @@
-"""How the commands show results and progress."""
+"""Output of the commands: tables, JSON, progress and live views."""
 
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from rich.progress import (
 from rich.table import Table
 
 from drake_clutter.files import InputError
+from drake_clutter.reports.terminal_text import describe_episode
 
 if TYPE_CHECKING:
     from drake_clutter.cell.work_cell import WorkCell
@@ -31,64 +32,60 @@ out_console, err_console = Console(), Console(stderr=True)
 
 
 def escape_markup(text: str) -> str:
-    """Return text that Rich takes as it is."""
+    """Return text that Rich prints unchanged."""
     return text.replace("[", "\\[")
 
 
-def print_result(fields: dict[str, Any], as_json: bool, title: str) -> None:
-    """Print a result, as a table or as JSON."""
+def print_result(
+    document: Mapping[str, Any], rows: Mapping[str, str], as_json: bool, title: str
+) -> None:
+    """Print a result, as a table or as JSON.
+
+    Args:
+        document: The result, for JSON.
+        rows: The result in words: texts by label.
+        as_json: Whether to print the document instead of the table.
+        title: Title of the table.
+    """
     if as_json:
-        print(json.dumps(fields, indent=2))
+        print(json.dumps(document, indent=2))
         return
     table = Table("", "", title=title, show_header=False)
-    for key, value in fields.items():
-        if isinstance(value, float):
-            value = f"{value:.4g}"
-        elif isinstance(value, list | tuple) and value and isinstance(value[0], float):
-            value = " to ".join(f"{v:.4g}" for v in value)
-        elif isinstance(value, list | tuple):
-            value = ", ".join(str(v) for v in value) or "none"
-        elif isinstance(value, dict):
-            value = ", ".join(f"{v} {k}" for k, v in value.items()) or "none"
-        table.add_row(key.replace("_", " "), escape_markup(str(value)))
+    for label, text in rows.items():
+        table.add_row(escape_markup(label), escape_markup(text))
     out_console.print(table)
 
 
 def print_transition(transition: "Transition") -> None:
-    """Print how a move went, on standard error."""
-    found = f", found {', '.join(transition.newly_found)}" if transition.newly_found else ""
-    reasons = [
-        str(reason)
-        for reason in (transition.outcome.instability, transition.outcome.detail)
-        if reason
-    ]
-    why = f" ({'; '.join(reasons)})" if reasons else ""
-    err_console.print(
-        f"{transition.move}: {transition.outcome.result.value}{why}{found}", highlight=False
-    )
+    """Print the result of a move on standard error."""
+    text = f"{transition.move}: {transition.outcome.result.value}"
+    causes = (transition.outcome.instability, transition.outcome.detail)
+    if reasons := [str(cause) for cause in causes if cause]:
+        text += f" ({'; '.join(reasons)})"
+    if transition.newly_found:
+        text += f", found {', '.join(transition.newly_found)}"
+    err_console.print(text, highlight=False)
 
 
-def print_episode(fields: dict[str, Any], as_json: bool, out: Path) -> None:
-    """Print what `episode.json` holds."""
-    if as_json:
-        print_result(fields, True, "")
-        return
-    shown = {
-        key: fields[key]
-        for key in ("success", "ended", "objects", "hidden_at_start", "found", "total_reward")
-    }
-    print_result(
-        shown | {"moves": len(fields["moves"]), "page": str(out / "index.html")}, False, f"{out}"
-    )
+def print_episode(episode: Mapping[str, Any], as_json: bool, out: Path) -> None:
+    """Print the content of `episode.json`, as a table or as JSON."""
+    rows = describe_episode(episode) | {"page": str(out / "index.html")}
+    print_result(episode, rows, as_json, f"{out}")
 
 
 def progress_bar(
     description: str, items: Iterable[Any], num_done: int, total: int
 ) -> Iterator[Any]:
-    """Yield the items, with a progress bar that appears with the first of them.
+    """Yield items while a progress bar on standard error counts them.
 
-    While they are made, standard output goes to standard error: Ray writes its messages there, and --json's result has to
-    stay alone.
+    Meanwhile standard output is redirected to standard error: Ray prints messages there, and
+    `--json` must print nothing but its result.
+
+    Args:
+        description: What is counted, such as "scenes".
+        items: The items; the bar appears when the first is requested.
+        num_done: Number of items that an earlier run has finished.
+        total: Number of items, including those.
     """
     columns = (
         TextColumn(description),
@@ -108,19 +105,29 @@ def show_recording(
     cell: "WorkCell",
     html_file: Path | None,
 ) -> None:
-    """Show frames in the browser until it is interrupted, or write them to one HTML file."""
+    """Show a motion in the browser until it is interrupted, or write it to one HTML file.
+
+    Args:
+        name: File that is shown, for the message.
+        scene: The objects.
+        frames: Poses over time; a single frame is a still scene.
+        cell: The work cell, whose arm is shown where the frames contain joint positions.
+        html_file: The HTML file; None serves a live view.
+
+    Raises:
+        InputError: The HTML file cannot be written.
+    """
     from drake_clutter.reports.recording import serve_recording, write_recording
 
     if html_file is not None:
         try:
             write_recording(html_file, scene, frames, cell)
         except OSError as error:
-            raise InputError(
-                f"--html {html_file}: cannot be written ({error.strerror}); allowed is a place you may write"
-            ) from error
-        out_console.print(f"wrote {html_file}")
+            problem = f"cannot be written ({error.strerror}); allowed is a writable path"
+            raise InputError(f"--html {html_file}: {problem}") from error
+        out_console.print(f"Wrote {html_file}.")
         return
     meshcat = serve_recording(scene, frames, cell)
-    out_console.print(f"{name} is at {meshcat.web_url()}; Ctrl-C ends it")
+    out_console.print(f"Showing {name} at {meshcat.web_url()}; press Ctrl-C to stop.")
     while True:
         time.sleep(1)

@@ -1,48 +1,146 @@
-"""Results as text for a terminal."""
+"""Results of commands in words, for tables in a terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+EVALUATION_CAPTION = (
+    "moves: allowed per episode; all found: fraction of episodes; found: hidden objects found per "
+    "episode; of hidden: fraction of all hidden objects; collapsed: fraction of episodes; moves "
+    "used: mean of the episodes in which all objects were found"
+)
+"""Meaning of the columns of `evaluation_table_rows`."""
 
-def evaluation_table_rows(row: dict[str, Any], limits: Sequence[int]) -> list[dict[str, str]]:
-    """Return a row of `summarise_episodes` as lines of a table, one for each limit of moves.
 
-    A line has its cells by column.
+def evaluation_table_rows(
+    row: Mapping[str, Any], move_limits: Sequence[int]
+) -> list[dict[str, str]]:
+    """Return an agent's row of `summarise_episodes` as one table row per move limit.
+
+    Args:
+        row: Statistics of an agent.
+        move_limits: Numbers of allowed moves, ascending.
+
+    Returns:
+        Cells by column; see `EVALUATION_CAPTION`.
     """
-    lines = []
-    for limit in limits:
-        part = row[f"within_{limit}"]
-        low, high = part["success_ci95"]
+    rows = []
+    for limit in move_limits:
+        statistics = row[f"within_{limit}"]
+        low, high = statistics["success_ci95"]
         cells = {
-            "in": str(limit),
-            "success (95 %)": f"{part['success']:.2f} ({low:.2f}-{high:.2f})",
+            "moves": str(limit),
+            "all found (95 % CI)": f"{statistics['success']:.2f} ({low:.2f}-{high:.2f})",
+            "found": f"{statistics['found']:.2f}",
+            "of hidden": f"{statistics['found_of_hidden']:.2f}",
+            "collapsed": f"{statistics['collapsed']:.2f}",
+            "moves used": "",
         }
-        cells |= {"found": f"{part['found']:.2f}", "of hidden": f"{part['found_of_hidden']:.2f}"}
-        lines.append(cells | {"collapsed": f"{part['collapsed']:.2f}", "moves": ""})
+        rows.append(cells)
     if row["moves_of_successes"] is not None:
-        lines[-1]["moves"] = f"{row['moves_of_successes']:.1f}"
-    return lines
+        rows[-1]["moves used"] = f"{row['moves_of_successes']:.1f}"
+    return rows
 
 
-def describe_plans(plans: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return what of `plan.json` fits on a screen, by move."""
-    descriptions = {}
-    for plan in plans:
-        move = f"{plan['move']['pick']} to {plan['move']['place']}"
-        if plan["planned"]:
-            parts = [
-                f"{segment['name']} {segment['duration']:.2f} s" for segment in plan["segments"]
-            ]
-            nearest = min(
-                (s["min_distance"] for s in plan["segments"] if s["min_distance"] is not None),
-                default=None,
-            )
-            distance_text = "nothing near" if nearest is None else f"{1000 * nearest:.0f} mm clear"
-            descriptions[move] = (
-                f"{', '.join(parts)}; {distance_text}; planned in {plan['planning_time']:.2f} s"
-            )
-        else:
-            descriptions[move] = (
-                f"no plan: {plan['reason']}{': ' + plan['detail'] if plan['detail'] else ''}"
-            )
-    return descriptions
+def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return the `summary.json` of generated scenes as texts by label."""
+    rows = {
+        "agent": str(summary["agent"]),
+        "seed": str(summary["seed"]),
+        "scenes": f"{summary['count']}, each from a graph of {summary['nodes']} nodes",
+        "stable": _fraction(summary["stability_rate"], summary["stability_ci95"], "scenes"),
+    }
+    if summary["hidden_mean"] is not None:
+        interval = _interval(summary["hidden_ci95"])
+        rows["hidden objects"] = f"{summary['hidden_mean']:.2f} per stable scene{interval}"
+    if summary["solvable_share"] is not None:
+        rows["solvable"] = _fraction(
+            summary["solvable_share"], summary["solvable_ci95"], "stable scenes"
+        )
+    rows |= {
+        "distinct graphs": _fraction(summary["distinct_share"], None, "scenes"),
+        "stacks": f"{summary['mean_stacks']:.2f} per scene",
+        "objects": f"{summary['mean_objects']:.2f} per scene",
+        "largest stack": f"{summary['largest_stack_share']:.0%} of the objects of a scene (mean)",
+        "balanced": _fraction(summary["balanced_share"], None, "scenes"),
+        "class entropy": f"{summary['class_entropy']:.2f} bit",
+        "objects by class": _counts(summary["classes"]),
+        "unstable scenes": _counts(summary["instability_reasons"]),
+        "failed layouts": _counts(summary["layout_failures"]),
+        "time": f"{summary['seconds']:.1f} s with {_number(summary['workers'], 'worker')}",
+    }
+    return rows
+
+
+def describe_episode(episode: Mapping[str, Any]) -> dict[str, str]:
+    """Return an `episode.json` as texts by label."""
+    hidden = episode["hidden_at_start"]
+    return {
+        "result": f"{episode['ended']} after {_number(len(episode['moves']), 'move')}",
+        "objects": f"{episode['objects']}, of which {len(hidden)} hidden at the start",
+        "found": f"{len(episode['found'])} of {len(hidden)}: {_names(episode['found'])}",
+        "total reward": f"{episode['total_reward']:g}",
+    }
+
+
+def describe_solution(solution: Mapping[str, Any]) -> dict[str, str]:
+    """Return a `solution.json` as texts by label."""
+    rows = {"result": str(solution["solvability"])}
+    if solution["moves"] is not None:
+        proof = "optimal" if solution["is_optimal"] else "not proved optimal"
+        rows["plan"] = f"{_number(solution['moves'], 'move')}, {proof}"
+        rows["moves"] = _names(solution["plan"])
+    rows["lower bound"] = _number(solution["lower_bound"], "move")
+    if solution["unrevealable"]:
+        rows["cannot be revealed"] = _names(solution["unrevealable"])
+    if solution["confirmed"] is not None:
+        rows["confirmed by Drake"] = "yes" if solution["confirmed"] else "no"
+    evaluated, budget = solution["moves_evaluated"], solution["budget"]
+    rows["search"] = f"{evaluated} of at most {budget} moves evaluated"
+    return rows
+
+
+def describe_feasibility(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return the `summary.json` of a feasibility study as texts by setup."""
+    rows = {}
+    for name, statistics in summary["setups"].items():
+        failures = {k: n for k, n in statistics["results"].items() if k != "planned"}
+        text = f"{statistics['planned']} of {_number(statistics['moves'], 'move')} planned"
+        rows[name] = f"{text}; failures: {_counts(failures)}"
+    return rows
+
+
+def describe_plans(plans: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the plans of a `plan.json` as texts by move."""
+    return {f"{p['move']['pick']} to {p['move']['place']}": _describe_plan(p) for p in plans}
+
+
+def _describe_plan(plan: Mapping[str, Any]) -> str:
+    if not plan["planned"]:
+        return f"no plan: {': '.join(filter(None, (plan['reason'], plan['detail'])))}"
+    segments = [f"{segment['name']} {segment['duration']:.2f} s" for segment in plan["segments"]]
+    distances = [s["min_distance"] for s in plan["segments"] if s["min_distance"] is not None]
+    nearest = f"{1000 * min(distances):.0f} mm" if distances else "farther than 30 mm"
+    return (
+        f"{', '.join(segments)}; nearest obstacle {nearest}; planned in "
+        f"{plan['planning_time']:.2f} s"
+    )
+
+
+def _fraction(value: float, interval: Sequence[float] | None, total: str) -> str:
+    return f"{value:.2f} of the {total}{_interval(interval)}"
+
+
+def _interval(interval: Sequence[float] | None) -> str:
+    return f" (95 % CI {interval[0]:.2f} to {interval[1]:.2f})" if interval else ""
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
