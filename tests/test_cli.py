@@ -127,12 +127,12 @@ def test_explore_finds_what_is_below(fidelity: str, scene: Path, tmp_path: Path)
     assert printed == episode
     assert episode["fidelity"] == fidelity
     assert episode["success"] is True
-    assert episode["hidden_at_start"] == episode["found"] == ["below"]
+    assert episode["initially_hidden"] == episode["found"] == ["below"]
     (only,) = episode["moves"]
     assert only["move"] == {"pick": "above", "place": "tray"}
     assert only["outcome"] == "placed"
     assert only["newly_found"] == ["below"]
-    assert only["visible_share"]["below"] > 0.99
+    assert only["visible_fractions"]["below"] > 0.99
     assert only["reward"] == 1.0
     assert (out / "index.html").is_file()
 
@@ -141,7 +141,12 @@ def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: P
     out = tmp_path / "solution"
     printed = json.loads(run("solve", scene, "--json", "--out", out).stdout)
     assert printed == json.loads((out / "solution.json").read_text())
-    assert (printed["answer"], printed["moves"], printed["fewest"], printed["confirmed"]) == (
+    assert (
+        printed["solvability"],
+        printed["moves"],
+        printed["is_optimal"],
+        printed["confirmed"],
+    ) == (
         "solvable",
         1,
         True,

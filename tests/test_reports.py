@@ -127,7 +127,7 @@ def test_the_page_says_what_happened(folder: Path) -> None:
     assert "Newly found: Gelatin box 1." in text
     assert "0% \N{RIGHTWARDS ARROW} 100%" in text
     assert "no free spot" in text
-    assert "Sugar box 3: toppled (100 mm, 86\N{DEGREE SIGN})" in text
+    assert "Sugar box 3: toppled (moved 100 mm, tilted 86\N{DEGREE SIGN})" in text
 
 
 def test_words_from_outside_are_escaped(folder: Path) -> None:
@@ -226,10 +226,10 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
         DEFAULT_CELL,
     )
     text = Page((tmp_path / "index.html").read_text(encoding="utf-8")).text
-    assert f"it knew 2 of {len(task.scene.objects)} objects" in text
+    assert f"2 of {len(task.scene.objects)} objects are known" in text
     assert text.index("60%") < text.index("40%")
-    assert f"Passed over, as there was no room for it: {display_name(other)}." in text
-    assert f"What it knew{display_name(other)}, {display_name(step.move.pick)}." in text
+    assert f"Skipped, because no free placement was found: {display_name(other)}." in text
+    assert f"Known objects{display_name(other)}, {display_name(step.move.pick)}." in text
 
 
 def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
@@ -239,9 +239,9 @@ def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> 
     write_episode_page(
         tmp_path, "Seen", task.initial_scene, task.initial_perception, [shown], {}, DEFAULT_CELL
     )
-    picture = np.asarray(Image.open(tmp_path / "images/move_01_seen.png"))
+    picture = np.asarray(Image.open(tmp_path / "images/move_01_detections.png"))
     assert picture.shape == (720, 720, 3)
-    assert "recognised in it: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()
+    assert "detected objects: Cracker box, Sugar box" in (tmp_path / "index.html").read_text()
     unseen = draw_detections(replace(seen, detections=()))
     assert (picture != unseen).any(axis=2).mean() > 0.01, "outlines and labels"
     assert (unseen[:40, :40] == unseen[0, 0]).all(), "the tray's floor"

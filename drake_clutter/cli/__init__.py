@@ -1,4 +1,7 @@
-"""The command line: a file for each command, which parses and prints; what is done is in `drake_clutter.commands`."""
+"""Command-line interface: one module per command, which parses options and prints results.
+
+The work is done in `drake_clutter.commands`.
+"""
 
 from drake_clutter.cli.app import app, main
 

@@ -1,4 +1,7 @@
-"""The application. Drake is imported by the commands that need it, so that `doctor` runs where Drake is broken."""
+"""The command-line application.
+
+Commands import Drake when they run, so that `doctor` also works where Drake cannot be imported.
+"""
 
 import typer
 
@@ -19,9 +22,10 @@ from drake_clutter.cli.view import view
 from drake_clutter.files import cli_error_handler
 
 app = typer.Typer(
-    help="Clutter that is generated, judged, looked at and searched, on Drake.",
+    help="Generate and explore cluttered tabletop scenes in Drake.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
 )
 for command in (
     generate,
@@ -43,6 +47,6 @@ app.add_typer(assets_app, name="assets")
 
 
 def main() -> None:
-    """Run the console script: a misuse is one line and exit code 2."""
+    """Run the console script; a user error is one line on standard error and exit code 2."""
     with cli_error_handler():
         app()

@@ -17,13 +17,14 @@ def assets() -> None:
 
 @assets_app.command("build")
 def build(
-    folder: Annotated[Path, typer.Argument(help="An asset folder: it holds catalog.yaml.")],
-    only: Annotated[
-        list[str] | None, typer.Option("--class", help="Build this class alone; may be repeated.")
+    folder: Annotated[Path, typer.Argument(help="Asset folder with a `catalog.yaml`.")],
+    classes: Annotated[
+        list[str] | None,
+        typer.Option("--class", help="Build only this class. May be repeated."),
     ] = None,
 ) -> None:
-    """Build SDF models, collision pieces and textures of a catalog's classes."""
+    """Build the SDF models, collision geometry and textures of a catalog."""
     from drake_clutter.assets import build_assets
 
-    for built in build_assets(folder, only):
-        out_console.print(f"built {built}")
+    for built in build_assets(folder, classes):
+        out_console.print(f"Built {built}.")

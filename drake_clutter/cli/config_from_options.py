@@ -1,4 +1,4 @@
-"""Scenes and worlds from a command's options."""
+"""Configurations, work cells and scenes from a command's options."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,24 +13,31 @@ if TYPE_CHECKING:
     from drake_clutter.scenes.scene_file import SceneFile
 
 CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures"})
-"""Fields of the work cell, which settings name without its own name."""
+"""Fields of the work cell, which settings may name without the prefix `cell.`."""
+_SUPPORT_FIELDS = (
+    "cell.support",
+    "layout.tray_side",
+    "world.cell.support",
+    "world.layout.tray_side",
+)
+"""Fields of the support in a configuration and, with `world`, in a scenario."""
 
 
 def qualify_setting(setting: str) -> str:
-    """Return FIELD=VALUE with the field's full name in the world."""
+    """Return FIELD=VALUE with the full name of the field in the configuration."""
     return f"cell.{setting}" if setting.split("=")[0].split(".")[0] in CELL_FIELDS else setting
 
 
 def check_cell_models(cell: "WorkCell", default: "WorkCell", file: Path | None) -> None:
-    """Read the models of a cell, before anything is done with it.
+    """Load the robot and fixture models of a cell, so that errors are reported early.
 
     Args:
         cell: The cell.
-        default: What it was without options: what the models are then, a command may do without.
-        file: Which file it is from; None: from --set.
+        default: The cell without options; its models are not checked.
+        file: File that the cell was read from; None if `--set` changed it.
 
     Raises:
-        InputError: The file, the field and what is allowed.
+        InputError: A model cannot be loaded.
     """
     from drake_clutter.files import InputError
     from drake_clutter.simulation.cell_plant import validate_models
@@ -44,15 +51,13 @@ def check_cell_models(cell: "WorkCell", default: "WorkCell", file: Path | None) 
 
 
 def reject_support_settings(settings: Sequence[str] | None) -> None:
-    """Refuse settings of the support, on which the objects of scenes stand already.
+    """Refuse settings of the support, because the objects of a scene stand on its own support.
 
     Raises:
-        InputError: There is one.
+        InputError: A setting changes the support.
     """
     for setting in settings or ():
-        if qualify_setting(setting).startswith(
-            ("cell.support", "layout.tray_side", "world.cell.support", "world.layout.tray_side")
-        ):
+        if qualify_setting(setting).startswith(_SUPPORT_FIELDS):
             raise input_error(
                 f"--set {setting}",
                 "the objects stand on their scene's support; allowed are other fields",
@@ -60,56 +65,69 @@ def reject_support_settings(settings: Sequence[str] | None) -> None:
 
 
 def load_config_from_options(
-    config: Path | None,
-    cell: Path | None,
+    config_file: Path | None,
+    cell_file: Path | None,
     settings: Sequence[str] | None,
     scene_cell: "WorkCell | None" = None,
 ) -> "ClutterConfig":
-    """Return the world: the defaults with the cell, over them the config's fields, and single fields.
+    """Return the configuration of a command that reads no single scene.
+
+    Later sources replace fields of earlier ones: the defaults, the cell, the configuration file,
+    the settings.
 
     Args:
-        config: File of the config.
-        cell: File of the cell.
-        settings: Single fields.
-        scene_cell: Stands for the default cell; or None.
+        config_file: Configuration file, or None.
+        cell_file: Work cell file, or None.
+        settings: Single fields, as FIELD=VALUE.
+        scene_cell: Cell that replaces the default one; None keeps the default.
     """
     from drake_clutter.cell.work_cell import load_cell
-    from drake_clutter.config import ClutterConfig, upgrade
-    from drake_clutter.validation import load_config_as
+    from drake_clutter.config import ClutterConfig
 
     default = ClutterConfig() if scene_cell is None else ClutterConfig(cell=scene_cell)
-    base = default if cell is None else replace(default, cell=load_cell(cell))
-    loaded = load_config_as(base, config, upgrade=upgrade)
-    loaded = load_config_as(
-        loaded, settings=[qualify_setting(setting) for setting in settings or ()], upgrade=upgrade
-    )
-    check_cell_models(loaded.cell, default.cell, cell or config)
-    return loaded
+    base = default if cell_file is None else replace(default, cell=load_cell(cell_file))
+    config = _override(base, config_file, settings)
+    check_cell_models(config.cell, default.cell, cell_file or config_file)
+    return config
 
 
 def load_scene_and_config(
     scene: Path,
     catalog: Path | None,
-    config: Path | None,
-    cell: Path | None,
+    config_file: Path | None,
+    cell_file: Path | None,
     settings: Sequence[str] | None,
 ) -> tuple["SceneFile", "ClutterConfig"]:
-    """Return a scene file and the world for it.
+    """Return a scene file and the configuration for it.
 
-    The cell is that of --cell, else the one that the scene was made with; its support is the scene's, as the objects stand
-    on it. Fields of --config and --set go over it.
+    Args:
+        scene: Scene file.
+        catalog: Asset folder with the user's object classes, or None.
+        config_file: Configuration file, or None.
+        cell_file: Work cell file; None takes the cell that the scene was made with. The support
+            is always the scene's, because the objects stand on it.
+        settings: Single fields, as FIELD=VALUE.
     """
     from drake_clutter.catalog import load_catalog
     from drake_clutter.cell.work_cell import load_cell
-    from drake_clutter.config import ClutterConfig, upgrade
+    from drake_clutter.config import ClutterConfig
     from drake_clutter.scenes.scene_file import load_scene
-    from drake_clutter.validation import load_config_as
 
     file = load_scene(scene, load_catalog(catalog))
-    scene_cell = load_cell(cell).with_support(file.scene.support) if cell is not None else file.cell
-    loaded = load_config_as(replace(ClutterConfig(), cell=scene_cell), config, upgrade=upgrade)
-    loaded = load_config_as(
-        loaded, settings=[qualify_setting(setting) for setting in settings or ()], upgrade=upgrade
-    )
-    check_cell_models(loaded.cell, file.cell, cell or config)
-    return replace(file, scene=replace(file.scene, support=loaded.cell.support)), loaded
+    cell = file.cell
+    if cell_file is not None:
+        cell = load_cell(cell_file).with_support(file.scene.support)
+    config = _override(ClutterConfig(cell=cell), config_file, settings)
+    check_cell_models(config.cell, file.cell, cell_file or config_file)
+    return replace(file, scene=replace(file.scene, support=config.cell.support)), config
+
+
+def _override(
+    base: "ClutterConfig", config_file: Path | None, settings: Sequence[str] | None
+) -> "ClutterConfig":
+    """Return a configuration with the fields of a file, then of settings, replaced."""
+    from drake_clutter.config import upgrade
+    from drake_clutter.validation import load_config_as
+
+    full_settings = [qualify_setting(setting) for setting in settings or ()]
+    return load_config_as(base, config_file, full_settings, upgrade)

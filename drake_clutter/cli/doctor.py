@@ -1,32 +1,31 @@
 """`drake-clutter doctor`."""
 
 import dataclasses
-import json
 
 import typer
 from rich.table import Table
 
 from drake_clutter.cli.options import JsonOption
-from drake_clutter.cli.output import escape_markup, out_console
+from drake_clutter.cli.output import escape_markup, out_console, print_json
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Check Drake, EGL, solvers, torch and cores, and report how to mend what is missing."""
+    """Check the installation and report missing components.
+
+    Exits with code 1 if a check fails.
+    """
     from drake_clutter.installation_check import run_checks
 
-    found = run_checks()
+    checks = run_checks()
     if as_json:
-        print(json.dumps([dataclasses.asdict(check) for check in found], indent=2))
+        print_json([dataclasses.asdict(check) for check in checks])
     else:
-        table = Table("", "check", "found", "how to mend it")
-        for check in found:
-            remedy = "" if check.ok else escape_markup(check.remedy)
+        table = Table("", "check", "found", "remedy")
+        for check in checks:
+            status = "[green]ok" if check.ok else "[red]failed"
             table.add_row(
-                "[green]ok" if check.ok else "[red]no",
-                check.name,
-                escape_markup(check.detail),
-                remedy,
+                status, check.name, escape_markup(check.detail), escape_markup(check.remedy)
             )
         out_console.print(table)
-    if not all(check.ok for check in found):
+    if not all(check.ok for check in checks):
         raise typer.Exit(1)

@@ -1,6 +1,5 @@
 """`drake-clutter evaluate`."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,19 +22,20 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import out_console, progress_bar
+from drake_clutter.cli.output import out_console, print_json, progress_bar
 from drake_clutter.files import InputError
 
 
 def evaluate(
     source: Annotated[
         str | None,
-        typer.Argument(metavar="SCENES", help="The same as --scenes.", show_default=False),
+        typer.Argument(metavar="SCENES", help="The same as `--scenes`.", show_default=False),
     ] = None,
     scenes: Annotated[
         str | None,
         typer.Option(
-            help="A frozen set (sg_star_25, ...) or its file, or a folder of scene files that were judged."
+            help="Shipped scene set, such as sg_star_25; a scene set file; or a folder of scene "
+            "files with verdicts, such as the `scenes` folder that `generate` writes."
         ),
     ] = None,
     agents: Annotated[
@@ -44,13 +44,14 @@ def evaluate(
             "--agents",
             "--agent",
             metavar="NAME,...",
-            help="As for `explore`, or full-knowledge; may be repeated.",
-            show_default="those without learning",
+            help="Exploration policies, as for `explore`, or full-knowledge (optimal plans from "
+            "the true scene). May be repeated.",
+            show_default="random,largest-first,largest-clear",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="JSON to write, with the rows and every episode."),
+        typer.Option(metavar="FILE", help="JSON file to write, with statistics and all episodes."),
     ] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
@@ -61,39 +62,41 @@ def evaluate(
     workers: WorkersOption = 1,
     ray: RayOption = None,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare explorers on scenes that hide something."""
+    """Compare exploration policies on scenes with hidden objects."""
     from drake_clutter.agents.explorers import BASELINE_POLICIES
-    from drake_clutter.commands import evaluate_explorers as command
-    from drake_clutter.reports.terminal_text import evaluation_table_rows
+    from drake_clutter.commands.evaluate_explorers import (
+        common_cell,
+        evaluate_explorers,
+        load_evaluation_scenes,
+        move_limits,
+    )
+    from drake_clutter.reports.terminal_text import EVALUATION_CAPTION, evaluation_table_rows
 
     scenes_source = scenes or source
     if scenes_source is None or None not in (scenes, source):
-        raise InputError(
-            "--scenes: give it once; allowed are a frozen set, its file, and a folder of scene files that were judged"
-        )
+        allowed = "a shipped scene set, a scene set file, or a folder of scene files with verdicts"
+        raise InputError(f"--scenes: give it once; allowed is {allowed}")
     reject_support_settings(settings)
-    evaluation_scenes = command.load_evaluation_scenes(scenes_source, catalog)[:max_scenes]
-    world = load_config_from_options(
-        config, cell, settings, None if cell else command.common_cell(evaluation_scenes)
-    )
-    names = [name for some in agents or BASELINE_POLICIES for name in some.split(",")]
-    limit = max_moves or world.exploration.max_moves
+    evaluation_scenes = load_evaluation_scenes(scenes_source, catalog)[:max_scenes]
+    scene_cell = None if cell_file else common_cell(evaluation_scenes)
+    config = load_config_from_options(config_file, cell_file, settings, scene_cell)
+    limit = max_moves or config.exploration.max_moves
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
         return progress_bar("episodes", results, 0, total)
 
-    rows = command.evaluate_explorers(
+    rows = evaluate_explorers(
         evaluation_scenes,
-        names,
+        [name for names in agents or BASELINE_POLICIES for name in names.split(",")],
         limit,
         fidelity.value,
         seed,
-        world,
+        config,
         catalog,
         workers,
         out,
@@ -101,21 +104,21 @@ def evaluate(
         ray,
     )
     if as_json:
-        print(json.dumps(rows, indent=2))
+        print_json(rows)
         return
-    shown = [
+    table_rows = [
         {"agent": row["agent"]} | cells
         for row in rows
-        for cells in evaluation_table_rows(row, command.move_limits(limit))
+        for cells in evaluation_table_rows(row, move_limits(limit))
     ]
-    title = f"{scenes_source}: {rows[0]['episodes']} scenes, {rows[0]['hidden']:.1f} objects hidden"
+    hidden = f"{rows[0]['hidden']:.1f} hidden objects per scene"
     table = Table(
-        *shown[0],
-        title=title,
+        *table_rows[0],
+        title=f"{scenes_source}: {rows[0]['episodes']} scenes, {hidden}",
         box=SIMPLE,
         padding=(0, 1, 0, 0),
-        caption="in: so many moves; moves: of those who found all",
+        caption=EVALUATION_CAPTION,
     )
-    for cells in shown:
+    for cells in table_rows:
         table.add_row(*cells.values())
     out_console.print(table)

@@ -27,27 +27,28 @@ def explore(
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Search a scene for what it hides; writes episode.json and a page, index.html."""
-    from drake_clutter.commands import explore_scene as command
+    """Search a scene for its hidden objects.
 
-    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
+    Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`.
+    """
+    from drake_clutter.commands.explore_scene import explore_scene, settle_scene, write_episode
+
+    file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     prepare_output_directory(out)
-    limit = max_moves or world.exploration.max_moves
-    task = command.explore_scene(
-        command.settle_scene(file.scene, world, seed),
+    task = explore_scene(
+        settle_scene(file.scene, config, seed),
         agent,
         fidelity.value,
-        limit,
+        max_moves or config.exploration.max_moves,
         seed,
-        world,
+        config,
         print_transition,
     )
     title = f"{agent} explores {scene.name}"
-    print_episode(
-        command.write_episode(out, task, title, agent, fidelity.value, seed, world), as_json, out
-    )
+    episode = write_episode(out, task, title, agent, fidelity.value, seed, config)
+    print_episode(episode, as_json, out)

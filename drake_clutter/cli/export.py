@@ -11,7 +11,7 @@ from drake_clutter.files import prepare_output_directory
 
 
 class Format(Enum):
-    """Formats that a scene can be exported to."""
+    """File formats for exported scenes."""
 
     DMD = "dmd"
     SDF = "sdf"
@@ -24,7 +24,10 @@ def export(
     out: OutOption,
     format: Annotated[
         Format,
-        typer.Option(help="For Drake, PyBullet and other SDF readers, MuJoCo, any 3-D viewer."),
+        typer.Option(
+            help="dmd: Drake model directives. sdf: PyBullet, Gazebo. mjcf: MuJoCo. glb: 3-D "
+            "viewers."
+        ),
     ],
     initial_poses: InitialPosesOption = False,
     catalog: CatalogOption = None,
@@ -36,6 +39,6 @@ def export(
 
     file = load_scene(scene, load_catalog(catalog))
     prepare_output_directory(out)
-    out_console.print(
-        f"wrote {export_scene(file.scene if initial_poses else file.settled_scene, ExportFormat(format.value), out)}"
-    )
+    exported = file.scene if initial_poses else file.settled_scene
+    path = export_scene(exported, ExportFormat(format.value), out)
+    out_console.print(f"Wrote {path}.")

@@ -26,6 +26,7 @@ POSE_METAVAR = "X,Y,Z,YAW"
 
 
 def _parse_pose(option: str, text: str) -> list[float]:
+    """Return x, y, z [m] and yaw [deg] from a comma-separated text."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -44,76 +45,88 @@ def feasibility(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Folder for the results; one of the same study is taken up.",
+            help="Output folder: new, empty, or of the same study, which resumes.",
         ),
     ],
-    cell: Annotated[
+    cell_files: Annotated[
         list[Path] | None,
-        typer.Option("--cell", metavar="FILE", help="Work cell to study; may be repeated."),
+        typer.Option("--cell", metavar="FILE", help="Work cell to study. May be repeated."),
     ] = None,
     settings: SetOption = None,
     base: Annotated[
         list[str] | None,
-        typer.Option(metavar=POSE_METAVAR, help="Place of the arm's base in T; may be repeated."),
+        typer.Option(
+            metavar=POSE_METAVAR,
+            help="Pose of the arm's base in the tray frame [m, m, m, deg]. May be repeated.",
+        ),
     ] = None,
     tray: Annotated[
         list[str] | None,
         typer.Option(
             metavar=POSE_METAVAR,
-            help="Instead: the tray's place, seen from the base; may be repeated.",
+            help="Alternative to `--base`: pose of the tray in the base frame [m, m, m, deg]. May "
+            "be repeated.",
         ),
     ] = None,
     cell_override: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="YAML with single fields of the cell; may be repeated."),
+        typer.Option(
+            metavar="FILE",
+            help="YAML file with the cell fields that differ from the first cell. May be repeated.",
+        ),
     ] = None,
     targets: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="YAML list of {name, translation, quaternion}: cup poses to ask about.",
+            help="Suction cup poses to check: YAML list of `{name, translation, quaternion}`.",
         ),
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
+    config_file: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask an arm about every legal move of scenes: tables, pictures and a report. A study that was stopped goes on."""
-    from drake_clutter.commands import feasibility_job as command
+    """Plan every legal move of scenes with one or several arms.
+
+    Writes CSV tables, `summary.json` and the web page `report.html`. An interrupted study resumes
+    when the same command is given again.
+    """
+    from drake_clutter.commands.feasibility_job import (
+        REPORT_FILE,
+        FeasibilityJob,
+        check_unique_names,
+        collect_scene_files,
+        make_setups,
+        read_targets,
+        run_feasibility_study,
+    )
+    from drake_clutter.reports.terminal_text import describe_feasibility
 
     reject_support_settings(settings)
-    files = command.collect_scene_files(scenes)
-    _, world = load_scene_and_config(files[0], catalog, config, None, settings)
-    command.check_unique_names("--cell, --cell-override", [*(cell or []), *(cell_override or [])])
-    support = world.cell.support
+    files = collect_scene_files(scenes)
+    _, config = load_scene_and_config(files[0], catalog, config_file, None, settings)
+    check_unique_names("--cell, --cell-override", [*(cell_files or []), *(cell_override or [])])
+    support = config.cell.support
     cells = {
-        path.stem: load_config_from_options(config, path, settings).cell.with_support(support)
-        for path in cell or []
+        path.stem: load_config_from_options(config_file, path, settings).cell.with_support(support)
+        for path in cell_files or []
     }
-    setups = command.make_setups(
+    setups = make_setups(
         [_parse_pose("--base", text) for text in base or []],
         [_parse_pose("--tray", text) for text in tray or []],
         cell_override or [],
-        next(iter(cells.values()), world.cell),
+        next(iter(cells.values()), config.cell),
     )
     if cells:
-        setups = cells | {name: other for name, other in setups.items() if name != "default"}
-    asked = command.read_targets(targets) if targets else ()
-    job = command.FeasibilityJob(files, setups, asked, seed, world, catalog)
+        setups = cells | {name: cell for name, cell in setups.items() if name != "default"}
+    target_poses = read_targets(targets) if targets else ()
+    job = FeasibilityJob(files, setups, target_poses, seed, config, catalog)
 
-    def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-        return progress_bar("parts", made, done, total)
+    def progress(parts: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+        return progress_bar("parts of the study", parts, num_done, total)
 
-    summary = command.run_feasibility_study(job, out, workers, progress)
-    lines = {
-        name: f"{found['planned']} of {found['moves']} planned; "
-        + ", ".join(f"{n} {why}" for why, n in found["results"].items() if why != "planned")
-        for name, found in summary["setups"].items()
-    }
-    print_result(
-        summary if as_json else lines | {"report": str(out / command.REPORT_FILE)},
-        as_json,
-        f"{out}",
-    )
+    summary = run_feasibility_study(job, out, workers, progress)
+    rows = describe_feasibility(summary) | {"report": str(out / REPORT_FILE)}
+    print_result(summary, rows, as_json, f"{out}")

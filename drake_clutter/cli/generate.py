@@ -26,41 +26,44 @@ def generate(
     out: OutOption,
     agent: Annotated[
         str,
-        typer.Option(help="random, hill-climbing, or the file of a checkpoint that you trained."),
+        typer.Option(
+            help="Generation policy: random, hill-climbing; sg, sg-star or sg-14 (trained); or a "
+            "checkpoint file."
+        ),
     ] = "random",
     temperature: Annotated[
         float | None,
-        typer.Option(help="Of a trained agent: low for the best scenes, high for all kinds."),
+        typer.Option(
+            help="Softmax temperature of a trained policy: lower gives higher rewards, higher "
+            "gives more variety. Default: the one stored in its checkpoint."
+        ),
     ] = None,
     objects: ObjectsOption = "ycb7",
     nodes: NodesOption = 25,
-    count: Annotated[int, typer.Option(help="Scenes to generate.")] = 100,
+    count: Annotated[int, typer.Option(help="Number of scenes.")] = 100,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     ray: RayOption = None,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Generate scenes, settle them in Drake and say which are stable and what they hide. A run that was stopped goes on."""
+    """Generate scenes and judge their stability and hidden objects in Drake.
+
+    Writes one file per scene, `summary.json` and `contact_sheet.png`. An interrupted run resumes
+    when the same command is given again; a larger `--count` extends it.
+    """
     from drake_clutter.agents.generators import GenerationJob
-    from drake_clutter.commands import generate_scenes as command
+    from drake_clutter.commands.generate_scenes import generate_scenes
+    from drake_clutter.reports.terminal_text import describe_generation
 
-    job = GenerationJob(
-        agent,
-        objects,
-        catalog,
-        nodes,
-        seed,
-        load_config_from_options(config, cell, settings),
-        temperature,
-    )
+    config = load_config_from_options(config_file, cell_file, settings)
+    job = GenerationJob(agent, objects, catalog, nodes, seed, config, temperature)
 
-    def progress(made: Iterable[Any], done: int, total: int) -> Iterable[Any]:
-        return progress_bar("scenes", made, done, total)
+    def progress(scenes: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+        return progress_bar("scenes", scenes, num_done, total)
 
-    summary = command.generate_scenes(job, count, out, workers, progress, ray)
-    shown = {key: value for key, value in summary.items() if key != "config"}
-    print_result(summary if as_json else shown, as_json, f"{out}")
+    summary = generate_scenes(job, count, out, workers, progress, ray)
+    print_result(summary, describe_generation(summary), as_json, f"{out}")

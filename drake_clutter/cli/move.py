@@ -27,29 +27,39 @@ def move(
     out: OutOption,
     pick: Annotated[str | None, typer.Option(help="Name of the object to pick.")] = None,
     place: Annotated[
-        str | None, typer.Option(help="Name of the object to put it on, or tray.")
+        str | None, typer.Option(help="Name of the object to place it on, or tray.")
     ] = None,
     moves: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="YAML list of {pick: NAME, place: NAME or tray}."),
+        typer.Option(metavar="FILE", help="YAML list of `{pick: NAME, place: NAME or tray}`."),
     ] = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
     plan_only: Annotated[
         bool,
         typer.Option(
             "--plan-only",
-            help="With --fidelity arm: write how the arm would move (plan.json), move nothing.",
+            help="Plan the arm's motions without executing them; write `plan.json`. "
+            "Needs `--fidelity arm`.",
         ),
     ] = False,
     seed: SeedOption = 0,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Carry out one chosen move, or a list of them; writes episode.json and a page, index.html."""
-    from drake_clutter.commands import explore_scene as command
+    """Execute one move or a list of moves in a scene.
+
+    Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`.
+    """
+    from drake_clutter.commands.explore_scene import (
+        execute_moves,
+        plan_moves,
+        read_moves,
+        settle_scene,
+        write_episode,
+    )
     from drake_clutter.reports.terminal_text import describe_plans
     from drake_clutter.scenes.interfaces import Move
 
@@ -57,16 +67,15 @@ def move(
         raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
     if plan_only and fidelity is not Fidelity.ARM:
         raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
-    chosen = command.read_moves(moves) if moves else [Move(str(pick), str(place))]
-    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
+    requested = read_moves(moves) if moves else [Move(str(pick), str(place))]
+    file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     prepare_output_directory(out)
-    start = command.settle_scene(file.scene, world, seed)
+    start = settle_scene(file.scene, config, seed)
     if plan_only:
-        plans = command.plan_moves(start, chosen, seed, world, out)
-        print_result({"plans": plans} if as_json else describe_plans(plans), as_json, f"{out}")
+        plans = plan_moves(start, requested, seed, config, out)
+        print_result({"plans": plans}, describe_plans(plans), as_json, f"{out}")
         return
-    task = command.execute_moves(start, chosen, seed, world, print_transition, fidelity.value)
-    fields = command.write_episode(
-        out, task, f"Moves in {scene.name}", "chosen moves", fidelity.value, seed, world
-    )
-    print_episode(fields, as_json, out)
+    task = execute_moves(start, requested, seed, config, print_transition, fidelity.value)
+    title = f"Moves in {scene.name}"
+    episode = write_episode(out, task, title, "given moves", fidelity.value, seed, config)
+    print_episode(episode, as_json, out)

@@ -36,6 +36,11 @@ def escape_markup(text: str) -> str:
     return text.replace("[", "\\[")
 
 
+def print_json(document: Any) -> None:
+    """Print a document as JSON on standard output."""
+    print(json.dumps(document, indent=2))
+
+
 def print_result(
     document: Mapping[str, Any], rows: Mapping[str, str], as_json: bool, title: str
 ) -> None:
@@ -48,7 +53,7 @@ def print_result(
         title: Title of the table.
     """
     if as_json:
-        print(json.dumps(document, indent=2))
+        print_json(document)
         return
     table = Table("", "", title=title, show_header=False)
     for label, text in rows.items():

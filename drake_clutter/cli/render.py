@@ -17,14 +17,19 @@ def render(
     scene: SceneArgument,
     out: OutOption,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
 ) -> None:
-    """Render what the cameras see: color.png, depth.png (16 bit, 0.1 mm), label.png, visible.json, picture.png."""
+    """Render the images of the cell's cameras.
+
+    Writes `color.png`, `depth.png` (16 bit, 0.1 mm per step), `label.png` (k for object k, 0 for
+    anything else), `visible.json` (visible fraction of each object) and `picture.png`.
+    """
     from drake_clutter.commands.render_scene import render_scene
 
-    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
+    file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     prepare_output_directory(out)
-    shares = render_scene(file.settled_scene, world, out)
-    print_result({name: round(share, 3) for name, share in shares.items()}, False, "visible share")
+    fractions = render_scene(file.settled_scene, config, out)
+    rows = {name: f"{fraction:.3f}" for name, fraction in fractions.items()}
+    print_result(fractions, rows, False, "visible fraction")

@@ -14,13 +14,13 @@ def replay(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE.h5", help="Recorded motions, as `--fidelity arm` writes them."
+            metavar="FILE.h5", help="Recorded motions (`trajectory.h5`) of `--fidelity arm`."
         ),
     ],
-    html: HtmlOption = None,
+    html_file: HtmlOption = None,
     catalog: CatalogOption = None,
 ) -> None:
-    """Show the arm's recorded motions in the browser (Meshcat), or write them to one HTML file."""
+    """Replay recorded arm motions in the browser (Meshcat)."""
     from drake_clutter.catalog import load_catalog
     from drake_clutter.reports.recording import concatenate_motions
     from drake_clutter.station.trajectory_file import read_trajectories
@@ -30,4 +30,5 @@ def replay(
         raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
     for number, (move, motion) in enumerate(moves, start=1):
         out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
-    show_recording(file, scene, concatenate_motions([motion for _, motion in moves]), cell, html)
+    recording = concatenate_motions([motion for _, motion in moves])
+    show_recording(file, scene, recording, cell, html_file)

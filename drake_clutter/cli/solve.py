@@ -23,27 +23,26 @@ def solve(
     scene: SceneArgument,
     out: OutOption,
     budget: Annotated[
-        int, typer.Option(min=1, help="Moves that the search may try before it gives up.")
+        int, typer.Option(min=1, help="Maximum number of moves that the search may evaluate.")
     ] = 5000,
     seed: SeedOption = 0,
     catalog: CatalogOption = None,
-    config: ConfigOption = None,
-    cell: CellOption = None,
+    config_file: ConfigOption = None,
+    cell_file: CellOption = None,
     settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the fewest moves that reveal everything, with full knowledge of the scene; Drake confirms the plan."""
-    from drake_clutter.commands import explore_scene, solve_scene
+    """Find the shortest plan that reveals all objects, given full state information.
 
-    file, world = load_scene_and_config(scene, catalog, config, cell, settings)
+    The search uses the static stability model; a plan is then executed and confirmed in Drake.
+    Writes `solution.json` and, with a plan, `moves.yaml`, `episode.json` and `index.html`.
+    """
+    from drake_clutter.commands.explore_scene import settle_scene
+    from drake_clutter.commands.solve_scene import solve_scene
+    from drake_clutter.reports.terminal_text import describe_solution
+
+    file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     prepare_output_directory(out)
-    fields = solve_scene.solve_scene(
-        explore_scene.settle_scene(file.scene, world, seed),
-        scene.name,
-        out,
-        seed,
-        budget,
-        world,
-        print_transition,
-    )
-    print_result(fields, as_json, f"{out}")
+    start = settle_scene(file.scene, config, seed)
+    solution = solve_scene(start, scene.name, out, seed, budget, config, print_transition)
+    print_result(solution, describe_solution(solution), as_json, f"{out}")

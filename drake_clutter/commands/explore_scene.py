@@ -189,9 +189,9 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
                 "instability": str(instability) if instability else None,
                 "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
-                "picks": dict(step.decision.pick_probabilities),
-                "known": list(step.decision.considered),
-                "visible_share": step.next_perception.visible_fractions,
+                "pick_probabilities": dict(step.decision.pick_probabilities),
+                "known_objects": list(step.decision.considered),
+                "visible_fractions": step.next_perception.visible_fractions,
                 "reward": step.reward,
             }
         )
@@ -200,12 +200,12 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "seed": seed,
         "fidelity": fidelity,
         "success": end is TerminationReason.ALL_FOUND,
-        "ended": end.value,
-        "objects": len(task.scene.objects),
-        "hidden_at_start": list(task.initially_hidden),
+        "termination": end.value,
+        "num_objects": len(task.scene.objects),
+        "initially_hidden": list(task.initially_hidden),
         "found": list(task.found),
         "total_reward": sum(step.reward for step in task.transitions),
-        "visible_share_at_start": task.initial_perception.visible_fractions,
+        "initial_visible_fractions": task.initial_perception.visible_fractions,
         "moves": moves,
     }
 

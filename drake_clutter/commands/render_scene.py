@@ -45,6 +45,6 @@ def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -
     hidden = list(camera.hidden_objects(visible_fractions))
     write_json(
         out / f"{prefix}visible.json",
-        {"visible_share": visible_fractions, "hidden": hidden, "names": list(scene.names)},
+        {"visible_fractions": visible_fractions, "hidden": hidden, "names": list(scene.names)},
     )
     return visible_fractions

@@ -40,13 +40,13 @@ def solve_scene(
     """
     solution = OracleSearch(config).solve(scene, seed, budget)
     fields: dict[str, Any] = {
-        "answer": solution.solvability.value,
+        "solvability": solution.solvability.value,
         "moves": len(solution.plan) if solution.solvability is Solvability.SOLVABLE else None,
-        "at_least": solution.lower_bound,
-        "fewest": solution.is_optimal,
+        "lower_bound": solution.lower_bound,
+        "is_optimal": solution.is_optimal,
         "plan": [str(move) for move in solution.plan],
-        "never_found": list(solution.unrevealable),
-        "moves_tried": solution.moves_evaluated,
+        "unrevealable": list(solution.unrevealable),
+        "moves_evaluated": solution.moves_evaluated,
         "budget": budget,
         "seed": seed,
         "confirmed": None,

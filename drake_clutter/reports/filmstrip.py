@@ -1,4 +1,4 @@
-"""Pictures of the arm at work: moments of a recorded move, side by side."""
+"""Images of the arm during a recorded move."""
 
 from collections.abc import Sequence
 
@@ -24,39 +24,45 @@ from drake_clutter.simulation.scene_plant import add_scene_plant, rigid_transfor
 
 _FRAME_SIZE = (480, 480)
 _OVERSAMPLING = 2
-_CAMERA_POSITION, _CAMERA_TARGET, _FOV_Y_DEG = (1.10, -1.90, 1.30), (-0.22, 0.0, 0.46), 36.0
-"""Where the camera is and what it looks at [m], if the arm's base is at -x; and its view [deg]."""
-_RENDERER = "arm_pictures"
+_CAMERA_POSITION = (1.10, -1.90, 1.30)
+"""Position of the camera in the tray frame, if the arm's base is at -x [m]."""
+_CAMERA_TARGET = (-0.22, 0.0, 0.46)
+"""Point that the camera looks at [m]."""
+_FOV_Y_DEG = 36.0
+_RENDERER = "filmstrip"
+_MIN_HEIGHT_CHANGE = 0.002
+"""Smallest change of an object's height that counts as lifting or lowering [m]."""
 
 
 def select_key_frames(frames: Sequence[MotionSample], pick: str) -> list[MotionSample]:
-    """The frames of a recorded move that tell it: before, the object's rise, its way, and when it stands."""
-    height = np.array([frame.poses[pick].p[2] for frame in frames])
-    horizontal_distance = np.array(
-        [np.linalg.norm(frame.poses[pick].p[:2] - frames[0].poses[pick].p[:2]) for frame in frames]
-    )
-    above_start = np.flatnonzero(height > height[0] + 0.002)
-    lift_start = int(above_start[0]) if len(above_start) else len(frames) // 2
-    arrival = (
-        int(np.flatnonzero(horizontal_distance >= 0.98 * horizontal_distance.max())[0])
-        if len(above_start)
-        else len(frames) // 2
-    )
-    moving = np.flatnonzero(np.abs(height - height[-1]) > 0.002)
+    """Return four frames of a recorded move: before the lift, carrying, placed, and retreating.
+
+    Args:
+        frames: The recorded motion.
+        pick: Name of the moved object.
+    """
+    positions = np.array([frame.poses[pick].p for frame in frames])
+    height = positions[:, 2]
+    horizontal_distance = np.linalg.norm(positions[:, :2] - positions[0, :2], axis=1)
+    above_start = np.flatnonzero(height > height[0] + _MIN_HEIGHT_CHANGE)
+    lift_start = arrival = len(frames) // 2
+    if len(above_start):
+        lift_start = int(above_start[0])
+        arrived = horizontal_distance >= 0.98 * horizontal_distance.max()
+        arrival = int(np.flatnonzero(arrived)[0])
+    moving = np.flatnonzero(np.abs(height - height[-1]) > _MIN_HEIGHT_CHANGE)
     placed = min(int(moving[-1]) + 1, len(frames) - 1) if len(moving) else len(frames) - 1
-    return [
-        frames[k]
-        for k in (
-            max(lift_start - 2, 0),
-            (lift_start + arrival) // 2,
-            placed,
-            (placed + len(frames)) // 2,
-        )
-    ]
+    carry = (lift_start + arrival) // 2
+    retreat = (placed + len(frames)) // 2
+    return [frames[k] for k in (max(lift_start - 2, 0), carry, placed, retreat)]
 
 
 def rotation_to_base_side(cell: WorkCell) -> NDArray[np.float64]:
-    """Return the rotation (3, 3), by quarter turns about z, of the direction -x to that of the arm's base."""
+    """Return the rotation by quarter turns about z from -x to the side of the arm's base.
+
+    Returns:
+        Rotation matrix. Shape (3, 3).
+    """
     x, y = cell.robot.X_TB.translation()[:2]
     c, s = (-np.sign(x), 0.0) if abs(x) >= abs(y) else (0.0, -np.sign(y))
     if not c and not s:
@@ -67,8 +73,25 @@ def rotation_to_base_side(cell: WorkCell) -> NDArray[np.float64]:
 def render_filmstrip(
     scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
 ) -> NDArray[np.uint8]:
-    """Pictures of frames that know where the arm was, side by side: (480, 480 n, 3) uint8."""
-    builder, cell = DiagramBuilder(), cell.with_support(scene.support)
+    """Return the images of n frames side by side; see `render_frames`. Shape (480, 480 n, 3)."""
+    return np.hstack(render_frames(scene, frames, cell))
+
+
+def render_frames(
+    scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
+) -> list[NDArray[np.uint8]]:
+    """Return an image of the cell for each frame.
+
+    Args:
+        scene: The objects.
+        frames: Frames with joint positions of the arm.
+        cell: The work cell; its support is replaced by the scene's.
+
+    Returns:
+        RGB images. Shape (480, 480, 3) each.
+    """
+    cell = cell.with_support(scene.support)
+    builder = DiagramBuilder()
     scene_plant = add_scene_plant(
         builder,
         [(o.name, o.object_class) for o in scene.objects],
@@ -81,8 +104,8 @@ def render_filmstrip(
     plant.Finalize()
     scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RENDER_ENGINE))
     diagram = builder.Build()
-    root = diagram.CreateDefaultContext()
-    context = plant.GetMyMutableContextFromRoot(root)
+    root_context = diagram.CreateDefaultContext()
+    plant_context = plant.GetMyMutableContextFromRoot(root_context)
     width, height = (_OVERSAMPLING * size for size in _FRAME_SIZE)
     info = CameraInfo(width, height, np.radians(_FOV_Y_DEG))
     camera = ColorRenderCamera(
@@ -93,17 +116,15 @@ def render_filmstrip(
         look_at_pose(R @ np.array(_CAMERA_POSITION), R @ np.array(_CAMERA_TARGET))
     )
     query_port = scene_plant.scene_graph.get_query_output_port()
-    pictures = []
+    images = list[NDArray[np.uint8]]()
     for frame in frames:
         for name, body in scene_plant.bodies.items():
-            plant.SetFreeBodyPose(context, body, rigid_transform(frame.poses[name]))
-        assert frame.arm is not None, "these are an arm's motions"
-        set_joint_angles(plant, context, arm, frame.arm.q)
-        query = query_port.Eval(scene_plant.scene_graph.GetMyContextFromRoot(root))
-        color = query.RenderColorImage(camera, query.inspector().world_frame_id(), X_TC).data[
-            :, :, :3
-        ]
-        pictures.append(
-            np.asarray(Image.fromarray(color).resize(_FRAME_SIZE, Image.Resampling.LANCZOS))
-        )
-    return np.hstack(pictures)
+            plant.SetFreeBodyPose(plant_context, body, rigid_transform(frame.poses[name]))
+        assert frame.arm is not None, "the frames must have joint positions"
+        set_joint_angles(plant, plant_context, arm, frame.arm.q)
+        query = query_port.Eval(scene_plant.scene_graph.GetMyContextFromRoot(root_context))
+        world_frame = query.inspector().world_frame_id()
+        color = query.RenderColorImage(camera, world_frame, X_TC).data[:, :, :3]
+        image = Image.fromarray(color).resize(_FRAME_SIZE, Image.Resampling.LANCZOS)
+        images.append(np.asarray(image))
+    return images

@@ -73,10 +73,10 @@ def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
 
 def describe_episode(episode: Mapping[str, Any]) -> dict[str, str]:
     """Return an `episode.json` as texts by label."""
-    hidden = episode["hidden_at_start"]
+    hidden = episode["initially_hidden"]
     return {
-        "result": f"{episode['ended']} after {_number(len(episode['moves']), 'move')}",
-        "objects": f"{episode['objects']}, of which {len(hidden)} hidden at the start",
+        "result": f"{episode['termination']} after {_number(len(episode['moves']), 'move')}",
+        "objects": f"{episode['num_objects']}, of which {len(hidden)} hidden at the start",
         "found": f"{len(episode['found'])} of {len(hidden)}: {_names(episode['found'])}",
         "total reward": f"{episode['total_reward']:g}",
     }
