@@ -204,6 +204,6 @@ def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> 
     other.write_text(config_yaml(load_cell(UR5E)))
     with pytest.raises(
         InputError,
-        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are files",
+        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are unique file names",
     ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

@@ -236,7 +236,7 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
     fields = write_scenario_results(
         tmp_path, Scenario(agent="largest-clear"), task, timing, "A test"
     )
-    assert (fields["success"], fields["ended"]) == (True, "all found")
+    assert (fields["success"], fields["termination"]) == (True, "all found")
     assert json.loads((tmp_path / "episode.json").read_text()) == json.loads(json.dumps(fields))
     assert {path.name for path in tmp_path.iterdir()} >= {
         "index.html",
@@ -244,6 +244,9 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
         "trajectory.h5",
         "scenario.yaml",
     }
+    page = (tmp_path / "index.html").read_text()
+    assert "The motion of the arm and of all objects is simulated." in page
+    assert all(f"images/move_02_arm_{number}.png" in page for number in (1, 2, 3, 4))
 
 
 @pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])

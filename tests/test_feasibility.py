@@ -191,7 +191,7 @@ def test_cells_of_one_name_are_refused(scenes: Path, tmp_path: Path) -> None:
         arguments += ["--cell", str(path)]
     told = CliRunner().invoke(app, arguments)
     assert isinstance(told.exception, InputError)
-    assert "cell is there twice; allowed are files with names of their own" in str(told.exception)
+    assert "cell is there twice; allowed are unique file names" in str(told.exception)
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +284,7 @@ def test_a_study_from_the_command_line(
     assert {name for name in after if after[name] != before[name]} == {gone.name}
     told = CliRunner().invoke(app, [*arguments, "--seed", "1"])
     assert isinstance(told.exception, InputError)
-    assert "holds another study" in str(told.exception)
+    assert "holds results of other options" in str(told.exception)
 
 
 def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,7 +309,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     reach = table(out / "reach.csv")
     for name in names:
         of_setup = [row for row in reach if row["setup"] == name]
-        assert max(float(row["share"]) for row in of_setup) == 1.0
+        assert max(float(row["reachable_fraction"]) for row in of_setup) == 1.0
         assert {float(row["x"]) for row in of_setup} == {-0.2, 0.2}, (
             "over the scene's tray, whatever the cell's"
         )

@@ -1,11 +1,11 @@
-"""`drake-clutter feasibility`: what an arm could do in scenes, as tables, pictures and a report; resumable, in parallel."""
+"""Kinematic feasibility studies, as CSV tables and a web page; parallel and resumable."""
 
 import csv
 import io
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,9 @@ from pydantic import field_validator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
+from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig, upgrade_cell
-from drake_clutter.files import InputError, prepare_output_directory, write_json, write_text
+from drake_clutter.files import InputError, write_json, write_text
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
 from drake_clutter.reports.feasibility_report import write_feasibility_report
@@ -47,21 +48,38 @@ from drake_clutter.validation import (
 from drake_clutter.workers.parallel_map import map_ordered
 from drake_clutter.yaml_io import read_yaml
 
-JOB_FILE, PARTS_FOLDER, REPORT_FILE = "job.json", "parts", "report.html"
-MAP_HEIGHTS, MAP_SPACING = (0.05, 0.20, 0.35, 0.50), 0.05
-"""m, of the reachability map."""
+PARTS_FOLDER = "parts"
+REPORT_FILE = "report.html"
+MAP_HEIGHTS = (0.05, 0.20, 0.35, 0.50)
+"""Heights of the reachability map above the floor of the support [m]."""
+MAP_SPACING = 0.05
+"""Grid spacing of the reachability map [m]."""
 PLANNING_TIME_LIMIT = 5.0
-"""s, for each move."""
-BASE_GRID_X, BASE_GRID_Y = (
-    np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist(),
-    np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist(),
-)
-"""m, of the bases that are compared, on one side of the tray: the other sides of a square one are like it."""
+"""Time limit for planning one move [s]."""
+BASE_GRID_X = np.round(np.arange(-1.0, -0.40, 0.1), 3).tolist()
+"""x of the compared base positions in the tray frame [m].
+
+They lie on one side of the tray; the other sides of a square tray are equivalent.
+"""
+BASE_GRID_Y = np.round(np.arange(-0.6, 0.61, 0.2), 3).tolist()
+"""y of the compared base positions in the tray frame [m]."""
+_RENAMED_PART_FIELDS = {
+    "noise": "pose_errors",
+    "share": "reachable_fraction",
+    "branches": "num_solutions",
+    "in_the_way": "blocking_bodies",
+}
+"""Current names of fields in part files by those that version 0.1 wrote."""
 
 
 @dataclass(frozen=True)
 class TargetPose:
-    """A pose of the cup that a user asks about."""
+    """Pose of the suction cup whose reachability is checked.
+
+    Attributes:
+        name: Name in the results.
+        X_TG: Pose of the cup in the tray frame; z points out of the tool.
+    """
 
     name: str
     X_TG: Pose
@@ -69,13 +87,15 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class FeasibilityJob:
-    """Everything that decides what a study finds.
+    """Everything that decides the results of a study.
 
     Attributes:
-        scenes: files. setups: arms by name.
-        targets: poses of the cup that are asked about beside the moves.
-        seed: of places and errors. world: the config.
-        catalog_folder: a user's asset folder, or None.
+        scenes: Scene files.
+        setups: Work cells by name.
+        targets: Poses of the suction cup to check in addition to the moves.
+        seed: Seed of placements and pose errors.
+        config: Configuration; its cell is replaced by that of each setup.
+        catalog_folder: Asset folder with the user's object classes, or None.
     """
 
     scenes: tuple[Path, ...]
@@ -86,29 +106,30 @@ class FeasibilityJob:
     catalog_folder: Path | None
 
     def to_dict(self) -> dict[str, Any]:
-        """As a document."""
+        """Return the job as a JSON document."""
         return {
             "scenes": [str(path.resolve()) for path in self.scenes],
             "setups": {name: to_plain(cell) for name, cell in self.setups.items()},
             "targets": [asdict(target) for target in self.targets],
             "seed": self.seed,
-            "world": to_plain(self.config),
+            "config": to_plain(self.config),
             "catalog_folder": str(self.catalog_folder.resolve()) if self.catalog_folder else None,
         }
 
 
 def collect_scene_files(paths: Sequence[Path]) -> tuple[Path, ...]:
-    """Scene files, and those of folders, in order.
+    """Return scene files and those of folders, in order.
 
     Raises:
-        InputError: a folder without any, or names that are there twice.
+        InputError: A folder has no scene files, or two files have the same name.
     """
     scene_paths = list[Path]()
     for path in paths:
         files = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
         if not files:
             raise InputError(
-                f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote"
+                f"{path}: holds no scene files (*.yaml); give the `scenes` folder that `generate` "
+                "wrote"
             )
         scene_paths += files
     check_unique_names("scenes", scene_paths)
@@ -116,17 +137,18 @@ def collect_scene_files(paths: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def check_unique_names(source: str, files: Sequence[Path]) -> None:
-    """Refuse files of which two have the same name but for its end, as results are named after them.
+    """Check that file names without suffix are unique, because results are named after them.
+
+    Args:
+        source: Option that the files come from, for the message.
+        files: The files.
 
     Raises:
-        InputError: The name.
+        InputError: Two files have the same name.
     """
-    if duplicates := [
-        name for name, count in Counter(path.stem for path in files).items() if count > 1
-    ]:
-        raise InputError(
-            f"{source}: {duplicates[0]} is there twice; allowed are files with names of their own"
-        )
+    counts = Counter(path.stem for path in files)
+    if duplicates := [name for name, count in counts.items() if count > 1]:
+        raise InputError(f"{source}: {duplicates[0]} is there twice; allowed are unique file names")
 
 
 def make_setups(
@@ -135,17 +157,17 @@ def make_setups(
     cell_files: Sequence[Path],
     default: WorkCell,
 ) -> dict[str, WorkCell]:
-    """Return cells by name: the files', and the default one with other bases; the default one if nothing is given.
+    """Return the work cells to study by name; the default cell if nothing else is given.
 
     Args:
-        base_poses: X_TB as x, y, z (m) and yaw (deg), roll and pitch as they are.
-        tray_poses: X_BT as x, y, z (m) and yaw (deg), without roll and pitch.
-        cell_files: YAML with fields of `WorkCell` over those of the default; whole cells if they name
-            a robot's model.
-        default: A cell; all have its support, which is the scenes'.
+        base_poses: X_TB as x, y, z [m] and yaw [deg]; roll and pitch are the default cell's.
+        tray_poses: X_BT as x, y, z [m] and yaw [deg]; roll and pitch are zero.
+        cell_files: YAML files whose fields replace those of the default cell. A file that names a
+            robot model is a complete cell.
+        default: Default cell. All cells get its support, on which the objects stand.
 
     Raises:
-        InputError: A file that is none, or a robot that cannot be loaded.
+        InputError: A file cannot be used, or a robot cannot be loaded.
     """
     cells = {
         path.stem: _load_setup_cell(path, default).with_support(default.support)
@@ -156,7 +178,8 @@ def make_setups(
         base = PoseSpec(translation=(x, y, z), rpy_deg=(roll, pitch, yaw))
         cells[f"base {x:g}, {y:g}, {z:g}, {yaw:g}"] = _with_base(default, base)
     for x, y, z, yaw in tray_poses:
-        c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+        c = math.cos(math.radians(yaw))
+        s = math.sin(math.radians(yaw))
         translation = (-(c * x + s * y), -(c * y - s * x), -z)
         base = PoseSpec(translation=translation, rpy_deg=(0.0, 0.0, -yaw))
         cells[f"tray {x:g}, {y:g}, {z:g}, {yaw:g}"] = _with_base(default, base)
@@ -192,10 +215,10 @@ class _TargetEntry(StrictModel):
 
 
 def read_targets(path: Path) -> tuple[TargetPose, ...]:
-    """Poses of the cup from a YAML list of `{name, translation, quaternion}`, X_TG: z points out of the tool.
+    """Return the cup poses of a YAML list of `{name, translation, quaternion}`.
 
     Raises:
-        InputError: the file, the entry and what is allowed.
+        InputError: The file or one of its entries cannot be used.
     """
     content = "a list of {name: TEXT, translation: [x, y, z], quaternion: [w, x, y, z]}"
     entries = validate(tuple[_TargetEntry, ...], read_yaml(path, content), str(path))
@@ -206,7 +229,16 @@ def read_targets(path: Path) -> tuple[TargetPose, ...]:
 
 @dataclass(frozen=True)
 class StudyPart:
-    """A piece of the work: of an arm the moves of a scene, or, without a scene, what it reaches; or scores of some bases."""
+    """Part of a study whose result is one file.
+
+    A part with a scene plans the moves in it; a part with a base position scores base positions;
+    any other part computes the reachability map and checks the target poses.
+
+    Attributes:
+        setup: Name of the work cell.
+        scene_index: Index of the scene, or None.
+        base_x: x of the base positions in the tray frame, or None [m].
+    """
 
     setup: str
     scene_index: int | None = None
@@ -214,28 +246,29 @@ class StudyPart:
 
     @property
     def file_name(self) -> str:
-        """Where its result is kept."""
+        """Name of the file with the result."""
         content = "reach" if self.scene_index is None else f"scene_{self.scene_index:04d}"
         return f"{self.setup}__{content if self.base_x is None else f'bases_{self.base_x:g}'}.json"
 
 
 class FeasibilityWorker:
-    """Does parts of a job; for the runner."""
+    """Computes parts of a study, in a worker process."""
 
     def __init__(self, job: FeasibilityJob) -> None:
+        """Create a worker of a job."""
         self._job = job
         self._studies: dict[str, FeasibilityStudy] = {}
 
     def __call__(self, part: StudyPart) -> dict[str, Any]:
-        """A part's result."""
+        """Return the result of a part as a JSON document."""
         cell = self._job.setups[part.setup]
         if part.base_x is not None:
-            places = [(part.base_x, y) for y in BASE_GRID_Y]
-            scores = zip(places, score_base_positions(cell, places), strict=True)
+            positions = [(part.base_x, y) for y in BASE_GRID_Y]
+            scores = zip(positions, score_base_positions(cell, positions), strict=True)
             return {
                 "bases": [
-                    {"x": x, "y": y, "share": share, "manipulability": best}
-                    for (x, y), (share, best) in scores
+                    {"x": x, "y": y, "reachable_fraction": fraction, "manipulability": best}
+                    for (x, y), (fraction, best) in scores
                 ]
             }
         if part.scene_index is None:
@@ -247,24 +280,24 @@ class FeasibilityWorker:
         reachability_map = reachability.compute_map(MAP_HEIGHTS, MAP_SPACING)
         targets = []
         for target in self._job.targets:
-            X = np.eye(4)
-            X[:3, :3], X[:3, 3] = target.X_TG.rotation, target.X_TG.p
-            result = reachability.analyze_poses(X[None])
-            q = result.q[0].tolist() if result.num_solutions[0] else None
+            X_TG = np.eye(4)
+            X_TG[:3, :3] = target.X_TG.rotation
+            X_TG[:3, 3] = target.X_TG.p
+            result = reachability.analyze_poses(X_TG[None])
             targets.append(
                 {
                     "target": target.name,
-                    "branches": int(result.num_solutions[0]),
+                    "num_solutions": int(result.num_solutions[0]),
                     "manipulability": float(result.manipulability[0]),
-                    "q": q,
-                    "in_the_way": result.blocking_bodies[0],
+                    "q": result.q[0].tolist() if result.num_solutions[0] else None,
+                    "blocking_bodies": result.blocking_bodies[0],
                 }
             )
         return {
             "x": reachability_map.x.tolist(),
             "y": reachability_map.y.tolist(),
             "heights": list(reachability_map.heights),
-            "share": reachability_map.reachable_fraction.tolist(),
+            "reachable_fraction": reachability_map.reachable_fraction.tolist(),
             "manipulability": reachability_map.manipulability.tolist(),
             "targets": targets,
         }
@@ -273,24 +306,24 @@ class FeasibilityWorker:
         path = self._job.scenes[scene_index]
         scene = load_settled_scene(path, self._job)
         if scene is None:
-            return {"scene": path.stem, "unstable": True, "moves": [], "noise": []}
+            return {"scene": path.stem, "unstable": True, "moves": [], "pose_errors": []}
         if setup not in self._studies:
-            world = replace(self._job.config, cell=self._job.setups[setup])
+            config = replace(self._job.config, cell=self._job.setups[setup])
             planner = PlannerConfig(optimize=False, time_limit=PLANNING_TIME_LIMIT)
-            self._studies[setup] = FeasibilityStudy(setup, world, planner, self._job.seed)
+            self._studies[setup] = FeasibilityStudy(setup, config, planner, self._job.seed)
         study = self._studies[setup]
         move_rows = study.plan_all_moves(path.stem, scene_index, scene)
         pose_error_rows = study.test_pose_errors(path.stem, scene_index, scene, move_rows)
         return {
             "scene": path.stem,
             "unstable": False,
-            "moves": [asdict(r) for r in move_rows],
-            "noise": [asdict(r) for r in pose_error_rows],
+            "moves": [asdict(row) for row in move_rows],
+            "pose_errors": [asdict(row) for row in pose_error_rows],
         }
 
 
 def load_settled_scene(path: Path, job: FeasibilityJob) -> Scene | None:
-    """The scene as it settles; None if it does not stay."""
+    """Return a scene at its settled poses; None if it is unstable."""
     file = load_scene(path, load_catalog(job.catalog_folder))
     verdict = file.verdict or DrakeJudge(job.config).judge(file.scene, item_rng(job.seed))
     return file.scene.with_poses(verdict.settled) if verdict.stable else None
@@ -302,47 +335,47 @@ def run_feasibility_study(
     workers: int,
     progress: Callable[[Iterable[Any], int, int], Iterable[Any]],
 ) -> dict[str, Any]:
-    """Does what of the study is not done yet; writes its tables (CSV), summary.json and report.html; returns the summary.
+    """Compute the missing parts of a study; write CSV tables, `summary.json` and `report.html`.
 
     Args:
-        job: what to find out.
-        out: a folder, new, or of the same job: that is taken up where it was left.
-        workers: processes.
-        progress: wraps the parts that are done, given how many were and how many there will be.
+        job: The study.
+        out: Output folder: new, empty, or of the same job.
+        workers: Number of worker processes.
+        progress: Wraps the results of the missing parts, given the number of existing parts and
+            the number of all parts.
+
+    Returns:
+        The summary.
 
     Raises:
-        InputError: a scene file that is none, or a folder that holds something else.
+        InputError: A scene file cannot be used, or the folder holds something else.
     """
     for path in job.scenes:
         load_scene(path, load_catalog(job.catalog_folder))
-    if (out / JOB_FILE).exists():
-        earlier = json.loads((out / JOB_FILE).read_text())
-        if json.dumps(earlier) != json.dumps(job.to_dict()):  # the order of cameras counts, too
-            raise InputError(
-                f"--out {out}: holds another study, see {JOB_FILE}; give the same options or another folder"
-            )
-    else:
-        prepare_output_directory(out)
-        write_json(out / JOB_FILE, job.to_dict())
-    (out / PARTS_FOLDER).mkdir(exist_ok=True)
-    parts = [StudyPart(setup, number) for setup in job.setups for number in range(len(job.scenes))]
-    parts += [StudyPart(setup) for setup in job.setups] + [
-        StudyPart(next(iter(job.setups)), None, x) for x in BASE_GRID_X
-    ]
-    remaining = [part for part in parts if not (out / PARTS_FOLDER / part.file_name).exists()]
+    open_job_folder(out, job.to_dict())
+    folder = out / PARTS_FOLDER
+    folder.mkdir(exist_ok=True)
+    parts = [StudyPart(setup, index) for setup in job.setups for index in range(len(job.scenes))]
+    parts += [StudyPart(setup) for setup in job.setups]
+    parts += [StudyPart(next(iter(job.setups)), None, x) for x in BASE_GRID_X]
+    remaining = [part for part in parts if not (folder / part.file_name).exists()]
     new_results = map_ordered(partial(FeasibilityWorker, job), remaining, workers=workers)
-    for part, result in zip(
-        remaining, progress(new_results, len(parts) - len(remaining), len(parts)), strict=True
-    ):
-        write_json(out / PARTS_FOLDER / part.file_name, _nan_to_none(result))
-    results = {
-        part: json.loads((out / PARTS_FOLDER / part.file_name).read_text()) for part in parts
-    }
-    return _write_results(job, out, results)
+    num_done = len(parts) - len(remaining)
+    for part, result in zip(remaining, progress(new_results, num_done, len(parts)), strict=True):
+        write_json(folder / part.file_name, _nan_to_none(result))
+    return _write_results(job, out, {part: _read_part(folder / part.file_name) for part in parts})
+
+
+def _read_part(path: Path) -> Any:
+    """Return the result of a part with the field names of this version."""
+    return json.loads(
+        path.read_text(encoding="utf-8"),
+        object_hook=lambda fields: {_RENAMED_PART_FIELDS.get(k, k): v for k, v in fields.items()},
+    )
 
 
 def _nan_to_none(value: Any) -> Any:
-    """JSON has neither NaN nor infinity: they are null."""
+    """Return a document with null in place of NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _nan_to_none(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -350,29 +383,26 @@ def _nan_to_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _write_results(job: FeasibilityJob, out: Path, results: dict[StudyPart, Any]) -> dict[str, Any]:
-    moves = [
-        row
-        for part, found in results.items()
-        if part.scene_index is not None
-        for row in found["moves"]
-    ]
-    pose_errors = [
-        row
-        for part, found in results.items()
-        if part.scene_index is not None
-        for row in found["noise"]
-    ]
-    reach = {
-        part.setup: found
-        for part, found in results.items()
+def _write_results(
+    job: FeasibilityJob, out: Path, results: Mapping[StudyPart, Any]
+) -> dict[str, Any]:
+    """Write the tables, the summary and the report from the results of all parts."""
+    scene_results = [r for part, r in results.items() if part.scene_index is not None]
+    moves = [row for result in scene_results for row in result["moves"]]
+    pose_errors = [row for result in scene_results for row in result["pose_errors"]]
+    maps = {
+        part.setup: result
+        for part, result in results.items()
         if part.scene_index is None and part.base_x is None
     }
     bases = [
-        row for part, found in results.items() if part.base_x is not None for row in found["bases"]
+        row
+        for part, result in results.items()
+        if part.base_x is not None
+        for row in result["bases"]
     ]
     targets = [
-        {"setup": setup, **target} for setup, found in reach.items() for target in found["targets"]
+        {"setup": setup, **target} for setup, result in maps.items() for target in result["targets"]
     ]
     map_rows = [
         {
@@ -380,35 +410,31 @@ def _write_results(job: FeasibilityJob, out: Path, results: dict[StudyPart, Any]
             "height": z,
             "x": x,
             "y": y,
-            **{name: f[name][k][i][j] for name in ("share", "manipulability")},
+            **{name: result[name][k][i][j] for name in ("reachable_fraction", "manipulability")},
         }
-        for setup, f in reach.items()
-        for k, z in enumerate(f["heights"])
-        for i, x in enumerate(f["x"])
-        for j, y in enumerate(f["y"])
+        for setup, result in maps.items()
+        for k, z in enumerate(result["heights"])
+        for i, x in enumerate(result["x"])
+        for j, y in enumerate(result["y"])
     ]
-    tables = {
-        "moves": (moves, MoveRecord),
-        "noise": (pose_errors, PoseErrorRecord),
-        "reach": (map_rows, None),
-        "bases": (bases, None),
-    }
-    for name, (rows, kind) in (tables | {"targets": (targets, None)}).items():
-        columns = [field.name for field in fields(kind)] if kind else list(rows[0]) if rows else []
-        if columns:
-            _write_csv(out / f"{name}.csv", columns, rows)
-    summary = summarize_study(job, moves, pose_errors)
-    summary["unstable_scenes"] = sorted(
-        {f["scene"] for p, f in results.items() if p.scene_index is not None and f["unstable"]}
+    _write_csv(out / "moves.csv", moves, [field.name for field in fields(MoveRecord)])
+    _write_csv(
+        out / "pose_errors.csv", pose_errors, [field.name for field in fields(PoseErrorRecord)]
     )
-    best = max(bases, key=lambda row: (row["share"], row["manipulability"]))
-    summary["best_base"] = best
+    _write_csv(out / "reach.csv", map_rows)
+    _write_csv(out / "bases.csv", bases)
+    _write_csv(out / "targets.csv", targets)
+    summary = summarize_study(job, moves, pose_errors)
+    summary["unstable_scenes"] = sorted({r["scene"] for r in scene_results if r["unstable"]})
+    summary["best_base"] = max(
+        bases, key=lambda row: (row["reachable_fraction"], row["manipulability"])
+    )
     write_json(out / "summary.json", summary)
-    scenes = {path.stem: path for path in job.scenes}
+    paths = {path.stem: path for path in job.scenes}
 
     def load_scene_by_name(name: str) -> Scene:
-        scene = load_settled_scene(scenes[name], job)
-        assert scene is not None, "only moves of stable scenes are shown"
+        scene = load_settled_scene(paths[name], job)
+        assert scene is not None, "moves exist only for stable scenes"
         return scene
 
     write_feasibility_report(
@@ -416,17 +442,22 @@ def _write_results(job: FeasibilityJob, out: Path, results: dict[StudyPart, Any]
         job.setups,
         moves,
         pose_errors,
-        reach,
+        maps,
         bases,
         targets,
         summary,
         load_scene_by_name,
-        job.config,
     )
     return summary
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+def _write_csv(
+    path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
+) -> None:
+    """Write a table; without columns they are the first row's, and an empty table is not written."""
+    columns = columns or (list(rows[0]) if rows else [])
+    if not columns:
+        return
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -434,7 +465,7 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
     write_text(path, text.getvalue())
 
 
-GROUP_KEYS: dict[str, Callable[[dict[str, Any]], str]] = {
+GROUP_KEYS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "object_class": lambda row: row["object_class"],
     "rest": lambda row: row["rest"],
     "objects_below": lambda row: str(row["below"]),
@@ -445,65 +476,84 @@ GROUP_KEYS: dict[str, Callable[[dict[str, Any]], str]] = {
         f"x {_bin_of_20_cm(row['pick_x'])}, y {_bin_of_20_cm(row['pick_y'])}"
     ),
 }
-"""What the moves of a summary are grouped by; places in the tray's frame, heights above its floor."""
+"""Groups of moves in a summary: by name, the function that returns a move's group.
+
+Positions are in the tray frame, heights above its floor.
+"""
 
 
 def _bin_of_20_cm(coordinate: float) -> str:
-    """The 20 cm within which a place (m) lies, in cm."""
+    """Return the interval of 20 cm that contains a coordinate in m, as text in cm."""
     low = 20 * math.floor((coordinate + 0.1) / 0.2) - 10
     return f"{low} to {low + 20}"
 
 
 def summarize_study(
-    job: FeasibilityJob, moves: Sequence[dict[str, Any]], pose_errors: Sequence[dict[str, Any]]
+    job: FeasibilityJob,
+    moves: Sequence[Mapping[str, Any]],
+    pose_errors: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """By setup: shares, reasons, what was planned of each of `GROUPS`; and which moves only one of two can do."""
-    setups = {}
-    for setup in job.setups:
-        rows = [row for row in moves if row["setup"] == setup]
-        planned = [row for row in rows if row["result"] == PLANNED]
-        quantiles = np.quantile(
-            [row["planning_s"] for row in rows if row["planning_s"] > 0] or [0.0], [0.5, 0.95, 0.99]
-        ).tolist()
-        setups[setup] = {
-            "moves": len(rows),
-            "planned": len(planned),
-            "planned_share": len(planned) / len(rows) if rows else None,
-            "planned_ci95": wilson_interval(len(planned), len(rows)),
-            "results": dict(Counter(row["result"] for row in rows).most_common()),
-            "groups": {
-                group: {
-                    value: {"moves": count, "planned": sum(name(row) == value for row in planned)}
-                    for value, count in sorted(Counter(map(name, rows)).items())
-                }
-                for group, name in GROUP_KEYS.items()
-            },
-            "motion_s_median": float(np.median([row["motion_s"] for row in planned]))
-            if planned
-            else None,
-            "planning_s": dict(zip(("p50", "p95", "p99"), quantiles, strict=True)),
-            "holds_with_error": {
-                f"{1000 * error:g} mm": [
-                    sum(
-                        n["result"] == "holds"
-                        for n in pose_errors
-                        if n["setup"] == setup and n["error"] == error
-                    ),
-                    sum(1 for n in pose_errors if n["setup"] == setup and n["error"] == error),
-                ]
-                for error in sorted({n["error"] for n in pose_errors})
-            },
-        }
+    """Return statistics of each setup, and how many moves only one of two setups can plan.
+
+    Args:
+        job: The study.
+        moves: Rows of `moves.csv`.
+        pose_errors: Rows of `pose_errors.csv`.
+    """
     planned_keys = {
-        (r["setup"], r["scene"], r["pick"], r["place"]) for r in moves if r["result"] == PLANNED
+        (row["setup"], row["scene"], row["pick"], row["place"])
+        for row in moves
+        if row["result"] == PLANNED
     }
-    names, keys = list(job.setups), {(r["scene"], r["pick"], r["place"]) for r in moves}
+    keys = {(row["scene"], row["pick"], row["place"]) for row in moves}
     planned_by = {
         f"{first} and not {second}": sum(
             (first, *key) in planned_keys and (second, *key) not in planned_keys for key in keys
         )
-        for first in names
-        for second in names
+        for first in job.setups
+        for second in job.setups
         if first != second
     }
+    setups = {
+        setup: _summarize_setup(
+            [row for row in moves if row["setup"] == setup],
+            [row for row in pose_errors if row["setup"] == setup],
+        )
+        for setup in job.setups
+    }
     return {"scenes": len(job.scenes), "setups": setups, "planned_by": planned_by}
+
+
+def _summarize_setup(
+    moves: Sequence[Mapping[str, Any]], pose_errors: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the statistics of one setup from its rows."""
+    planned = [row for row in moves if row["result"] == PLANNED]
+    planning_times = [row["planning_s"] for row in moves if row["planning_s"] > 0] or [0.0]
+    quantiles = np.quantile(planning_times, [0.5, 0.95, 0.99]).tolist()
+    motion_durations = [row["motion_s"] for row in planned]
+    return {
+        "moves": len(moves),
+        "planned": len(planned),
+        "planned_fraction": len(planned) / len(moves) if moves else None,
+        "planned_ci95": wilson_interval(len(planned), len(moves)),
+        "results": dict(Counter(row["result"] for row in moves).most_common()),
+        "groups": {
+            group: {
+                value: {"moves": count, "planned": sum(key(row) == value for row in planned)}
+                for value, count in sorted(Counter(map(key, moves)).items())
+            }
+            for group, key in GROUP_KEYS.items()
+        },
+        "median_motion_duration_s": float(np.median(motion_durations)) if planned else None,
+        "planning_time_s": dict(zip(("p50", "p95", "p99"), quantiles, strict=True)),
+        "pose_errors": {
+            f"{1000 * error:g} mm": {
+                "plans": sum(row["error"] == error for row in pose_errors),
+                "valid": sum(
+                    row["error"] == error and row["result"] == "holds" for row in pose_errors
+                ),
+            }
+            for error in sorted({row["error"] for row in pose_errors})
+        },
+    }

@@ -19,6 +19,7 @@ from drake_clutter.agents.generators import (
     summarize_scenes,
 )
 from drake_clutter.catalog import load_catalog
+from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
 from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
@@ -30,13 +31,15 @@ from drake_clutter.tasks.oracle_search import Solvability
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
-JOB_FILE, PROGRESS_FILE, SCENES_FOLDER = "job.json", "progress.json", "scenes"
-SUMMARY_FILE, CONTACT_SHEET_FILE = "summary.json", "contact_sheet.png"
+PROGRESS_FILE = "progress.json"
+SCENES_FOLDER = "scenes"
+SUMMARY_FILE = "summary.json"
+CONTACT_SHEET_FILE = "contact_sheet.png"
 
 
 @dataclass(frozen=True)
 class _GeneratorFactory:
-    """Makes a worker; picklable."""
+    """Picklable factory of the generator of a worker process."""
 
     job: GenerationJob
 
@@ -52,23 +55,24 @@ def generate_scenes(
     progress: Callable[[Iterable[Any], int, int], Iterable[Any]],
     ray_address: str | None = None,
 ) -> dict[str, Any]:
-    """Writes `scenes/0000.yaml`, ..., `summary.json` and `contact_sheet.png`.
+    """Write `scenes/0000.yaml`, ..., `summary.json` and `contact_sheet.png`.
 
-    A folder of the same job is taken up where it was left, and may be extended to a larger count.
+    A folder of the same job is resumed, and may be extended to a larger number of scenes.
 
     Args:
-        job: what to generate.
-        count: scenes in the folder at the end.
-        out: the folder.
-        workers: processes.
-        progress: wraps the scenes that are made, given how many are there and how many there will be.
-        ray_address: of the Ray cluster that the processes run on; None: they run here.
+        job: What to generate.
+        count: Number of scenes in the folder at the end.
+        out: Output folder.
+        workers: Number of worker processes.
+        progress: Wraps the new scenes, given the number of existing scenes and of all scenes.
+        ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
 
     Returns:
         The summary.
 
     Raises:
-        InputError: an option that is not allowed, a folder that holds something else, or no Ray cluster at the address.
+        InputError: An option is not allowed, the folder holds something else, or there is no Ray
+            cluster at the address.
     """
     if count < 1:
         raise InputError(f"--count {count}; allowed is 1 or more")
@@ -76,37 +80,23 @@ def generate_scenes(
     make_generation_agent(job.agent, job.config, job.temperature)
     catalog = load_catalog(job.catalog_folder)
     for object_class in catalog.object_set(job.objects):
-        _ = object_class.corners  # says what is missing before anything is written
-    prepare_output_directory(
-        out,
-        allowed_entries=frozenset(
-            {JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER}
-        ),
-    )
-    if (out / JOB_FILE).exists():
-        earlier = json.loads((out / JOB_FILE).read_text())
-        if json.dumps(earlier) != json.dumps(job.to_dict):  # the order of cameras counts, too
-            raise InputError(
-                f"--out {out}: holds scenes of other options, see {JOB_FILE}; give the same options or another folder"
-            )
-    else:
-        prepare_output_directory(out)
-        write_json(out / JOB_FILE, job.to_dict)
-    (out / SCENES_FOLDER).mkdir(exist_ok=True)
-    paths = [out / SCENES_FOLDER / f"{index:04d}.yaml" for index in range(count)]
-    # Scenes are written in order, so what is there is a beginning.
-    num_done = next((index for index, path in enumerate(paths) if not path.exists()), count)
-    earlier_run = (
-        json.loads((out / PROGRESS_FILE).read_text()) if (out / PROGRESS_FILE).exists() else {}
-    )
-    seconds, layout_failures = (
-        float(earlier_run.get("seconds", 0.0)),
-        Counter(earlier_run.get("layout_failures", {})),
-    )
-    solvable: list[str | None] = earlier_run.get("solvable", [])[:num_done]
-    num_done = len(
-        solvable
-    )  # one less than the scenes, if the run was stopped between the two files
+        _ = object_class.corners  # raises if a model is missing, before anything is written
+    entries = (JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER)
+    prepare_output_directory(out, allowed_entries=frozenset(entries))
+    open_job_folder(out, job.to_dict)
+    folder = out / SCENES_FOLDER
+    folder.mkdir(exist_ok=True)
+    paths = [folder / f"{index:04d}.yaml" for index in range(count)]
+    # Scenes are written in order, so the existing ones have the lowest indices.
+    num_files = next((index for index, path in enumerate(paths) if not path.exists()), count)
+    earlier_run: dict[str, Any] = {}
+    if (out / PROGRESS_FILE).exists():
+        earlier_run = json.loads((out / PROGRESS_FILE).read_text())
+    earlier_seconds = float(earlier_run.get("seconds", 0.0))
+    layout_failures = Counter(earlier_run.get("layout_failures", {}))
+    solvable: list[str | None] = earlier_run.get("solvable", [])[:num_files]
+    # One less than the files if the run was interrupted between the two writes of a scene.
+    num_done = len(solvable)
 
     start_time = time.monotonic()
     generated: Iterable[GeneratedScene] = map_ordered(
@@ -116,11 +106,10 @@ def generate_scenes(
         layout_failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, job.config.cell, result.verdict)
         solvable.append(result.solvable.value if result.solvable else None)
-        total_seconds = seconds + time.monotonic() - start_time
         write_json(
             out / PROGRESS_FILE,
             {
-                "seconds": total_seconds,
+                "seconds": earlier_seconds + time.monotonic() - start_time,
                 "layout_failures": dict(layout_failures),
                 "solvable": solvable,
             },
@@ -129,7 +118,7 @@ def generate_scenes(
 
     files = [load_scene(path, catalog) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]
-    solvabilities = [None if answer is None else Solvability(answer) for answer in solvable[:count]]
+    solvabilities = [None if value is None else Solvability(value) for value in solvable[:count]]
     summary = summarize_scenes(job, judged, solvabilities)
     summary |= {
         "layout_failures": dict(layout_failures),
@@ -138,28 +127,24 @@ def generate_scenes(
         "config": to_plain(job.config),
     }
     write_json(out / SUMMARY_FILE, summary)
-    write_contact_sheet(
-        out / CONTACT_SHEET_FILE,
-        [_thumbnail(i, s, v) for i, (s, v) in enumerate(judged[:MAX_THUMBNAILS])],
-    )
+    renderer = SceneRenderer()
+    thumbnails = [
+        _thumbnail(renderer, index, scene, verdict)
+        for index, (scene, verdict) in enumerate(judged[:MAX_THUMBNAILS])
+    ]
+    write_contact_sheet(out / CONTACT_SHEET_FILE, thumbnails)
     return summary
 
 
-_renderer: SceneRenderer | None = None
+def _thumbnail(
+    renderer: SceneRenderer, index: int, scene: Scene, verdict: Verdict
+) -> tuple[NDArray[np.uint8], str, bool]:
+    """Return the image of a scene, its caption, and whether it is stable.
 
-
-def _thumbnail(index: int, scene: Scene, verdict: Verdict) -> tuple[NDArray[np.uint8], str, bool]:
-    """Picture, caption, and whether it is stable. An unstable scene is shown as it was laid out."""
-    global _renderer
-    _renderer = _renderer or SceneRenderer()
+    A stable scene is shown at its settled poses, an unstable one at its initial poses.
+    """
     if verdict.instability is None:
-        return (
-            _renderer.render_overhead(scene.with_poses(verdict.settled)),
-            f"{index:04d}  hidden {len(verdict.hidden)}",
-            True,
-        )
-    return (
-        _renderer.render_overhead(scene),
-        f"{index:04d}  {verdict.instability.reason.value}: {verdict.instability.object}",
-        False,
-    )
+        image = renderer.render_overhead(scene.with_poses(verdict.settled))
+        return image, f"{index:04d}  {len(verdict.hidden)} hidden", True
+    reason = f"{verdict.instability.reason.value}: {verdict.instability.object}"
+    return renderer.render_overhead(scene), f"{index:04d}  {reason}", False

@@ -1,0 +1,52 @@
+"""`job.json`: the options of a resumable job, which decide whether a folder can be resumed."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.config import ClutterConfig, upgrade_head
+from drake_clutter.files import InputError, prepare_output_directory, write_json
+from drake_clutter.validation import to_plain, validate
+
+JOB_FILE = "job.json"
+_RENAMED_FIELDS = {"catalogue_folder": "catalog_folder", "world": "config"}
+"""Current names of fields by those that version 0.1 wrote."""
+
+
+def open_job_folder(out: Path, job: Mapping[str, Any]) -> None:
+    """Create the output folder of a job, or check that a folder belongs to the same job.
+
+    Args:
+        out: Output folder.
+        job: Everything that decides the results, as a document.
+
+    Raises:
+        InputError: The folder holds something else.
+    """
+    path = out / JOB_FILE
+    if not path.exists():
+        prepare_output_directory(out)
+        write_json(path, job)
+        return
+    # Compared as text, because the order of cameras matters, too.
+    if json.dumps(_read_job(path)) != json.dumps(job):
+        raise InputError(
+            f"--out {out}: holds results of other options, see {JOB_FILE}; give the same options "
+            "or another folder"
+        )
+
+
+def _read_job(path: Path) -> dict[str, Any]:
+    """Return a job document with the field names and defaults of this version."""
+    written = json.loads(path.read_text(encoding="utf-8"))
+    job = {_RENAMED_FIELDS.get(key, key): value for key, value in written.items()}
+    source = str(path)
+    if "config" in job:
+        job["config"] = to_plain(validate(ClutterConfig, upgrade_head(job["config"]), source))
+    if "setups" in job:
+        job["setups"] = {
+            name: to_plain(validate(WorkCell, cell, source)) for name, cell in job["setups"].items()
+        }
+    return job
