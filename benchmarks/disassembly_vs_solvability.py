@@ -16,7 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate_scenes import JOB_FILE, PROGRESS_FILE, SCENES_FOLDER
+from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER
+from drake_clutter.commands.job_file import JOB_FILE
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import cli_error_handler, write_json
 from drake_clutter.resources import git_commit

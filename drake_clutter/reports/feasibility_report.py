@@ -86,8 +86,8 @@ def write_feasibility_report(
         _setups_table(setups, summary),
     ]
     if summary["unstable_scenes"]:
-        names = escape(", ".join(summary["unstable_scenes"]))
-        parts.append(f"<p>Excluded, because they are unstable: {names}.</p>")
+        excluded = escape(", ".join(summary["unstable_scenes"]))
+        parts.append(f"<p>Excluded, because they are unstable: {excluded}.</p>")
     if len(setups) > 1:
         rows = [(pair, str(count)) for pair, count in summary["planned_by"].items()]
         parts.append("<h2>Moves planned by one setup and not by another</h2>")

@@ -1,0 +1,54 @@
+"""Folders of resumable jobs: which ones are resumed, also those of version 0.1."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import DEFAULT_CELL
+
+from drake_clutter.commands.feasibility_job import FeasibilityJob, _read_part
+from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
+
+
+def job(seed: int = 0) -> dict[str, Any]:
+    cells = {"default": DEFAULT_CELL}
+    return FeasibilityJob((Path("/scene.yaml"),), cells, (), seed, ClutterConfig(), None).to_dict()
+
+
+def test_the_same_job_is_resumed_and_another_refused(tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    open_job_folder(out, job())
+    open_job_folder(out, job())
+    assert json.loads((out / JOB_FILE).read_text()) == job()
+    with pytest.raises(InputError, match=r"holds results of other options, see job\.json"):
+        open_job_folder(out, job(seed=1))
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty"):
+        open_job_folder(tmp_path, job())
+
+
+def test_a_job_of_version_0_1_is_resumed(tmp_path: Path) -> None:
+    earlier = {
+        {"config": "world", "catalog_folder": "catalogue_folder"}.get(key, key): value
+        for key, value in job().items()
+    }
+    (tmp_path / JOB_FILE).write_text(json.dumps(earlier))
+    open_job_folder(tmp_path, job())
+
+
+def test_a_part_of_version_0_1_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "part.json"
+    path.write_text(
+        '{"share": [1.0], "noise": [], "targets": [{"branches": 2, "in_the_way": "table"}]}'
+    )
+    assert _read_part(path) == {
+        "reachable_fraction": [1.0],
+        "pose_errors": [],
+        "targets": [{"num_solutions": 2, "blocking_bodies": "table"}],
+    }
