@@ -4,6 +4,7 @@ All that `behavior_hashes.py` asks of the package is here; when interfaces chang
 """
 
 import hashlib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -230,7 +231,12 @@ def _episode(
 
 def _move(step: Transition) -> Line:
     outcome = step.outcome
-    texts = [outcome.result.value, outcome.detail, outcome.instability, outcome.inconclusive]
+    texts = [
+        outcome.result.value,
+        _recorded_detail(outcome.detail),
+        outcome.instability,
+        outcome.inconclusive,
+    ]
     words = f"{step.move}: {'; '.join(str(text) for text in texts if text)}"
     words += f"; found {_named(step.newly_found)}"
     parts = {"poses": _numbers(outcome.scene.poses.values())}
@@ -240,6 +246,12 @@ def _move(step: Transition) -> Line:
     if arms:
         parts |= {"q_middle": [*arms[len(arms) // 2].q], "q_last": [*arms[-1].q]}
     return Line(words, parts)
+
+
+def _recorded_detail(detail: str) -> str:
+    """Return the detail of an outcome as the recorded hashes have it."""
+    placed = re.fullmatch(r"placed with an error of (.*)", detail)
+    return f"{placed[1]} from where it was to be" if placed else detail
 
 
 def _numbers(poses: Iterable[Pose]) -> list[float]:

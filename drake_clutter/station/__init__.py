@@ -1,0 +1,1 @@
+"""Drake simulation of the work cell: station diagram, executor of plans, gripper, recordings."""

@@ -1,4 +1,4 @@
-"""Moves by the arm: planned, simulated through the whole trajectory, and judged by what happened."""
+"""Move executor with a simulated arm: planning, simulation of the motion, outcome."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,31 +18,38 @@ from drake_clutter.simulation.settle import find_instability, settle
 from drake_clutter.station.station_simulation import StationSimulation
 
 MIN_DISPLACEMENT = 1e-4
-"""m; what moved less is not settled again."""
+"""Objects that moved less during the motion are not settled again [m]; above numerical drift."""
 
 
 class ArmExecutor:
-    """Carries out a move at fidelity `arm` (a `MoveExecutor`): planned, simulated through the whole trajectory, and judged.
+    """Execute moves at fidelity `arm` (a `MoveExecutor`).
 
-    What the motion touched is settled afterwards as the judge settles. A scene has collapsed when any object but the picked one
-    has moved or turned past the limits, or the picked one past them from where it was let go.
+    A move is planned, simulated along the whole trajectory, and evaluated. Objects that were
+    disturbed are settled afterwards with the settings of the Drake judge. The scene has collapsed
+    if an object exceeds the limits of displacement or tilt: the picked object relative to its
+    release pose, any other relative to its pose before the move.
     """
 
     def __init__(
         self, config: ClutterConfig, *, planner_config: PlannerConfig | None = None
     ) -> None:
-        """Makes an executor."""
+        """Create an executor.
+
+        Args:
+            config: Work cell and settle limits.
+            planner_config: Parameters of the planner; None for the defaults.
+        """
         self._config = config
         self._planner_config = planner_config or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
     def plan(self, scene: Scene, command: PickPlaceCommand) -> PickPlacePlan | PlanningFailure:
-        """Return the plan for a command, or why there is none."""
+        """Return the plan for a command, or the reason why there is none."""
         planner = self.planner_for(scene.support)
         return planner.plan(scene.objects, command.move.pick, command.X_TO_place)
 
     def planner_for(self, support: Support) -> PickPlacePlanner:
-        """For a tray; kept."""
+        """Return the planner for a support; the last one is reused."""
         if self._planner is None or self._planner.cell.support != support:
             self._planner = PickPlacePlanner(
                 self._config.cell.with_support(support), self._planner_config
@@ -50,17 +57,17 @@ class ArmExecutor:
         return self._planner
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """See `MoveExecutor.execute`."""
+        """Plan and simulate a command, see `MoveExecutor.execute`."""
         plan = self.plan(scene, command)
         if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
-        simulated = StationSimulation(self._config.cell, scene).execute(plan, record=True)
-        X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -simulated.lowered_distance))
-        after, pick = scene.with_poses(simulated.poses), command.move.pick
+        result = StationSimulation(self._config.cell, scene).execute(plan, record=True)
+        X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
+        after = scene.with_poses(result.poses)
         outcome = evaluate_outcome(
-            scene, after, pick, X_TO_place, simulated.lost_object, self._config.settle
+            scene, after, command.move.pick, X_TO_place, result.lost_object, self._config.settle
         )
-        return replace(outcome, motion=simulated.motion, detail=str(simulated))
+        return replace(outcome, motion=result.motion, detail=str(result))
 
 
 def evaluate_outcome(
@@ -71,28 +78,31 @@ def evaluate_outcome(
     lost_object: bool,
     config: SettleConfig,
 ) -> Outcome:
-    """What a motion of the arm has led to: what it touched is settled, and everything compared with where it should be.
+    """Settle the disturbed objects after an arm motion and return the outcome of the move.
 
     Args:
-        before, after: the scene, at rest and after the motion.
-        pick: what was picked; X_TO_place: where it was to be let go; lost_object: whether it came off the cup on the way.
-        config: the limits.
+        before: Scene at rest before the motion.
+        after: Scene after the motion.
+        pick: Name of the picked object.
+        X_TO_place: Pose at which the object was to be released.
+        lost_object: Whether the object came off the gripper before it was released.
+        config: Limits of displacement and tilt.
     """
-    put = before.with_poses({pick: X_TO_place})
-    # What comes off the cup only as it touches down, and stays there, has been put down.
-    dropped = lost_object and worst_instability([put[pick]], after, config) is not None
-    others = [o for o in put.objects if o.name != pick or not dropped]
-    instability = worst_instability(others, after, config)
+    expected = before.with_poses({pick: X_TO_place})
+    # An object that comes off at touchdown and stays at its place pose counts as placed.
+    dropped = lost_object and worst_instability([expected[pick]], after, config) is not None
+    checked = [o for o in expected.objects if o.name != pick or not dropped]
+    instability = worst_instability(checked, after, config)
     if instability is None and not dropped:
-        moved = {
+        disturbed = {
             o.name
             for o in before.objects
             if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > MIN_DISPLACEMENT
         } | {pick}
         for group in group_touching_objects(after.objects, TOUCHING_MARGIN):
-            if not moved.isdisjoint(o.name for o in group):
+            if not disturbed.isdisjoint(o.name for o in group):
                 after = after.with_poses(settle(group, before.support, config).poses)
-        instability = worst_instability(others, after, config)
+        instability = worst_instability(checked, after, config)
     result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
         result = MoveResult.COLLAPSED
@@ -102,10 +112,16 @@ def evaluate_outcome(
 def worst_instability(
     expected: Sequence[SceneObject], after: Scene, config: SettleConfig
 ) -> Instability | None:
-    """Of the objects that did not stay where they were, the one that went furthest."""
-    found = [
-        fall
+    """Return the instability with the largest displacement, or None if all objects are stable.
+
+    Args:
+        expected: Objects at their expected poses.
+        after: Scene with the actual poses.
+        config: Limits of displacement and tilt.
+    """
+    instabilities = [
+        instability
         for o in expected
-        if (fall := find_instability(o, after[o.name].X_TO, after.support, config))
+        if (instability := find_instability(o, after[o.name].X_TO, after.support, config))
     ]
-    return max(found, key=lambda fall: fall.displacement, default=None)
+    return max(instabilities, key=lambda instability: instability.displacement, default=None)

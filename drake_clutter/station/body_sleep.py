@@ -1,4 +1,7 @@
-"""Which objects are simulated: those that take no part in the current motion are locked."""
+"""Body sleeping: lock objects that take no part in the current motion of the arm.
+
+Sleeping bodies are standard in physics engines; Drake has none, so their free joints are locked.
+"""
 
 import math
 from collections import deque
@@ -22,86 +25,108 @@ from drake_clutter.station.gripper_actuator import GraspStatus
 Floats = NDArray[np.float64]
 
 WAKE_BEFORE_CONTACT = 0.05
-"""Before the gripper meets an object or lets it go, from when objects around are free [s]."""
+"""Time before the gripper grasps or releases an object at which its neighbors are woken [s]; two
+steps of the simulation."""
 SLEEP_AFTER_DWELL = 0.15
-"""After the dwell, until when the objects around are free; what does move stays free [s]."""
+"""Time after a dwell until which the neighbors stay awake [s]. Objects that still move stay awake
+longer."""
 _DESCENT_STEP = 0.01
-"""Between the heights of a descent at which contacts are looked for [m]."""
+"""Height step at which contacts along a guarded descent are searched [m]."""
 
 
 def nearest_object(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
-    """Return the object whose origin is nearest to a pose: what is there in truth."""
+    """Return the object whose origin is closest to that of a pose."""
     return min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - X_TO.p)))
 
 
 def affected_bodies(
     objects: Sequence[SceneObject], plan: PickPlacePlan
 ) -> tuple[set[str], set[str]]:
-    """Return the names of what picking, and of what placing may disturb.
+    """Return the names of the objects that a plan may disturb.
 
-    These are the stacks that are taken from, put on, or come close to. The picked object is in
-    both.
+    These are the stacks that touch the picked object at its pick pose or its place pose. Poses of
+    the plan may be estimates: the picked object is the one closest to the pick pose.
+
+    Args:
+        objects: Objects at their actual poses.
+        plan: Plan to execute.
+
+    Returns:
+        Names of the objects affected by picking, and by placing. Both include the picked object.
     """
     picked = nearest_object(objects, plan.X_TO_pick)
     X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
-    lowered = np.linspace(0.0, plan.max_descent, math.ceil(plan.max_descent / _DESCENT_STEP) + 1)
+    num_heights = math.ceil(plan.max_descent / _DESCENT_STEP) + 1
     placed = [
         replace(picked, X_TO=X_TO_place.translated((0.0, 0.0, -height)))
-        for height in lowered.tolist()
+        for height in np.linspace(0.0, plan.max_descent, num_heights).tolist()
     ]
     groups = group_touching_objects(objects, TOUCHING_MARGIN)
 
-    def near(ends: Sequence[SceneObject]) -> set[str]:
-        def close(o: SceneObject) -> bool:
-            together = (group_touching_objects([end, o], TOUCHING_MARGIN) for end in ends)
-            return o is not picked and any(len(groups) == 1 for groups in together)
+    def names_near(copies: Sequence[SceneObject]) -> set[str]:
+        def touches_copy(o: SceneObject) -> bool:
+            pairs = (group_touching_objects([copy, o], TOUCHING_MARGIN) for copy in copies)
+            return o is not picked and any(len(pair) == 1 for pair in pairs)
 
-        touched = (o.name for group in groups if any(close(o) for o in group) for o in group)
-        return {picked.name, *touched}
+        near = (o.name for group in groups if any(touches_copy(o) for o in group) for o in group)
+        return {picked.name, *near}
 
-    return near([picked]), near(placed)
+    return names_near([picked]), names_near(placed)
 
 
 def bodies_to_wake(
     schedule: CommandSchedule, at_pick: Set[str], at_place: Set[str], time: float
 ) -> set[str]:
-    """Return the names of what may move at a time since a plan began [s].
+    """Return the names of the objects that must be awake at a time.
 
     Args:
-        schedule: Of the plan.
-        at_pick: What picking may disturb, see `affected_bodies`.
-        at_place: What placing may disturb.
-        time: Since the plan began [s].
+        schedule: Command schedule of the plan.
+        at_pick: Names of the objects affected by picking, see `affected_bodies`.
+        at_place: Names of the objects affected by placing, see `affected_bodies`.
+        time: Time since the start of the plan [s].
     """
     pick_start = schedule.suction_on_time - WAKE_BEFORE_CONTACT
+    pick_end = schedule.suction_on_time + DWELL_TIME + SLEEP_AFTER_DWELL
     place_start = schedule.descent_start_time - WAKE_BEFORE_CONTACT
-    woken = set[str]()
-    if pick_start <= time <= schedule.suction_on_time + DWELL_TIME + SLEEP_AFTER_DWELL:
-        woken |= at_pick
-    if place_start <= time <= schedule.suction_off_time + DWELL_TIME + SLEEP_AFTER_DWELL:
-        woken |= at_place
-    return woken
+    place_end = schedule.suction_off_time + DWELL_TIME + SLEEP_AFTER_DWELL
+    names = set[str]()
+    if pick_start <= time <= pick_end:
+        names |= at_pick
+    if place_start <= time <= place_end:
+        names |= at_place
+    return names
 
 
 class BodySleepManager:
-    """Locks objects that take no part, which makes the simulation about ten times faster.
+    """Lock objects that take no part in the current motion.
+
+    This makes the simulation about ten times faster.
 
     Attributes:
         awake: Names of the objects that may move.
     """
 
     MAX_SLEEP_SPEED = 0.002
-    """Of an object that falls asleep, on average over some updates [m/s]: contact may make it
-    tremble without getting anywhere."""
+    """Mean speed over `WINDOW` updates below which an object may be locked [m/s]. Averaging rejects
+    contact chatter."""
     WINDOW = 4
+    """Number of updates over which speeds are averaged and contacts are remembered."""
 
     def __init__(self, station: ClutterStation) -> None:
-        """Make a manager; see `reset`."""
+        """Create a manager; call `reset` before `update`.
+
+        Args:
+            station: Station whose objects are locked.
+        """
         self._station = station
         self._locked_filter: FilterId | None = None
 
     def reset(self, root: Context) -> None:
-        """Lock all objects in a new context."""
+        """Lock all objects in a new context.
+
+        Args:
+            root: Context of the root diagram.
+        """
         self.awake = set[str]()
         self._position_history = deque[tuple[float, dict[str, Floats]]](maxlen=self.WINDOW)
         self._contact_history = deque[set[str]](maxlen=self.WINDOW)
@@ -111,53 +136,65 @@ class BodySleepManager:
     def update(
         self, root: Context, required: Set[str], grasp: GraspStatus, *, expects_grasp: bool
     ) -> None:
-        """Wake what is wanted, what is held, and what still moves; lock the rest.
+        """Wake required, grasped, moving and recently hit objects, and lock the others.
 
         Args:
-            root: Of the simulation.
-            required: Names.
-            grasp: What the gripper holds.
-            expects_grasp: Whether the gripper should hold something; if it does not, what falls may
-                hit anything, and all are woken.
+            root: Context of the root diagram.
+            required: Names of objects that must be awake.
+            grasp: Status of the gripper.
+            expects_grasp: Whether the gripper should hold an object. If it does not, all objects
+                are woken, because a falling object may hit any of them.
         """
         moving = {name for name, v in self._speeds(root).items() if v > self.MAX_SLEEP_SPEED}
-        lost = grasp.lost_object or (expects_grasp and not grasp.has_held)
-        # What is run into is woken for long enough to see whether it moves, else it would stand
-        # like a rock.
+        lost_object = grasp.lost_object or (expects_grasp and not grasp.has_held)
+        # A locked object that is hit must be woken, otherwise it acts as a fixed obstacle. It stays
+        # awake for `WINDOW` updates, so that its mean speed is known before it may be locked.
         context = self._station.plant_context(root)
         self._contact_history.append(
             self._station.objects_in_contact(context) - self.awake if self.awake else set()
         )
         awake = {*required, *moving, *({grasp.held} - {""})}.union(*self._contact_history)
-        if lost:
+        if lost_object:
             awake = set(self._station.object_classes)
         if awake != self.awake:
             self._lock_all_but(root, awake)
             self.awake = awake
 
     def _speeds(self, root: Context) -> dict[str, float]:
-        """Return speeds of what is awake, by name [m/s]."""
-        scene, context = self._station.scene_plant, self._station.plant_context(root)
-        speeds = scene.speeds(context, self.awake)
-        places = {name: X_TO.p for name, X_TO in scene.poses(context, self.awake).items()}
+        """Return the mean speeds of the awake objects, by name [m/s].
+
+        Objects that were not awake for the whole window have their current speed.
+        """
+        scene_plant = self._station.scene_plant
+        context = self._station.plant_context(root)
+        speeds = scene_plant.speeds(context, self.awake)
+        poses = scene_plant.poses(context, self.awake)
+        positions = {name: X_TO.p for name, X_TO in poses.items()}
         if len(self._position_history) == self.WINDOW:
-            then, earlier = self._position_history[0]
-            time = root.get_time() - then
-            for name, p in places.items():
-                if name in earlier:
-                    speeds[name] = float(np.linalg.norm(p - earlier[name])) / time
-        self._position_history.append((root.get_time(), places))
+            earlier_time, earlier_positions = self._position_history[0]
+            duration = root.get_time() - earlier_time
+            for name, p in positions.items():
+                if name in earlier_positions:
+                    distance = float(np.linalg.norm(p - earlier_positions[name]))
+                    speeds[name] = distance / duration
+        self._position_history.append((root.get_time(), positions))
         return speeds
 
     def _lock_all_but(self, root: Context, awake: Set[str]) -> None:
-        """Lock all objects but some. Those that were free must be at rest: they are stopped.
+        """Lock all objects except some, and set the velocities of the newly locked ones to zero.
 
-        What is locked does not collide with the surroundings or other locked objects: Drake crashes
-        where it would penetrate them.
+        Collisions of locked objects with fixed bodies and with each other are filtered out: Drake
+        fails at penetrations between bodies that cannot move.
+
+        Args:
+            root: Context of the root diagram.
+            awake: Names of the objects that may move.
         """
-        station, plant = self._station, self._station.plant
+        station = self._station
+        plant = station.plant
         context = station.plant_context(root)
-        locked, fixed = GeometrySet(), GeometrySet()
+        locked = GeometrySet()
+        fixed = GeometrySet()
         for body in (*station.arm.fixed, get_support_body(plant)):
             fixed.Add(plant.GetCollisionGeometriesForBody(body))
         for name, joint in station.free_joints.items():
@@ -165,7 +202,8 @@ class BodySleepManager:
                 continue
             locked.Add(plant.GetCollisionGeometriesForBody(station.scene_plant.bodies[name]))
             if not joint.is_locked(context):
-                velocities, start = plant.GetVelocities(context), joint.velocity_start()
+                velocities = plant.GetVelocities(context)
+                start = joint.velocity_start()
                 velocities[start : start + 6] = 0.0
                 plant.SetVelocities(context, velocities)
                 joint.Lock(context)
@@ -173,12 +211,12 @@ class BodySleepManager:
         filters = scene_graph.collision_filter_manager(
             scene_graph.GetMyMutableContextFromRoot(root)
         )
-        before = self._locked_filter
+        previous_filter = self._locked_filter
         self._locked_filter = filters.ApplyTransient(
             CollisionFilterDeclaration().ExcludeBetween(locked, fixed).ExcludeWithin(locked)
         )
-        if before is not None:
-            filters.RemoveDeclaration(before)
+        if previous_filter is not None:
+            filters.RemoveDeclaration(previous_filter)
         for name in awake & station.free_joints.keys():
             if station.free_joints[name].is_locked(context):
                 station.free_joints[name].Unlock(context)

@@ -1,4 +1,4 @@
-"""The work cell as a Diagram: plant, geometry, and the arm under position control."""
+"""Work cell as a Drake Diagram: plant, scene graph, and arm with joint position control."""
 
 from collections.abc import Mapping, Sequence
 
@@ -26,12 +26,14 @@ from drake_clutter.station.grasp_constraint import CompliantGrasp, GraspConstrai
 
 Floats = NDArray[np.float64]
 
-JOINT_STIFFNESS, JOINT_DAMPING = 1e5, 2e3
-"""Of the joints' position control [N m/rad] and [N m s/rad], as stiff as an industrial arm's."""
+JOINT_STIFFNESS = 1e5
+"""Proportional gain of the joint position control [N m/rad]: stiff, as that of industrial arms."""
+JOINT_DAMPING = 2e3
+"""Derivative gain of the joint position control [N m s/rad]."""
 
 
 class ClutterStation(Diagram):
-    """The arm among objects.
+    """Simulated work cell with arm, gripper and objects.
 
     .. pydrake_system::
 
@@ -45,26 +47,27 @@ class ClutterStation(Diagram):
         - query
 
     Input ports:
-        command: Desired positions [rad] and velocities [rad/s], and feed-forward torques [N m].
-            Shape (3 n,) for n joints.
+        command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
+            of n joints. Shape (3 n,).
 
     Output ports:
-        state: Of the whole plant.
-        body_poses: Of all bodies of the plant.
-        bellows: How far they are pulled out [m], and how fast [m/s]. Shape (2,).
-        query: With visuals only: of `camera_scene_graph`.
+        state: State of the plant. Shape (num_multibody_states,).
+        body_poses: Poses of all bodies of the plant in the world, a list of `RigidTransform`.
+        bellows: Extension of the suction cup's bellows [m] and its rate [m/s]. Shape (2,).
+        query: `QueryObject` of `camera_scene_graph`. Only with visuals.
 
     Attributes:
-        cell: The cell.
-        object_classes: Of the objects, by name.
-        time_step: Of the plant [s].
-        scene_plant: The objects in the plant.
-        plant: The plant.
-        arm: The arm in the plant.
-        grasp: Fixes an object to the cup.
-        free_joints: Joint to the world of each object that can be locked, by name.
-        camera_scene_graph: The geometry that cameras see, or None. It is apart from that of the
-            contacts, as renderers that get poses at every step take more time than the step does.
+        cell: Work cell.
+        object_classes: Classes of the objects, by name.
+        time_step: Time step of the plant [s].
+        scene_plant: Plant with the bodies of the objects.
+        plant: Plant of arm, cell and objects.
+        arm: Frames and bodies of the arm in the plant.
+        grasp: Grasp constraint between suction cup and object.
+        free_joints: Free joint of each object that can be locked, by name.
+        camera_scene_graph: Scene graph with the visual geometry for cameras; None without visuals.
+            It is separate from the scene graph of the contacts, because render engines update
+            their poses at every step, which takes longer than the step itself.
     """
 
     def __init__(
@@ -79,15 +82,17 @@ class ClutterStation(Diagram):
         """Build the diagram.
 
         Args:
-            cell: What stands around.
-            objects: Name and class of each.
-            time_step: Of the plant [s].
-            weldable_object: Name of the one object that the cup can take, by a `WeldGrasp`; "": it takes
-                any, by a `CompliantGrasp`.
-            visuals: Whether cameras are to see it.
+            cell: Work cell.
+            objects: Name and class of each object.
+            time_step: Time step of the plant [s].
+            weldable_object: Name of the only object that can be grasped, with a `WeldGrasp`; "" for
+                a `CompliantGrasp` of any object.
+            visuals: Whether to add visual geometry for cameras.
         """
         super().__init__()
-        self.cell, self.object_classes, self.time_step = cell, dict(objects), time_step
+        self.cell = cell
+        self.object_classes = dict(objects)
+        self.time_step = time_step
         self._weldable_object = weldable_object
         builder = DiagramBuilder()
         self.scene_plant: ScenePlant = add_scene_plant(
@@ -127,42 +132,52 @@ class ClutterStation(Diagram):
     def _add_camera_geometry(
         self, builder: DiagramBuilder, objects: Sequence[tuple[str, ObjectClass]]
     ) -> SceneGraph:
-        """Add the geometry that cameras see.
+        """Add a scene graph with visual geometry and return it.
 
-        It is that of a twin of the plant, which is never simulated, in the plant's state.
+        The geometry belongs to a copy of the plant that is not simulated. Its poses are computed
+        from the state of the simulated plant.
         """
-        twin, seen = (
-            MultibodyPlant(self.time_step),
-            builder.AddNamedSystem("camera_scene_graph", SceneGraph()),
-        )
-        twin.RegisterAsSourceForSceneGraph(seen)
+        visual_plant = MultibodyPlant(self.time_step)
+        visual_graph = builder.AddNamedSystem("camera_scene_graph", SceneGraph())
+        visual_plant.RegisterAsSourceForSceneGraph(visual_graph)
         bodies = add_objects(
-            twin, seen, objects, self.cell.support, visuals=True, jointed=self._weldable_object
+            visual_plant,
+            visual_graph,
+            objects,
+            self.cell.support,
+            visuals=True,
+            jointed=self._weldable_object,
         ).bodies
-        arm = add_work_cell(twin, seen, self.cell, compliant=True, visuals=True)
-        _make_grasp_constraint(
-            twin, arm, bodies, self._weldable_object
-        )  # with it the states are alike
-        twin.Finalize()
+        arm = add_work_cell(visual_plant, visual_graph, self.cell, compliant=True, visuals=True)
+        # The joint of a `WeldGrasp` makes the states of both plants equal.
+        _make_grasp_constraint(visual_plant, arm, bodies, self._weldable_object)
+        visual_plant.Finalize()
         poses = builder.AddNamedSystem(
-            "poses", MultibodyPositionToGeometryPose(twin, input_multibody_state=True)
+            "poses", MultibodyPositionToGeometryPose(visual_plant, input_multibody_state=True)
         )
+        pose_port = visual_graph.get_source_pose_port(visual_plant.get_source_id())
         builder.Connect(self.plant.get_state_output_port(), poses.get_input_port())
-        builder.Connect(poses.get_output_port(), seen.get_source_pose_port(twin.get_source_id()))
-        builder.ExportOutput(seen.get_query_output_port(), "query")
-        return seen
+        builder.Connect(poses.get_output_port(), pose_port)
+        builder.ExportOutput(visual_graph.get_query_output_port(), "query")
+        return visual_graph
 
     @property
     def graspable_objects(self) -> tuple[str, ...]:
-        """Names of the objects that the cup can take."""
+        """Names of the objects that can be grasped."""
         return (self._weldable_object,) if self._weldable_object else tuple(self.object_classes)
 
     def plant_context(self, root: Context) -> Context:
-        """Return the plant's context in that of the diagram that holds the station."""
+        """Return the context of the plant from the context of the root diagram."""
         return self.plant.GetMyMutableContextFromRoot(root)
 
     def set_state(self, root: Context, q: Floats, objects: Sequence[SceneObject]) -> None:
-        """Put the arm at q (n,) [rad] and the objects at their poses, all at rest."""
+        """Set the state: arm and objects at rest, and no object attached.
+
+        Args:
+            root: Context of the root diagram.
+            q: Joint positions of the arm [rad]. Shape (n,).
+            objects: Objects at their poses.
+        """
         context = self.plant_context(root)
         positions = self.plant.GetPositions(context)
         positions[self._q_indices] = q
@@ -177,23 +192,33 @@ class ClutterStation(Diagram):
                 self.plant.SetFreeBodyPose(context, self.scene_plant.bodies[o.name], X_TO)
 
     def joint_positions(self, context: Context) -> Floats:
-        """Return q (n,) [rad] from the plant's context."""
+        """Return the joint positions of the arm [rad]. Shape (n,).
+
+        Args:
+            context: Context of the plant.
+        """
         return np.asarray(self.plant.GetPositions(context)[self._q_indices])
 
     def arm_state(self, context: Context, suction: bool) -> ArmState:
-        """Return the arm's state from the plant's context, with the torques of the last step."""
+        """Return joint positions, velocities and torques of the arm.
+
+        Args:
+            context: Context of the plant.
+            suction: Whether the vacuum is commanded on.
+        """
         torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
-        q, v = self.joint_positions(context), self.plant.GetVelocities(context)[self._v_indices]
+        q = self.joint_positions(context)
+        v = self.plant.GetVelocities(context)[self._v_indices]
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
 
     def objects_in_contact(self, context: Context) -> set[str]:
-        """Return names of objects that touch the arm, its tool, or another object.
+        """Return the names of the objects in contact with the arm, the gripper or other objects.
 
-        Locked objects touch only what is not locked: so of them, those that something free or the
-        arm has run into.
+        Contacts between locked objects are filtered out. A locked object is reported if the arm or
+        an awake object hits it.
 
         Args:
-            context: Of the plant.
+            context: Context of the plant.
         """
         results = self.plant.get_contact_results_output_port().Eval(context)
         inspector = self.scene_plant.scene_graph.model_inspector()
@@ -211,19 +236,17 @@ class ClutterStation(Diagram):
 
 
 def _set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
-    """Give the arm's motors position control."""
-    motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    for motor in motors:
-        if motor.model_instance() == arm.robot:
-            motor.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS, d=JOINT_DAMPING))
+    """Set the position control gains of the actuators of the arm."""
+    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    for actuator in actuators:
+        if actuator.model_instance() == arm.robot:
+            actuator.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS, d=JOINT_DAMPING))
 
 
 def _make_grasp_constraint(
     plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], weldable_object: str
 ) -> GraspConstraint:
-    """Return the constraint for the one object that is jointed, or for any."""
-    return (
-        WeldGrasp(plant, arm, bodies[weldable_object])
-        if weldable_object
-        else CompliantGrasp(plant, arm)
-    )
+    """Return a `WeldGrasp` of the weldable object, or a `CompliantGrasp` if there is none."""
+    if weldable_object:
+        return WeldGrasp(plant, arm, bodies[weldable_object])
+    return CompliantGrasp(plant, arm)

@@ -1,4 +1,4 @@
-"""The joint commands of a plan over time."""
+"""Command schedule of a plan: joint references, feed-forward torques and suction over time."""
 
 import math
 from dataclasses import dataclass
@@ -19,23 +19,24 @@ from drake_clutter.planning.time_parameterization import (
 Floats = NDArray[np.float64]
 
 DWELL_TIME = 0.15
-"""Time in which the vacuum builds up, and in which it is gone again [s]."""
+"""Time at rest in which the vacuum builds up or vanishes [s]."""
 SAMPLE_PERIOD = 0.01
-"""Between samples of reference and feed-forward torque, interpolated linearly [s]."""
+"""Sample period of the command, which is linearly interpolated [s]."""
 
 
 @dataclass(frozen=True)
 class CommandSchedule:
-    """A plan's commands over the time since it began.
+    """Commands of a plan over the time since its start.
 
     Attributes:
-        command: Desired positions [rad] and velocities [rad/s], feed-forward torques [N m], of n
-            joints. Shape (3 n,).
-        suction_on_time: When the vacuum is switched on [s].
-        descent_start_time: When the descent begins [s]; `suction_off_time` without a descent.
-        suction_off_time: When the vacuum is switched off [s].
-        end_time: When the arm is home again [s].
-        stage_starts: Name and start [s] of each phase and dwell.
+        command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
+            of n joints. Shape (3 n,).
+        suction_on_time: Time at which the vacuum is switched on [s].
+        descent_start_time: Time at which the guarded descent starts [s]; `suction_off_time` without
+            guarded descent.
+        suction_off_time: Time at which the vacuum is switched off [s].
+        end_time: Time at which the arm is home again [s].
+        stage_starts: Name and start time [s] of each stage.
     """
 
     command: PiecewisePolynomial
@@ -46,7 +47,12 @@ class CommandSchedule:
     stage_starts: tuple[tuple[str, float], ...]
 
     def stage_at(self, time: float) -> str:
-        """Return what is done at a time [s]; `idle` afterwards."""
+        """Return the name of the stage at a time [s].
+
+        Returns:
+            `approach`, `grasp`, `carry`, `release`, `retreat`, with a guarded descent also
+            `steady`, `descend` and `rise`; `idle` after the end.
+        """
         if time >= self.end_time:
             return "idle"
         return [name for name, start in self.stage_starts if start <= time + 1e-9][-1]
@@ -55,61 +61,74 @@ class CommandSchedule:
 def build_command_schedule(
     plan: PickPlacePlan, cell: WorkCell, contact_time: float = math.inf
 ) -> CommandSchedule:
-    """Return a plan's phases one after the other, with dwells at the ends of the carry.
+    """Return the command schedule of a plan, with dwells at grasp and release.
 
     Args:
-        plan: What to carry out.
-        cell: Where.
-        contact_time: When the descent ends [s]; then the arm rises as far as it went down.
+        plan: Plan to execute.
+        cell: Work cell with robot and gripper.
+        contact_time: Time since the start of the guarded descent at which it ends [s]. The arm then
+            releases the object and rises by the same distance.
     """
     approach, carry, retreat = plan.segments
-    parts, t_parts = list[Floats](), list[Floats]()
-    starts, time = list[tuple[str, float]](), 0.0
-    empty, loaded = Payload(), Payload(plan.mass, plan.p_GCm)
-    put_down = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
+    empty = Payload()
+    loaded = Payload(plan.mass, plan.p_GCm)
+    placement = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
     if plan.guarded_descent is not None:
-        down = _truncate(plan.guarded_descent, contact_time)
-        descend, rise = ("descend", down, loaded), ("rise", _reverse(down), empty)
-        put_down = [("steady", None, loaded), descend, *put_down, rise]
+        descent = _truncate(plan.guarded_descent, contact_time)
+        placement = [
+            ("steady", None, loaded),
+            ("descend", descent, loaded),
+            *placement,
+            ("rise", _reverse(descent), empty),
+        ]
+    time = 0.0
+    times = list[Floats]()
+    commands = list[Floats]()
+    stage_starts = list[tuple[str, float]]()
     for name, trajectory, payload in (
         ("approach", approach.trajectory, empty),
         ("grasp", None, empty),
         ("carry", carry.trajectory, loaded),
-        *put_down,
+        *placement,
         ("retreat", retreat.trajectory, empty),
     ):
-        starts.append((name, time))
+        stage_starts.append((name, time))
         duration = float(trajectory.end_time()) if trajectory else DWELL_TIME
         if trajectory:
             q, v, a = sample_motion(trajectory, max(2, round(duration / SAMPLE_PERIOD) + 1))
         else:
             num_joints = approach.trajectory.rows()
-            q = np.repeat(parts[-1][-1:, :num_joints], 2, axis=0)
+            q = np.repeat(commands[-1][-1:, :num_joints], 2, axis=0)
             v = a = np.zeros_like(q)
-        t_parts.append(time + np.linspace(0.0, duration, len(q)))
-        parts.append(
-            np.column_stack([q, v, inverse_dynamics(dynamics_plant(cell, payload), q, v, a)])
-        )
+        torques = inverse_dynamics(dynamics_plant(cell, payload), q, v, a)
+        times.append(time + np.linspace(0.0, duration, len(q)))
+        commands.append(np.column_stack([q, v, torques]))
         time += duration
-    at = dict(starts)
-    # Neighbouring parts share a time: the later sample is left a moment later.
-    t = np.concatenate(
-        [part + (1e-6 * (k > 0)) * (part == part[0]) for k, part in enumerate(t_parts)]
+    start_of = dict(stage_starts)
+    # Neighboring stages share a time, at which torques may jump: the later sample is delayed by
+    # 1 us, because breaks must increase.
+    breaks = np.concatenate(
+        [stage + (1e-6 * (k > 0)) * (stage == stage[0]) for k, stage in enumerate(times)]
     )
-    command = PiecewisePolynomial.FirstOrderHold(t, np.vstack(parts).T)
-    descent_start = at.get("descend", at["release"])
-    return CommandSchedule(command, at["grasp"], descent_start, at["release"], time, tuple(starts))
+    return CommandSchedule(
+        command=PiecewisePolynomial.FirstOrderHold(breaks, np.vstack(commands).T),
+        suction_on_time=start_of["grasp"],
+        descent_start_time=start_of.get("descend", start_of["release"]),
+        suction_off_time=start_of["release"],
+        end_time=time,
+        stage_starts=tuple(stage_starts),
+    )
 
 
 def _truncate(trajectory: Trajectory, time: float) -> Trajectory:
-    """Return the part up to a time [s]; it may end in motion."""
+    """Return a trajectory up to a time [s]."""
     end = min(time, trajectory.end_time())
-    times = PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]])
-    return PathParameterizedTrajectory(trajectory, times)
+    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]])
+    return PathParameterizedTrajectory(trajectory, scaling)
 
 
 def _reverse(trajectory: Trajectory) -> Trajectory:
-    """Return the same way back."""
+    """Return a trajectory traversed backwards."""
     end = trajectory.end_time()
-    times = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])
-    return PathParameterizedTrajectory(trajectory, times)
+    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])
+    return PathParameterizedTrajectory(trajectory, scaling)

@@ -1,8 +1,9 @@
-"""Two ways to fix an object to the cup in a plant, at the pose that it has then.
+"""Grasp constraints: two models of an object attached to the suction cup.
 
-`WeldGrasp` is a floating joint from the cup to the object that is locked. `CompliantGrasp` is six
-distance constraints, the legs of a Stewart platform, whose feet are set when it is switched on.
-docs/arm.md compares them.
+`WeldGrasp` locks a floating joint between cup and object. `CompliantGrasp` activates six distance
+constraints between them, arranged like the legs of a Stewart platform.
+
+Frames: G is the gripper, its origin at the center of the cup's lip; O is the object.
 """
 
 import math
@@ -23,23 +24,43 @@ Floats = NDArray[np.float64]
 
 
 class GraspConstraint(Protocol):
-    """Fixes an object to the cup of an arm; made before the plant is finalized."""
+    """Attaches an object to the suction cup; created before the plant is finalized."""
 
     def reset(self, context: Context) -> None:
-        """Hold nothing; called once on every new context of the plant."""
+        """Detach any object; called once on every new context.
+
+        Args:
+            context: Context of the plant.
+        """
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """Hold an object where it is."""
+        """Attach an object at its current pose.
+
+        Args:
+            context: Context of the plant.
+            body: Body of the object.
+        """
 
     def detach(self, context: Context) -> None:
-        """Let it go."""
+        """Detach the object.
+
+        Args:
+            context: Context of the plant.
+        """
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """Return force [N] and moment [N m] of the object on the cup's lip, in G. Shapes (3,)."""
+        """Return the load of the object on the lip.
+
+        Args:
+            context: Context of the plant.
+
+        Returns:
+            Force [N] and moment [N m] in G. Shapes (3,).
+        """
 
 
 def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
-    """Return the load of the cup without its own weight, from the reaction in the bellows; in G."""
+    """Return force and moment in the bellows joint, without the weight of the cup, in G."""
     bellows = plant.GetJointByName("bellows", arm.tool)
     reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
     down_G = -arm.cup.CalcPoseInWorld(context).rotation().matrix()[2]
@@ -48,45 +69,50 @@ def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats
 
 
 class WeldGrasp:
-    """A floating joint between cup and one object, locked while it holds.
+    """Grasp without compliance: a floating joint between cup and object that is locked.
 
-    It replaces the object's joint to the world.
+    The joint replaces the free joint of the object, so only one object can be attached.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
-        self._plant, self._arm = plant, arm
+        self._plant = plant
+        self._arm = arm
         self._joint = plant.AddJoint(QuaternionFloatingJoint("hold", arm.cup, body.body_frame()))
 
     def reset(self, context: Context) -> None:
-        """See `GraspConstraint`."""
+        """Detach any object, see `GraspConstraint`."""
         self._joint.Unlock(context)
 
     def set_object_pose(self, context: Context, X_TO: RigidTransform) -> None:
-        """Put the object at a pose."""
+        """Set the pose of the detached object."""
         self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """See `GraspConstraint`; the object is the one that it was made for."""
-        velocities, start = self._plant.GetVelocities(context), self._joint.velocity_start()
+        """Attach the object of the joint, see `GraspConstraint`."""
+        velocities = self._plant.GetVelocities(context)
+        start = self._joint.velocity_start()
         velocities[start : start + 6] = 0.0
         self._plant.SetVelocities(context, velocities)
         self._joint.Lock(context)
 
     def detach(self, context: Context) -> None:
-        """See `GraspConstraint`."""
+        """Detach the object, see `GraspConstraint`."""
         self._joint.Unlock(context)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """See `GraspConstraint`."""
+        """Return the load of the object on the lip, see `GraspConstraint`."""
         return _cup_load(self._plant, self._arm, context)
 
 
 _PLATFORM_RADIUS = 0.08
-"""Size of the platforms [m]: forces and moments load the legs about equally."""
-_LEG_STIFFNESS, _LEG_DAMPING = 1e4, 100.0
-"""[N/m] and [N s/m]: rubber yields a little in every direction; stiff legs would tear at the seal
-with every tracking error."""
+"""Radius and distance of the platforms [m]: forces and moments load the legs about equally."""
+_LEG_STIFFNESS = 1e4
+"""Stiffness of a leg [N/m]. Rubber is compliant in all directions; with stiff legs, tracking errors
+of the arm would cause peaks of the load."""
+_LEG_DAMPING = 100.0
+"""Damping of a leg [N s/m]."""
 _ANGLE = 2 * math.pi / 3
+"""Angle between neighboring points of a platform [rad]."""
 _UPPER_POINTS = np.array(
     [
         [
@@ -97,6 +123,7 @@ _UPPER_POINTS = np.array(
         for k in (0, 1, 2)
     ]
 )
+"""Points of the legs on the cup, in G [m]. Shape (3, 3)."""
 _LOWER_POINTS = np.array(
     [
         [
@@ -107,41 +134,54 @@ _LOWER_POINTS = np.array(
         for k in (0, 1, 2)
     ]
 )
+"""Points of the legs on the object, in G at attachment [m]. Shape (3, 3)."""
 _LEGS = [(_UPPER_POINTS[k], _LOWER_POINTS[j % 3]) for k in (0, 1, 2) for j in (k, k + 2)]
+"""Upper and lower point of each leg."""
 
 
 class CompliantGrasp:
-    """Six distance constraints from points above the lip to points around it; for any object."""
+    """Compliant grasp of any object: six distance constraints.
+
+    They connect three points of the cup above the lip with three points of the object at the lip.
+    """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm) -> None:
-        self._plant, self._arm = plant, arm
+        self._plant = plant
+        self._arm = arm
         self._cup = plant.GetBodyByName("cup", arm.tool)
-        # Between any two bodies, as long as nothing is held.
+        # Inactive constraints need two bodies, too.
         other = plant.GetBodyByName("body", arm.tool)
         self._legs = [
-            plant.AddDistanceConstraint(self._cup, top, other, foot, 1.0) for top, foot in _LEGS
+            plant.AddDistanceConstraint(self._cup, upper, other, lower, 1.0)
+            for upper, lower in _LEGS
         ]
 
     def reset(self, context: Context) -> None:
-        """See `GraspConstraint`."""
+        """Detach any object, see `GraspConstraint`."""
         self.detach(context)
 
     def attach(self, context: Context, body: RigidBody) -> None:
-        """See `GraspConstraint`."""
+        """Attach an object, see `GraspConstraint`."""
         X_OG = body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
-        for leg, (top, foot) in zip(self._legs, _LEGS, strict=True):
-            ends = self._cup.index(), top, body.index(), X_OG @ foot
+        for leg, (upper, lower) in zip(self._legs, _LEGS, strict=True):
+            length = float(np.linalg.norm(upper - lower))
             params = DistanceConstraintParams(
-                *ends, float(np.linalg.norm(top - foot)), _LEG_STIFFNESS, _LEG_DAMPING
+                self._cup.index(),
+                upper,
+                body.index(),
+                X_OG @ lower,
+                length,
+                _LEG_STIFFNESS,
+                _LEG_DAMPING,
             )
             self._plant.SetDistanceConstraintParams(context, leg, params)
             self._plant.SetConstraintActiveStatus(context, leg, True)
 
     def detach(self, context: Context) -> None:
-        """See `GraspConstraint`."""
+        """Detach the object, see `GraspConstraint`."""
         for leg in self._legs:
             self._plant.SetConstraintActiveStatus(context, leg, False)
 
     def load(self, context: Context) -> tuple[Floats, Floats]:
-        """See `GraspConstraint`."""
+        """Return the load of the object on the lip, see `GraspConstraint`."""
         return _cup_load(self._plant, self._arm, context)

@@ -1,7 +1,7 @@
-"""How a gripper acts in a running simulation.
+"""Actuation of a gripper in a running simulation.
 
-Taking an object changes parameters of the plant, which no system may do to another: an actuator is
-called by the simulation's monitor instead.
+Attaching an object changes parameters of the plant, which no Drake system may do to another one.
+The simulation therefore calls the actuator from its monitor after every step.
 """
 
 import math
@@ -17,24 +17,25 @@ from drake_clutter.cell.suction import lip_surface_profile
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01
-"""Between two looks at the load, and at whether the gripper is to hold [s]."""
+"""Period at which the command and the load are checked [s]."""
 OVERLOAD_RELEASE_TIME = 0.02
-"""Of overload, in which air gets in [s]."""
+"""Duration of an overload after which the object comes off [s]: air leaks in. Shorter peaks come
+from contacts."""
 MAX_SEAL_GAP = 0.005
-"""Between lip and surface, at which the vacuum can build up [m]."""
+"""Largest lip-to-surface gap at which the vacuum can build up [m]."""
 
 
 @dataclass(frozen=True)
 class GraspStatus:
-    """What a gripper holds, and what became of it since it was last commanded on.
+    """Status of a gripper since it was last commanded on.
 
     Attributes:
         held: Name of the object that is held; "" for none.
         last_held: Name of the object that was held last; "" for none.
-        release_time: When the object came off by its load [s]; NaN if it did not.
-        max_load_ratio: Largest load over what the gripper can bear.
-        slip: Between gripper and object, from when it was taken to when it was let go [m]; NaN
-            before.
+        release_time: Time at which the object came off by overload [s]; NaN if it did not.
+        max_load_ratio: Largest ratio of the load to the load capacity.
+        slip: Displacement between object and gripper from attachment to release [m]; NaN before
+            the release.
     """
 
     held: str = ""
@@ -50,106 +51,111 @@ class GraspStatus:
 
     @property
     def lost_object(self) -> bool:
-        """Whether the object came off by its load."""
+        """Whether the object came off by overload."""
         return not math.isnan(self.release_time)
 
 
 class GripperActuator(Protocol):
-    """Takes objects and lets them go, in a running simulation.
+    """Attaches and releases objects in a running simulation.
 
     Attributes:
-        status: What it holds.
+        status: Status of the gripper.
     """
 
     status: GraspStatus
 
     def reset(self) -> None:
-        """Begin anew in a context in which nothing is held."""
+        """Reset the status for a new context in which no object is held."""
 
     def update(self, root: Context) -> None:
-        """Act; called after every step with the context of the whole diagram."""
+        """Attach or release an object.
+
+        Args:
+            root: Context of the root diagram, after a step.
+        """
 
 
 class SuctionActuator:
-    """Switches the constraint between cup and object on and off.
+    """Switches the grasp constraint between suction cup and object.
 
     Attributes:
-        status: What hangs on the cup.
+        status: Status of the gripper.
     """
 
     def __init__(self, station: ClutterStation, is_commanded_on: Callable[[Context], bool]) -> None:
-        """Make an actuator.
+        """Create an actuator.
 
         Args:
-            station: Whose cup.
-            is_commanded_on: Whether the vacuum is to be on, from the root context.
+            station: Station with the suction cup.
+            is_commanded_on: Returns whether the vacuum is commanded on, from the root context.
         """
         self._station = station
         self._is_commanded_on = is_commanded_on
         self.reset()
 
     def reset(self) -> None:
-        """See `GripperActuator`."""
+        """Reset the status, see `GripperActuator`."""
         self.status = GraspStatus()
         self._was_commanded_on = False
-        self._num_overloads = 0  # updates in a row
+        self._num_overloads = 0  # consecutive updates with overload
         self._last_update = -math.inf
-        self._X_OG = RigidTransform()  # when the object was taken
+        self._X_OG = RigidTransform()  # at the last attachment
 
     def update(self, root: Context) -> None:
-        """See `GripperActuator`."""
+        """Attach or release an object, see `GripperActuator`."""
         time = root.get_time()
         if 0 <= time - self._last_update < GRIPPER_UPDATE_PERIOD - self._station.time_step / 2:
             return
         self._last_update = time
-        context, on = self._station.plant_context(root), self._is_commanded_on(root)
-        if on and not self._was_commanded_on:
-            self.status, self._num_overloads = GraspStatus(held=self.status.held), 0
-        self._was_commanded_on = on
-        if on and not self.status.held and not self.status.lost_object:
+        context = self._station.plant_context(root)
+        is_on = self._is_commanded_on(root)
+        if is_on and not self._was_commanded_on:
+            self.status = GraspStatus(held=self.status.held)
+            self._num_overloads = 0
+        self._was_commanded_on = is_on
+        if is_on and not self.status.held and not self.status.lost_object:
             self._try_attach(context)
-        elif self.status.held and not on:
+        elif self.status.held and not is_on:
             self._release(context)
         elif self.status.held:
             self._check_overload(context, time)
 
     def _check_overload(self, context: Context, time: float) -> None:
-        """Let go what has been too heavy for too long."""
-        load = self._station.grasp.load(context)
-        ratio = float(self._station.cell.gripper.load_ratio(*load))
-        largest = max(self.status.max_load_ratio, ratio)
-        self.status = replace(self.status, max_load_ratio=largest)
+        """Release the object after an overload of `OVERLOAD_RELEASE_TIME`."""
+        force, moment = self._station.grasp.load(context)
+        ratio = float(self._station.cell.gripper.load_ratio(force, moment))
+        max_ratio = max(self.status.max_load_ratio, ratio)
+        self.status = replace(self.status, max_load_ratio=max_ratio)
         self._num_overloads = self._num_overloads + 1 if ratio > 1 else 0
         if self._num_overloads * GRIPPER_UPDATE_PERIOD > OVERLOAD_RELEASE_TIME:
             self.status = replace(self.status, release_time=time)
             self._release(context)
 
     def _cup_pose_in_object(self, context: Context, name: str) -> RigidTransform:
-        """Return X_OG."""
+        """Return X_OG of an object."""
         X_TG = self._station.arm.cup.CalcPoseInWorld(context)
         X_TO = self._station.scene_plant.bodies[name].EvalPoseInWorld(context)
         return X_TO.inverse() @ X_TG
 
     def _try_attach(self, context: Context) -> None:
-        """Take the object that is first under the lip, if close enough and the lip seals on it."""
-        station, suction = self._station, self._station.cell.gripper
-        grasps = {
-            name: self._cup_pose_in_object(context, name) for name in station.graspable_objects
-        }
+        """Attach the object that is closest below the lip, if the lip seals on it."""
+        station = self._station
+        suction = station.cell.gripper
+        X_OG = {name: self._cup_pose_in_object(context, name) for name in station.graspable_objects}
         gaps = {
             name: lip_surface_profile(
-                station.object_classes[name], X_OG, suction.cup_diameter
+                station.object_classes[name], X_OG[name], suction.cup_diameter
             ).min()
-            for name, X_OG in grasps.items()
+            for name in X_OG
         }
         if not gaps:
             return
-        first = min(gaps, key=lambda name: gaps[name])
-        seals = suction.can_attach(station.object_classes[first], grasps[first])
-        if gaps[first] <= MAX_SEAL_GAP and seals:
-            station.grasp.attach(context, station.scene_plant.bodies[first])
-            self.status = replace(self.status, held=first, last_held=first)
-            self._X_OG = grasps[first]
+        closest = min(gaps, key=lambda name: gaps[name])
+        can_attach = suction.can_attach(station.object_classes[closest], X_OG[closest])
+        if gaps[closest] <= MAX_SEAL_GAP and can_attach:
+            station.grasp.attach(context, station.scene_plant.bodies[closest])
+            self.status = replace(self.status, held=closest, last_held=closest)
+            self._X_OG = X_OG[closest]
 
     def _release(self, context: Context) -> None:
         X_OG = self._cup_pose_in_object(context, self.status.held)

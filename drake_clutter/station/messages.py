@@ -1,7 +1,7 @@
-"""Messages that systems exchange through abstract ports.
+"""Messages that systems exchange through abstract-valued ports.
 
-A port always carries an object, as newer Drakes let no None pass: a message with number 0 says that
-there has been none. A receiver acts on a message once, when its number is new.
+A port always holds a message, because Drake does not accept None as an abstract value. Number 0
+stands for no message. A receiver acts on a message once, when its number changes.
 """
 
 from dataclasses import dataclass, field
@@ -17,28 +17,28 @@ from drake_clutter.scenes.scene import SceneObject
 
 @dataclass(frozen=True)
 class Message:
-    """What all messages share.
+    """Base class of all messages.
 
     Attributes:
-        number: Counts from 1; 0 if there has been none.
+        number: Sequence number from 1; 0 for no message.
     """
 
     number: int = 0
 
     def __deepcopy__(self, memo: object) -> Self:
-        """Return itself: it never changes, and Drake copies abstract values at every update."""
+        """Return the message itself: it is immutable, and Drake copies abstract values often."""
         return self
 
 
 @dataclass(frozen=True)
 class PlanRequest(Message):
-    """A move to be planned.
+    """Request to plan a move.
 
     Attributes:
-        move: None in the message with number 0 alone.
-        command: The move with its poses; None: no place is known to be free.
-        observation: In which the move was chosen.
-        objects: K_t then.
+        move: Move; None if `number` is 0.
+        command: Move with its pick and place poses; None if no free placement was found.
+        observation: Observation on which the move is based.
+        objects: Known objects (K_t) at that time.
     """
 
     move: Move | None = None
@@ -49,11 +49,11 @@ class PlanRequest(Message):
 
 @dataclass(frozen=True)
 class PlanResponse(Message):
-    """What became of a request.
+    """Result of a plan request.
 
     Attributes:
-        number: Of the request.
-        plan: Or why there is none; None in the message with number 0 alone.
+        number: Number of the request.
+        plan: Plan, or the reason why there is none; None if `number` is 0.
     """
 
     plan: PickPlacePlan | PlanningFailure | None = field(default=None, repr=False)
@@ -61,11 +61,11 @@ class PlanResponse(Message):
 
 @dataclass(frozen=True)
 class PlannedMove(Message):
-    """A plan to be carried out.
+    """Plan to execute.
 
     Attributes:
-        number: Of the request.
-        plan: None in the message with number 0 alone.
+        number: Number of the request.
+        plan: Plan; None if `number` is 0.
     """
 
     plan: PickPlacePlan | None = field(default=None, repr=False)
@@ -73,17 +73,17 @@ class PlannedMove(Message):
 
 @dataclass(frozen=True)
 class ExecutorStatus(Message):
-    """What the executor is doing.
+    """Status of the plan executor.
 
     Attributes:
-        number: Of the plan.
-        stage: "idle", or what part of the plan is being carried out.
+        number: Number of the plan.
+        stage: Stage of the plan, see `CommandSchedule.stage_at`; "idle" if none is executed.
     """
 
     stage: str = "idle"
 
 
 def empty_observation() -> Observation:
-    """Return the model value of ports for observations, of which the type alone counts."""
+    """Return the model value of observation ports; Drake uses only its type."""
     cell = default_cell()
     return Observation(np.zeros((0, 0), np.float32), (), cell.camera, cell.support)

@@ -1,4 +1,4 @@
-"""Carries out plans in a running diagram."""
+"""Executor of pick-and-place plans: a LeafSystem that commands joints and suction."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,26 +26,28 @@ from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
 Floats = NDArray[np.float64]
 
 EXECUTOR_UPDATE_PERIOD = 0.025
-"""Between two looks for a new plan [s]."""
+"""Period at which new plans are accepted and contact is detected [s]."""
 CONTACT_COMPRESSION = 0.0005
-"""A descent has touched something when the bellows give way so far [m]: 1 N, and three more of
-damping until the arm stands still."""
+"""Compression of the bellows that counts as contact during a guarded descent [m]: 1 N at 2000 N/m.
+Damping adds about 3 N until the arm stops."""
 MIN_BELLOWS_EXTENSION = 0.0002
-"""Bellows that are pulled out less bear nothing, or what is held up already [m]; the lightest box
-pulls half a millimeter."""
+"""Extension of the bellows below which they carry no object, or one that is already supported [m].
+The lightest box extends them by 0.5 mm."""
 
 
 @dataclass(frozen=True)
 class ExecutorState(Message):
-    """The plan that is being carried out, or was last.
+    """State of the executor: the current or last plan.
 
     Attributes:
-        number: Of the plan.
-        plan: None before the first.
-        schedule: Of the plan; None before the first.
-        start_time: When it began [s].
-        bellows_extension: Before the descent [m]; NaN until then.
-        contact_time: Of the descent, until something was touched [s]; infinite if nothing was.
+        number: Number of the plan.
+        plan: Plan; None before the first one.
+        schedule: Command schedule of the plan; None before the first one.
+        start_time: Time at which the plan started [s].
+        bellows_extension: Extension of the bellows at the start of the guarded descent [m]; NaN
+            before.
+        contact_time: Time between the start of the guarded descent and contact [s]; infinite
+            without contact.
     """
 
     plan: PickPlacePlan | None = None
@@ -56,23 +58,33 @@ class ExecutorState(Message):
 
     @property
     def lowered_distance(self) -> float:
-        """By which the object is let go below its planned pose [m]."""
+        """Distance between the planned and the actual release height [m]."""
         if self.plan is None:
             return 0.0
         return min(self.plan.max_descent, self.contact_time * DESCENT_SPEED)
 
     def elapsed(self, time: float) -> float:
-        """Return the plan's time at a time of the simulation [s], up to the plan's end."""
+        """Return the time since the start of the plan, at most its duration [s].
+
+        Args:
+            time: Simulation time [s].
+        """
         assert self.schedule is not None
         return min(time - self.start_time, self.schedule.end_time)
 
     def has_ended(self, time: float) -> bool:
-        """Whether the arm is home again, or no plan has begun."""
+        """Return whether no plan is executed.
+
+        Args:
+            time: Simulation time [s].
+        """
         return self.schedule is None or time >= self.start_time + self.schedule.end_time
 
 
 class PickPlaceExecutor(LeafSystem):
-    """Carry out one plan after the other.
+    """Execute plans one after the other.
+
+    The initial state has no plan: the arm stays at its home configuration.
 
     .. pydrake_system::
 
@@ -87,96 +99,111 @@ class PickPlaceExecutor(LeafSystem):
         - status
 
     Input ports:
-        plan: `PlannedMove`; one with a new number begins as soon as the last has ended.
-        bellows: How far the bellows are pulled out [m], and how fast [m/s]. A descent ends when
-            they give way, or where it was planned to. Shape (2,).
+        plan: `PlannedMove`. A plan with a new number starts as soon as the previous one has ended.
+        bellows: Extension of the bellows [m] and its rate [m/s]. A guarded descent ends when they
+            are compressed, or at its planned end. Shape (2,).
 
     Output ports:
-        command: Desired positions [rad] and velocities [rad/s], and feed-forward torques [N m].
-            Shape (3 n,) for n joints.
-        suction: 1 for on. Shape (1,).
-        finished: Number of the plan that has ended, 0 while one is carried out; and how far below
-            its planned pose the object was let go [m]. Shape (2,).
+        command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
+            of n joints. Shape (3 n,).
+        suction: 1 if the vacuum is commanded on, else 0. Shape (1,).
+        finished: Number of the last plan if it has ended, else 0; and distance between planned and
+            actual release height [m]. Shape (2,).
         status: `ExecutorStatus`.
     """
 
     def __init__(self, *, cell: WorkCell) -> None:
-        """Make an executor that is at home."""
+        """Create an executor.
+
+        Args:
+            cell: Work cell with robot and gripper.
+        """
         super().__init__()
         self._cell = cell
         robot = load_robot(cell.robot)
-        home, still = robot.home[None], np.zeros((1, robot.num_joints))
-        hold = inverse_dynamics(dynamics_plant(cell, Payload()), home, still, still)
-        self._at_home = np.hstack([home, still, hold]).ravel()
+        home = robot.home[None]
+        zero = np.zeros((1, robot.num_joints))
+        gravity = inverse_dynamics(dynamics_plant(cell, Payload()), home, zero, zero)
+        self._home_command = np.hstack([home, zero, gravity]).ravel()
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
         self._bellows = self.DeclareVectorInputPort("bellows", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(ExecutorState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(EXECUTOR_UPDATE_PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
-        of = {self.all_state_ticket(), self.time_ticket()}
-        self.DeclareVectorOutputPort("command", len(self._at_home), self._calc_command, of)
-        self.DeclareVectorOutputPort("suction", 1, self._calc_suction, of)
-        self.DeclareVectorOutputPort("finished", 2, self._calc_finished, of)
+        prerequisites = {self.all_state_ticket(), self.time_ticket()}
+        self.DeclareVectorOutputPort(
+            "command", len(self._home_command), self._calc_command, prerequisites
+        )
+        self.DeclareVectorOutputPort("suction", 1, self._calc_suction, prerequisites)
+        self.DeclareVectorOutputPort("finished", 2, self._calc_finished, prerequisites)
         self.DeclareAbstractOutputPort(
-            "status", lambda: AbstractValue.Make(ExecutorStatus()), self._calc_status, of
+            "status", lambda: AbstractValue.Make(ExecutorStatus()), self._calc_status, prerequisites
         )
 
     @staticmethod
     def AddToBuilder(builder: DiagramBuilder, *, cell: WorkCell) -> "PickPlaceExecutor":
-        """Add an executor to a diagram."""
+        """Add an executor to a diagram and return it."""
         system: PickPlaceExecutor = builder.AddNamedSystem(
             "pick_place_executor", PickPlaceExecutor(cell=cell)
         )
         return system
 
     def state(self, context: Context) -> ExecutorState:
-        """Return the state in the executor's context."""
+        """Return the state from the context of the executor."""
         state: ExecutorState = context.get_abstract_state(self._state).get_value()
         return state
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        now, time = self.state(context), context.get_time()
-        after = self._detect_contact(context, now)
-        has_plan = self._plan.HasValue(context)
-        given: PlannedMove = self._plan.Eval(context) if has_plan else PlannedMove()
-        if given.plan is not None and given.number != now.number and now.has_ended(time):
-            schedule = build_command_schedule(given.plan, self._cell)
-            after = ExecutorState(given.number, given.plan, schedule, time)
-        if after is not now:
-            state.get_mutable_abstract_state(int(self._state)).set_value(after)
+        current = self.state(context)
+        time = context.get_time()
+        updated = self._detect_contact(context, current)
+        has_input = self._plan.HasValue(context)
+        move: PlannedMove = self._plan.Eval(context) if has_input else PlannedMove()
+        is_new = move.plan is not None and move.number != current.number
+        if move.plan is not None and is_new and current.has_ended(time):
+            schedule = build_command_schedule(move.plan, self._cell)
+            updated = ExecutorState(move.number, move.plan, schedule, time)
+        if updated is not current:
+            state.get_mutable_abstract_state(int(self._state)).set_value(updated)
         return EventStatus.Succeeded()
 
-    def _detect_contact(self, context: Context, now: ExecutorState) -> ExecutorState:
-        """Return the state with an end of the descent, if the object has touched something."""
-        if now.schedule is None or now.plan is None or not self._bellows.HasValue(context):
-            return now
-        start = now.schedule.descent_start_time
-        descended = context.get_time() - now.start_time - start
-        descending = 0 < descended < now.schedule.suction_off_time - start
-        if not descending or math.isfinite(now.contact_time):
-            return now
+    def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
+        """Return the state, with the contact time if contact occurs during a guarded descent."""
+        schedule = state.schedule
+        if schedule is None or state.plan is None or not self._bellows.HasValue(context):
+            return state
+        descent_duration = schedule.suction_off_time - schedule.descent_start_time
+        descent_time = context.get_time() - state.start_time - schedule.descent_start_time
+        is_descending = 0 < descent_time < descent_duration
+        if not is_descending or math.isfinite(state.contact_time):
+            return state
         extension = float(self._bellows.Eval(context)[0])
-        first = math.isnan(now.bellows_extension)
-        before = extension if first else now.bellows_extension
-        if extension > max(before - CONTACT_COMPRESSION, MIN_BELLOWS_EXTENSION):
-            return replace(now, bellows_extension=before)
-        schedule = build_command_schedule(now.plan, self._cell, descended)
-        return replace(now, bellows_extension=before, contact_time=descended, schedule=schedule)
+        is_first = math.isnan(state.bellows_extension)
+        initial_extension = extension if is_first else state.bellows_extension
+        if extension > max(initial_extension - CONTACT_COMPRESSION, MIN_BELLOWS_EXTENSION):
+            return replace(state, bellows_extension=initial_extension)
+        return replace(
+            state,
+            bellows_extension=initial_extension,
+            contact_time=descent_time,
+            schedule=build_command_schedule(state.plan, self._cell, descent_time),
+        )
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)
         if state.schedule is None:
-            output.SetFromVector(self._at_home)
+            output.SetFromVector(self._home_command)
         else:
             time = state.elapsed(context.get_time())
             output.SetFromVector(state.schedule.command.value(time).ravel())
 
     def _calc_suction(self, context: Context, output: BasicVector) -> None:
-        state, on = self.state(context), False
+        state = self.state(context)
+        is_on = False
         if state.schedule is not None:
             time = state.elapsed(context.get_time())
-            on = state.schedule.suction_on_time <= time < state.schedule.suction_off_time
-        output.SetFromVector([float(on)])
+            is_on = state.schedule.suction_on_time <= time < state.schedule.suction_off_time
+        output.SetFromVector([float(is_on)])
 
     def _calc_finished(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)
@@ -184,7 +211,8 @@ class PickPlaceExecutor(LeafSystem):
         output.SetFromVector([number, state.lowered_distance])
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
-        state, phase = self.state(context), "idle"
+        state = self.state(context)
+        stage = "idle"
         if state.schedule is not None:
-            phase = state.schedule.stage_at(state.elapsed(context.get_time()))
-        output.set_value(ExecutorStatus(state.number, phase))
+            stage = state.schedule.stage_at(state.elapsed(context.get_time()))
+        output.set_value(ExecutorStatus(state.number, stage))

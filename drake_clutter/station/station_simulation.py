@@ -1,4 +1,4 @@
-"""The simulated station: the only place that advances the Diagram of the arm.
+"""Simulation of the station: advances its Diagram and executes plans.
 
 simulation = StationSimulation(cell, scene)
 result = simulation.execute(plan)
@@ -23,39 +23,38 @@ from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
 
 SETTLE_TIME = 0.1
-"""Simulated after the arm is home [s]."""
+"""Time simulated after the arm is home [s]."""
 STEP_PERIOD = 0.025
-"""Between two decisions which objects are simulated [s]."""
+"""Period of a step: of updates of `BodySleepManager`, and of recorded samples [s]."""
 TIME_STEP = STEP_PERIOD / 10
-"""Of the plant [s]; with twice as much a high stack trembles as soon as it is free, and creeps
-until it falls."""
+"""Time step of the plant [s]. With twice as much, high stacks creep and fall."""
 POST_MOTION_WAIT = 1.0
-"""After a plan's end, for which what has fallen is followed [s]."""
+"""Time after the end of a plan in which fallen objects stay awake [s]."""
 
 AddSystems = Callable[[DiagramBuilder, ClutterStation, PickPlaceExecutor], None]
-"""Adds systems to a diagram and connects them; they own the executor's port `plan`."""
+"""Adds systems to a diagram and connects them, including the input port `plan` of the executor."""
 
 _ACTUATORS = {"suction": SuctionActuator}
-"""By the gripper's kind."""
+"""Actuator by `Gripper.kind`."""
 
 
 @dataclass(frozen=True)
 class PickPlaceResult:
-    """How a plan was carried out.
+    """Result of the execution of a plan.
 
     Attributes:
-        poses: X_TO by name, at the end.
+        poses: Poses X_TO at the end, by name.
         grasped: Whether the gripper held an object.
-        drop_time: When the object came off by its load [s]; NaN if it did not.
-        max_load_ratio: Largest load over what the gripper can bear.
-        slip: Between gripper and object [m].
-        position_error: Of the object's place, heights left out [m].
-        orientation_error: Of its orientation [rad].
-        displacements: How far each other object was moved, by name [m].
-        lowered_distance: By which the object was let go below its planned pose [m].
-        max_tracking_error: Largest error of a joint [rad].
-        simulated_time: Simulated [s].
-        motion: Recorded samples, if asked for.
+        drop_time: Time at which the object came off by overload [s]; NaN if it did not.
+        max_load_ratio: Largest ratio of the load to the load capacity of the gripper.
+        slip: Displacement between object and gripper from grasp to release [m].
+        position_error: Horizontal distance of the object from its place pose [m].
+        orientation_error: Angle between the object and its place pose [rad].
+        displacements: Displacement of each other object, by name [m].
+        lowered_distance: Distance between planned and actual release height [m].
+        max_tracking_error: Largest tracking error of a joint [rad].
+        simulated_time: Simulation time at the end [s].
+        motion: Recorded samples; empty if not recorded.
     """
 
     poses: dict[str, Pose]
@@ -73,7 +72,7 @@ class PickPlaceResult:
 
     @property
     def lost_object(self) -> bool:
-        """Whether the gripper did not hold the object all the way."""
+        """Whether the object was not held until its release."""
         return not self.grasped or not math.isnan(self.drop_time)
 
     def __str__(self) -> str:
@@ -81,22 +80,23 @@ class PickPlaceResult:
             return "the cup did not seal"
         if not math.isnan(self.drop_time):
             return f"came off the cup after {self.drop_time:.2f} s"
-        millimeters, degrees = 1000 * self.position_error, math.degrees(self.orientation_error)
-        return f"{millimeters:.1f} mm and {degrees:.1f} deg from where it was to be"
+        millimeters = 1000 * self.position_error
+        degrees = math.degrees(self.orientation_error)
+        return f"placed with an error of {millimeters:.1f} mm and {degrees:.1f} deg"
 
 
 class StationSimulation:
-    """The arm among the objects of a scene, in Drake.
+    """Simulation of the arm and the objects of a scene.
 
-    Objects that take no part in a motion are locked meanwhile.
+    Objects that take no part in a motion are locked, see `BodySleepManager`.
 
     Attributes:
-        cell: The cell, with the scene's support.
-        station: Plant, geometry and position control.
-        executor: Turns plans into commands.
-        diagram: Both, and the systems that were added.
-        simulator: Of the diagram.
-        gripper: Takes objects and lets them go.
+        cell: Work cell with the support of the scene.
+        station: Plant, scene graph and position control.
+        executor: Converts plans to commands.
+        diagram: Root diagram with station, executor and added systems.
+        simulator: Simulator of the diagram.
+        gripper: Attaches and releases objects.
     """
 
     def __init__(
@@ -108,23 +108,28 @@ class StationSimulation:
         visuals: bool = False,
         add_systems: AddSystems | None = None,
     ) -> None:
-        """Build the diagram and put the objects of a scene in it.
+        """Build the diagram and reset it to a scene.
 
         Args:
-            cell: Everything else that stands there.
-            scene: The objects, at rest.
-            weldable_object: Name of the one object that the gripper can take, see `ClutterStation`.
-            visuals: Whether cameras are to see the station.
-            add_systems: What else is in the diagram; None: plans come by `execute`.
+            cell: Work cell; its support is replaced by that of the scene.
+            scene: Objects at rest.
+            weldable_object: Name of the only object that can be grasped; "" for any, see
+                `ClutterStation`.
+            visuals: Whether to add visual geometry for cameras.
+            add_systems: Adds further systems, such as a planner; None if plans are passed to
+                `execute`.
+
+        Raises:
+            InputError: A model of the cell cannot be used.
         """
         self.cell = cell.with_support(scene.support)
         builder = DiagramBuilder()
-        classes = [(o.name, o.object_class) for o in scene.objects]
+        named_classes = [(o.name, o.object_class) for o in scene.objects]
         self.station: ClutterStation = builder.AddNamedSystem(
             "clutter_station",
             ClutterStation(
                 self.cell,
-                classes,
+                named_classes,
                 time_step=TIME_STEP,
                 weldable_object=weldable_object,
                 visuals=visuals,
@@ -145,24 +150,26 @@ class StationSimulation:
         self.reset(scene)
 
     def reset(self, scene: Scene) -> None:
-        """Begin anew at time 0: the arm is at home, the objects are at rest at their poses.
+        """Reset to time 0, with the arm at home and the objects at rest.
 
         Args:
-            scene: The objects, by the names that the simulation was built with.
+            scene: Objects with the names that the simulation was built with.
         """
         self._scene = scene
-        # The first step initializes it, so that a plan that is there by then begins at time 0.
+        # The first step initializes the simulator: a plan that is available then starts at time 0.
         self.simulator = Simulator(self.diagram)
         self.station.set_state(self.root, np.array(self.cell.robot.home), scene.objects)
         self.gripper.reset()
         self._sleep.reset(self.root)
         self._num_steps = 0
-        self._affected = 0, set[str](), set[str]()  # number of a plan, at pick, at place
+        self._affected_plan = 0
+        self._affected_at_pick = set[str]()
+        self._affected_at_place = set[str]()
         self.simulator.set_monitor(self._monitor)
 
     @property
     def root(self) -> Context:
-        """Context of the diagram."""
+        """Context of the root diagram."""
         return self.simulator.get_mutable_context()
 
     @property
@@ -172,65 +179,75 @@ class StationSimulation:
 
     @property
     def scene(self) -> Scene:
-        """The objects where they are now."""
+        """Objects at their current poses."""
         return self._scene.with_poses(self.station.scene_plant.poses(self.plant_context))
 
     @property
     def executor_state(self) -> ExecutorState:
-        """The plan that is being carried out, or was last."""
+        """State of the executor with the current or last plan."""
         return self.executor.state(self.executor.GetMyContextFromRoot(self.root))
 
     @property
     def finished_plan(self) -> int:
-        """Number of the plan that has ended; 0 while one is carried out."""
+        """Number of the last plan if it has ended, else 0."""
         port = self.executor.GetOutputPort("finished")
         return int(port.Eval(self.executor.GetMyContextFromRoot(self.root))[0])
 
     @property
     def is_executing(self) -> bool:
-        """Whether a plan is being carried out."""
+        """Whether a plan is executed."""
         return not self.executor_state.has_ended(self.root.get_time())
 
     def step(self) -> None:
-        """Advance by `STEP`."""
-        state, now = self.executor_state, self.root.get_time()
-        wanted, must_hold = set[str](), False
+        """Advance by `STEP_PERIOD`."""
+        state = self.executor_state
+        required = set[str]()
+        expects_grasp = False
         if state.plan is not None and state.schedule is not None:
-            if state.number != self._affected[0]:
-                self._affected = state.number, *affected_bodies(self.scene.objects, state.plan)
-            elapsed = now - state.start_time
-            wanted = bodies_to_wake(state.schedule, *self._affected[1:], elapsed)
+            if state.number != self._affected_plan:
+                self._affected_plan = state.number
+                self._affected_at_pick, self._affected_at_place = affected_bodies(
+                    self.scene.objects, state.plan
+                )
+            elapsed = self.root.get_time() - state.start_time
+            required = bodies_to_wake(
+                state.schedule, self._affected_at_pick, self._affected_at_place, elapsed
+            )
             end = state.schedule.end_time + POST_MOTION_WAIT
-            must_hold = state.schedule.suction_on_time + STEP_PERIOD <= elapsed < end
-        self._sleep.update(self.root, wanted, self.gripper.status, expects_grasp=must_hold)
+            expects_grasp = state.schedule.suction_on_time + STEP_PERIOD <= elapsed < end
+        self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
         self._num_steps += 1
         self.simulator.AdvanceTo(self._num_steps * STEP_PERIOD + TIME_STEP / 2)
 
     def run_until(self, condition: Callable[[], bool]) -> None:
-        """Step until something is true; it is asked before each step."""
+        """Step until a condition holds; it is checked before each step."""
         while not condition():
             self.step()
 
     def sample(self) -> MotionSample:
-        """Return where arm and objects are; the time is that since the latest plan began."""
+        """Return the state of arm and objects, with the time since the start of the last plan."""
         context = self.plant_context
         arm = self.station.arm_state(context, self._is_suction_on(self.root))
         time = self.root.get_time() - self.executor_state.start_time
         return MotionSample(time, self.station.scene_plant.poses(context), arm)
 
     def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
-        """Carry a plan out, until the arm is home and all has come to rest.
+        """Execute a plan until the arm is home, and for `SETTLE_TIME` more.
+
+        The diagram must not have been built with `add_systems` that connect the executor.
 
         Args:
-            plan: What to carry out; the diagram has no system that plans.
-            record: Whether the result has the motion, a sample per step.
+            plan: Plan to execute.
+            record: Whether to record a sample per step.
         """
-        before, number = self.scene, self.executor_state.number + 1
+        before = self.scene
+        number = self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
         self.executor.GetInputPort("plan").FixValue(context, PlannedMove(number, plan))
-        motion, tracking = list[MotionSample](), 0.0
+        motion = list[MotionSample]()
+        max_tracking_error = 0.0
 
-        def at_rest() -> bool:
+        def has_settled() -> bool:
             if self.finished_plan != number:
                 return False
             state = self.executor_state
@@ -238,33 +255,39 @@ class StationSimulation:
             end = state.start_time + state.schedule.end_time
             return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
 
-        while not at_rest():
+        while not has_settled():
             self.step()
-            tracking = max(tracking, self._tracking_error())
+            max_tracking_error = max(max_tracking_error, self._tracking_error())
             if record:
                 motion.append(self.sample())
-        return self._result(plan, before, tracking, tuple(motion))
+        return self._result(plan, before, max_tracking_error, tuple(motion))
 
     def _result(
-        self, plan: PickPlacePlan, before: Scene, tracking: float, motion: tuple[MotionSample, ...]
+        self,
+        plan: PickPlacePlan,
+        before: Scene,
+        max_tracking_error: float,
+        motion: tuple[MotionSample, ...],
     ) -> PickPlaceResult:
-        poses, status = self.station.scene_plant.poses(self.plant_context), self.gripper.status
-        place, wanted = poses[plan.pick], plan.X_TO_place
+        poses = self.station.scene_plant.poses(self.plant_context)
+        status = self.gripper.status
+        object_class = self.station.object_classes[plan.pick]
+        X_TO = poses[plan.pick]
         return PickPlaceResult(
             poses=poses,
             grasped=status.has_held,
             drop_time=status.release_time,
             max_load_ratio=status.max_load_ratio,
             slip=status.slip,
-            position_error=float(np.linalg.norm((place.p - wanted.p)[:2])),
-            orientation_error=tilt_between(self.station.object_classes[plan.pick], wanted, place),
+            position_error=float(np.linalg.norm((X_TO.p - plan.X_TO_place.p)[:2])),
+            orientation_error=tilt_between(object_class, plan.X_TO_place, X_TO),
             displacements={
                 o.name: float(np.linalg.norm(poses[o.name].p - o.X_TO.p))
                 for o in before.objects
                 if o.name != plan.pick
             },
             lowered_distance=self.executor_state.lowered_distance,
-            max_tracking_error=tracking,
+            max_tracking_error=max_tracking_error,
             simulated_time=self.root.get_time(),
             motion=motion,
         )
@@ -272,8 +295,8 @@ class StationSimulation:
     def _tracking_error(self) -> float:
         command = self.executor.GetOutputPort("command")
         q = self.station.joint_positions(self.plant_context)
-        wanted = command.Eval(self.executor.GetMyContextFromRoot(self.root))[: len(q)]
-        return float(np.abs(wanted - q).max())
+        q_desired = command.Eval(self.executor.GetMyContextFromRoot(self.root))[: len(q)]
+        return float(np.abs(q_desired - q).max())
 
     def _is_suction_on(self, root: Context) -> bool:
         context = self.executor.GetMyContextFromRoot(root)

@@ -1,15 +1,21 @@
-"""Recorded arm motions as HDF5, for a researcher's own analysis and for `drake-clutter replay`.
+"""Trajectory files: recorded arm motions as HDF5, read by `drake-clutter replay`.
 
-Attributes of the file: `version`, `scene` (a scene file's text: how everything lay at first), `cell` (a `WorkCell` as YAML).
-A group `move_0001`, ... for each move that the arm carried out; its attributes are `pick`, `place`, `result` and `detail`, its
-datasets, over n moments, for an arm of j joints:
+Attributes of the file:
 
-    time     (n,)             s, since the move began
-    q        (n, j)           rad
-    v        (n, j)           rad/s
-    torque   (n, j)           N m, of the motors
-    suction  (n,)             whether the vacuum is switched on
-    X_TO     (n, objects, 7)  qw, qx, qy, qz, x, y, z (m), in the order of the scene file's objects
+    version  1
+    scene    Initial scene as the text of a scene file.
+    cell     `WorkCell` as YAML.
+
+Each executed move has a group `move_0001`, `move_0002`, ... with the attributes `pick`, `place`,
+`result` and `detail`. Its datasets have m samples of an arm with n joints:
+
+    time     (m,)             Time since the start of the move [s].
+    q        (m, n)           Joint positions [rad].
+    v        (m, n)           Joint velocities [rad/s].
+    torque   (m, n)           Joint torques of the actuators [N m].
+    suction  (m,)             Whether the vacuum is commanded on.
+    X_TO     (m, objects, 7)  Quaternion (w, x, y, z) and position (x, y, z) [m] of each object, in
+                              the order of the scene file.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,19 +38,24 @@ from drake_clutter.validation import config_yaml, override_config
 from drake_clutter.yaml_io import parse_yaml
 
 FORMAT_VERSION = 1
+"""Version of the file format."""
 _ARM_DATASETS = ("q", "v", "torque")
+"""Datasets with a column per joint; also fields of `ArmState`."""
 
 
 def write_trajectories(
     path: Path, initial_scene: Scene, moves: Sequence[tuple[Move, Outcome]], cell: WorkCell
 ) -> int:
-    """Writes the moves of which there is an arm's motion, in one step; returns how many there are.
+    """Write the moves with a recorded arm motion atomically.
 
     Args:
-        path: the file.
-        initial_scene: the scene before the first move.
-        moves: and what they led to.
-        cell: in which they were carried out; its support is the scene's.
+        path: File to write.
+        initial_scene: Scene before the first move.
+        moves: Moves with their outcomes; moves without an arm motion are skipped.
+        cell: Work cell; its support is replaced by that of the scene.
+
+    Returns:
+        Number of moves written.
     """
     count = 0
     with atomic_write(path) as temporary, h5py.File(temporary, "w") as file:
@@ -56,7 +67,7 @@ def write_trajectories(
             }
         )
         for move, outcome in moves:
-            states = [frame.arm for frame in outcome.motion if frame.arm]
+            states = [sample.arm for sample in outcome.motion if sample.arm]
             if not states:
                 continue
             count += 1
@@ -72,10 +83,10 @@ def write_trajectories(
             arrays = {
                 name: np.array([getattr(state, name) for state in states]) for name in _ARM_DATASETS
             }
-            arrays["time"] = np.array([frame.time for frame in outcome.motion])
+            arrays["time"] = np.array([sample.time for sample in outcome.motion])
             arrays["suction"] = np.array([state.suction for state in states])
             poses = [
-                [frame.poses[o.name] for o in initial_scene.objects] for frame in outcome.motion
+                [sample.poses[o.name] for o in initial_scene.objects] for sample in outcome.motion
             ]
             arrays["X_TO"] = np.array(
                 [[(*X.quaternion, *X.translation) for X in row] for row in poses]
@@ -88,10 +99,17 @@ def write_trajectories(
 def read_trajectories(
     path: Path, catalog: Catalog
 ) -> tuple[Scene, WorkCell, list[tuple[Move, tuple[MotionSample, ...]]]]:
-    """Return the scene at first, the cell, and the motion of each move.
+    """Read a trajectory file.
+
+    Args:
+        path: File to read.
+        catalog: Catalog with the classes of the objects.
+
+    Returns:
+        Initial scene, work cell, and moves with their recorded samples.
 
     Raises:
-        InputError: the file, the field and what is allowed, for whatever cannot be such a file.
+        InputError: The file is not a trajectory file; names the field and what is allowed.
     """
     try:
         file = h5py.File(path)
@@ -101,45 +119,47 @@ def read_trajectories(
         ) from error
     with file:
         if int(file.attrs.get("version", 0)) != FORMAT_VERSION or "scene" not in file.attrs:
-            raise InputError(
-                f"{path}: version {file.attrs.get('version')}; allowed is a trajectory file of version {FORMAT_VERSION}"
-            )
+            found = f"{path}: version {file.attrs.get('version')}"
+            raise InputError(f"{found}; allowed is a trajectory file of version {FORMAT_VERSION}")
         scene = scene_from_yaml(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _read_cell(path, file.attrs).with_support(scene.support)
-        joints = load_robot(cell.robot).num_joints
-        return (
-            scene,
-            cell,
-            [_read_move(path, name, file[name], scene, joints) for name in sorted(file)],
-        )
+        num_joints = load_robot(cell.robot).num_joints
+        moves = [_read_move(path, name, file[name], scene, num_joints) for name in sorted(file)]
+        return scene, cell, moves
 
 
 def _read_cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
-    """Return the cell of a file; files of drake_clutter 0.1 hold the arm alone."""
+    """Return the work cell of a file; files of version 0.1 of the package have only the arm."""
     field = "cell" if "cell" in attributes else "arm"
-    given = parse_yaml(str(attributes.get(field, "{}")), f"{path}:{field}")
-    return override_config(
-        default_cell(), upgrade_cell(given) if field == "arm" else given, f"{path}:{field}"
-    )
+    source = f"{path}:{field}"
+    document = parse_yaml(str(attributes.get(field, "{}")), source)
+    if field == "arm":
+        document = upgrade_cell(document)
+    return override_config(default_cell(), document, source)
 
 
 def _read_move(
-    path: Path, name: str, group: h5py.Group, scene: Scene, joints: int
+    path: Path, name: str, group: h5py.Group, scene: Scene, num_joints: int
 ) -> tuple[Move, tuple[MotionSample, ...]]:
-    arrays: dict[str, NDArray[np.float64]] = {}
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM_DATASETS, (joints,))
+    """Return the move of a group and its samples."""
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM_DATASETS, (num_joints,))
     shapes |= {"time": (), "suction": (), "X_TO": (len(scene.objects), 7)}
+    arrays: dict[str, NDArray[np.float64]] = {}
     for field, shape in shapes.items():
-        found = group.get(field)
-        if not isinstance(found, h5py.Dataset) or len(found.shape) == 0 or found.shape[1:] != shape:
+        dataset = group.get(field)
+        if (
+            not isinstance(dataset, h5py.Dataset)
+            or len(dataset.shape) == 0
+            or dataset.shape[1:] != shape
+        ):
             raise InputError(
                 f"{path}:{name}.{field}; allowed is a dataset of shape {('n', *shape)}"
             )
-        arrays[field] = found[()]
+        arrays[field] = dataset[()]
     lengths = {field: len(values) for field, values in arrays.items()}
     if len(set(lengths.values())) != 1:
-        raise InputError(f"{path}:{name}: lengths {lengths}; allowed is one and the same")
-    frames = []
+        raise InputError(f"{path}:{name}: lengths {lengths}; allowed are equal lengths")
+    samples = []
     for k, time in enumerate(arrays["time"].tolist()):
         q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM_DATASETS)
         arm = ArmState(q, v, torque, bool(arrays["suction"][k]))
@@ -148,5 +168,5 @@ def _read_move(
             o.name: Pose(tuple(row[4:]), tuple(row[:4]))
             for o, row in zip(scene.objects, rows, strict=True)
         }
-        frames.append(MotionSample(time, poses, arm))
-    return Move(str(group.attrs["pick"]), str(group.attrs["place"])), tuple(frames)
+        samples.append(MotionSample(time, poses, arm))
+    return Move(str(group.attrs["pick"]), str(group.attrs["place"])), tuple(samples)
