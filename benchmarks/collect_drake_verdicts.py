@@ -35,7 +35,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "other offsets": {},
     "1 ms steps": {"time_step": 0.001},
-    "no early stop": {"calm_samples": 1_000_000},
+    "no early stop": {"early_stop_samples": 1_000_000},
 }
 """How Drake is asked: as by default, and in ways that should not matter."""
 

@@ -205,7 +205,7 @@ def in_bullet(case: Case) -> tuple[float, float, float, Found]:
             scene.support.contains(*X.p[:2])
             and X.p[2] >= 0
             and np.linalg.norm(X.p - X_first.p) < limits.max_displacement
-            and np.linalg.norm(X.p - X_late.p) <= limits.rest_drift
+            and np.linalg.norm(X.p - X_late.p) <= limits.max_rest_displacement
             and tilt_between(o.object_class, X_first, X) < math.radians(limits.max_tilt_deg)
             for o, X, X_first, X_late in zip(scene.objects, poses(scene), first, late, strict=True)
         )
@@ -460,7 +460,7 @@ def main(
     result |= {"versions": {"python": platform.python_version()} | packages, "notes": NOTES}
 
     fast, drake = StaticStabilityJudge(CONFIG), DrakeJudge(CONFIG)
-    accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, calm_samples=NEVER)))
+    accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, early_stop_samples=NEVER)))
     rg, cases = generator(NODES, CONFIG.cell.support.size[0], seed), []
     for index in range(count):
         rng = item_rng(seed, index)

@@ -14,7 +14,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.agents.generators import RandomGenerator
-from drake_clutter.catalog import Rest, Shape, load_catalog
+from drake_clutter.catalog import RestOrientation, Shape, load_catalog
 from drake_clutter.config import ClutterConfig, SettleConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
@@ -29,8 +29,12 @@ from drake_clutter.simulation.settle import settle
 NEVER = 1_000_000
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
-    "no early stop, 2.5 s": {"calm_samples": NEVER, "still_displacement": 0.0, "max_time": 2.5},
-    "calm, or 2 s": {"still_displacement": 0.0},
+    "no early stop, 2.5 s": {
+        "early_stop_samples": NEVER,
+        "chatter_displacement": 0.0,
+        "max_time": 2.5,
+    },
+    "calm, or 2 s": {"chatter_displacement": 0.0},
     "1 ms steps": {"time_step": 0.001},
     "4 ms steps": {"time_step": 0.004},
     "other random offsets": {},
@@ -67,7 +71,10 @@ def rests_on_lying(group: list[SceneObject]) -> str:
     """ "single" or "pair" if something rests on a lying cylinder or on two side by side, else ""."""
     found = ""
     for o in group:
-        if o.object_class.shape is not Shape.CYLINDER or o.object_class.only_rest is Rest.UPRIGHT:
+        if (
+            o.object_class.shape is not Shape.CYLINDER
+            or o.object_class.only_rest is RestOrientation.UPRIGHT
+        ):
             continue
         loaded = any(abs(other.bounds_T[0][2] - o.top_height) < 1e-6 for other in group)
         beside = any(

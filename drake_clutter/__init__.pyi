@@ -16,12 +16,12 @@ from .scenes.scene_dataset import (
     SceneDataset as SceneDataset,
     load_scene_dataset as load_scene_dataset,
 )
-from .export.folder import ExportFormat as ExportFormat, export_scene as export_scene
+from .export.export_folder import ExportFormat as ExportFormat, export_scene as export_scene
 
 # The scene grammar.
-from .grammar.graph import ClutterGraph as ClutterGraph
-from .grammar.grammar import NodeBudget as NodeBudget, SceneGrammar as SceneGrammar
-from .grammar.rules import ProductionRule as ProductionRule
+from .grammar.clutter_graph import ClutterGraph as ClutterGraph
+from .grammar.scene_grammar import NodeBudget as NodeBudget, SceneGrammar as SceneGrammar
+from .grammar.production_rules import ProductionRule as ProductionRule
 from .scenes.layout import LayoutFailure as LayoutFailure, lay_out as lay_out
 
 # The simulated world and the work cell.

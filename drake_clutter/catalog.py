@@ -28,11 +28,11 @@ from drake_clutter.yaml_io import read_yaml
 CATALOG_FILE = "catalog.yaml"
 _EARLIER_CATALOG_FILE = "catalogue.yaml"
 """Name of a catalog in asset folders that were made before version 0.2."""
-_CYLINDER_SIDES = 32
+_PRISM_SIDES = 32
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-_NONE: Any = Field(default_factory=dict)
+_EMPTY_MAPPING: Any = Field(default_factory=dict)
 _Size = Annotated[float, InRange(3, 1000)]
-_GRAMMAR_WORDS = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
+_RESERVED_NAMES = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
 
 
 class Shape(Enum):
@@ -43,7 +43,7 @@ class Shape(Enum):
     MESH = "mesh"
 
 
-class Rest(Enum):
+class RestOrientation(Enum):
     """Which of an object's axes points up when it rests: by its extent, but a mesh's are taken to be x, y, z in this order."""
 
     FLAT = "flat"  # the shortest
@@ -58,7 +58,7 @@ class PairArrangement(Enum):
     STANDING = "standing"
 
 
-class Label(StrictModel):
+class LabelDesign(StrictModel):
     """How the texture of a class is drawn. Colors are sRGB hex strings.
 
     Attributes:
@@ -74,9 +74,9 @@ class Label(StrictModel):
     motif: str = "dots"
 
 
-def _class_name(name: str) -> str:
-    if not _NAME.fullmatch(name) or name in _GRAMMAR_WORDS:
-        words = ", ".join(sorted(_GRAMMAR_WORDS))
+def _check_class_name(name: str) -> str:
+    if not _NAME.fullmatch(name) or name in _RESERVED_NAMES:
+        words = ", ".join(sorted(_RESERVED_NAMES))
         raise allowed_error(f"a name of lower-case letters, digits and _, and none of {words}")
     return name
 
@@ -101,13 +101,13 @@ class ClassEntry(StrictModel):
     mass_g: Annotated[float, InRange(1e-6, 20_000)]
     source: str = ""
     pairs: tuple[PairArrangement, ...] = ()
-    only_rest: Rest | None = None
+    only_rest: RestOrientation | None = None
     mesh: NonEmptyText | None = None
-    label: Label = Label()
+    label: LabelDesign = LabelDesign()
 
     @field_validator("size_mm")
     @classmethod
-    def _round(cls, size: tuple[float, ...] | None, info: ValidationInfo) -> Any:
+    def _check_cylinder_size(cls, size: tuple[float, ...] | None, info: ValidationInfo) -> Any:
         if size and info.data.get("shape") is Shape.CYLINDER and size[0] != size[1]:
             raise allowed_error(
                 "diameter, diameter, height: a cylinder's first two sizes are equal"
@@ -116,13 +116,13 @@ class ClassEntry(StrictModel):
 
     @field_validator("pairs")
     @classmethod
-    def _once(cls, pairs: tuple[PairArrangement, ...]) -> tuple[PairArrangement, ...]:
+    def _check_pairs(cls, pairs: tuple[PairArrangement, ...]) -> tuple[PairArrangement, ...]:
         if len(set(pairs)) != len(pairs):
             raise allowed_error("each arrangement once")
         return pairs
 
     @model_validator(mode="after")
-    def _size_or_mesh(self) -> Self:
+    def _check_size_or_mesh(self) -> Self:
         is_mesh = self.shape is Shape.MESH
         if is_mesh == (self.mesh is None) or is_mesh == (self.size_mm is not None):
             raise allowed_error(
@@ -139,8 +139,8 @@ class CatalogFile(StrictModel):
         object_sets: Named lists of classes; a user's catalog may name shipped classes too.
     """
 
-    classes: dict[Annotated[str, AfterValidator(_class_name)], ClassEntry] = _NONE
-    object_sets: dict[str, tuple[str, ...]] = _NONE
+    classes: dict[Annotated[str, AfterValidator(_check_class_name)], ClassEntry] = _EMPTY_MAPPING
+    object_sets: dict[str, tuple[str, ...]] = _EMPTY_MAPPING
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +166,9 @@ class ObjectClass:
     mass: float
     source: str
     pairs: tuple[PairArrangement, ...]
-    only_rest: Rest | None
+    only_rest: RestOrientation | None
     mesh: Path | None
-    label: Label
+    label: LabelDesign
     folder: Path
 
     @property
@@ -209,7 +209,7 @@ class ObjectClass:
                 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),
             )
         if self.shape is Shape.CYLINDER:
-            angle = np.arange(_CYLINDER_SIDES) * (2 * math.pi / _CYLINDER_SIDES)
+            angle = np.arange(_PRISM_SIDES) * (2 * math.pi / _PRISM_SIDES)
             ring = half[0] * np.column_stack([np.cos(angle), np.sin(angle)])
             return (
                 np.vstack(
@@ -256,7 +256,7 @@ class Catalog:
         return tuple(self.classes[class_name] for class_name in self.object_sets[name])
 
 
-def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
+def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
     if not path.is_file():
         raise InputError(f"{where}.mesh: no file {path}; give a mesh that lies beside the catalog")
     try:
@@ -275,10 +275,10 @@ def _mesh_size(path: Path, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
+def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
     mesh = folder / entry.mesh if entry.mesh else None
     if mesh is not None:
-        size = _mesh_size(mesh, where)
+        size = _measure_mesh(mesh, where)
     else:
         assert entry.size_mm is not None
         x, y, z = (s / 1000 for s in entry.size_mm)
@@ -323,18 +323,18 @@ def load_catalog(folder: Path | None = None) -> Catalog:
     for asset_folder in folders:
         path = catalog_path(asset_folder)
         if not path.is_file():
-            what = f"no such file; a catalog is a folder that holds {CATALOG_FILE}"
-            raise input_error(str(path), what)
-        read = validate(CatalogFile, read_yaml(path, "a catalog"), str(path))
-        for name, entry in read.classes.items():
+            allowed_values = f"no such file; a catalog is a folder that holds {CATALOG_FILE}"
+            raise input_error(str(path), allowed_values)
+        catalog_file = validate(CatalogFile, read_yaml(path, "a catalog"), str(path))
+        for name, entry in catalog_file.classes.items():
             if name in classes:
                 raise InputError(f"{path}: classes.{name}: is shipped already; choose another name")
-            classes[name] = _object_class(name, entry, asset_folder, f"{path}: classes.{name}")
-        for set_name, members in read.object_sets.items():
+            classes[name] = _make_object_class(name, entry, asset_folder, f"{path}: classes.{name}")
+        for set_name, members in catalog_file.object_sets.items():
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
-                what = f"a list, without repeats, of {', '.join(classes)}"
-                found = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
-                raise input_error(str(path), f"{found}; allowed is {what}")
+                allowed_values = f"a list, without repeats, of {', '.join(classes)}"
+                problem = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
+                raise input_error(str(path), f"{problem}; allowed is {allowed_values}")
             object_sets[set_name] = members
     return Catalog(classes, object_sets, folders)

@@ -12,11 +12,14 @@ from drake_clutter.validation import (
     config_class,
     load_config_as,
     override_config,
+    renamed_fields,
     to_plain,
+    with_current_names,
 )
 
 
 @config_class
+@renamed_fields(placement_tries="placement_attempts")
 class LayoutConfig:
     """How a graph becomes poses on the support.
 
@@ -25,21 +28,29 @@ class LayoutConfig:
         max_stack_height: A higher stack is a typed failure [m].
         lying_gap: Between the two objects of a lying pair [m].
         standing_gap: Between the two objects of a standing pair [m].
-        placement_tries: Draws of a stack's place before the layout starts anew, and of new starts.
+        placement_attempts: Draws of a stack's place before the layout starts anew, and of new starts.
     """
 
     stack_gap: NonNegative = 0.010
     max_stack_height: NonNegative = 0.50
     lying_gap: NonNegative = 0.002
     standing_gap: NonNegative = 0.050
-    placement_tries: Annotated[int, InRange(1)] = 100
+    placement_attempts: Annotated[int, InRange(1)] = 100
 
 
 @config_class
+@renamed_fields(
+    rest_drift="max_rest_displacement",
+    calm_speed="early_stop_speed",
+    calm_displacement="early_stop_displacement",
+    calm_tilt_deg="early_stop_tilt_deg",
+    calm_samples="early_stop_samples",
+    still_displacement="chatter_displacement",
+)
 class SettleConfig:
     """How Drake settles a scene and what counts as stable.
 
-    Contact properties belong to the assets: see `drake_clutter.assets.contact`.
+    Contact properties belong to the assets: see `drake_clutter.assets.contact_properties`.
 
     Attributes:
         time_step: Of the simulation [s].
@@ -47,14 +58,14 @@ class SettleConfig:
         max_displacement: A stable object's origin moves less [m].
         max_tilt_deg: A stable object turns less (a body of revolution: its axis) [deg].
         max_time: Simulated at most [s].
-        rest_drift: What went further in the last 0.5 s is not at rest [m]. Contact chatter and a marker that rocks on
+        max_rest_displacement: What went further in the last 0.5 s is not at rest [m]. Contact chatter and a marker that rocks on
             the facets of its contact mesh stay below it.
-        calm_speed: A stack is calm while every object is below this speed [m/s], and the next two limits.
-        calm_displacement: Since the start [m].
-        calm_tilt_deg: Since the start [deg].
-        calm_samples: Calm samples in a row, 0.05 s apart, that end the simulation early.
-        still_displacement: Half a second in which no object was further than this from where it is [m], or turned by
-            calm_tilt_deg, ends it too: light objects under heavy ones chatter, and are never calm.
+        early_stop_speed: A stack is calm while every object is below this speed [m/s], and the next two limits.
+        early_stop_displacement: Since the start [m].
+        early_stop_tilt_deg: Since the start [deg].
+        early_stop_samples: Calm samples in a row, 0.05 s apart, that end the simulation early.
+        chatter_displacement: Half a second in which no object was further than this from where it is [m], or turned by
+            early_stop_tilt_deg, ends it too: light objects under heavy ones chatter, and are never calm.
     """
 
     time_step: Annotated[float, InRange(1e-4, 0.02)] = 0.002
@@ -62,12 +73,12 @@ class SettleConfig:
     max_displacement: NonNegative = 0.010
     max_tilt_deg: NonNegative = 8.0
     max_time: Annotated[float, InRange(0.1, 60.0)] = 2.0
-    rest_drift: NonNegative = 0.0025
-    calm_speed: NonNegative = 0.0003
-    calm_displacement: NonNegative = 0.001
-    calm_tilt_deg: NonNegative = 0.3
-    calm_samples: Annotated[int, InRange(1)] = 4
-    still_displacement: NonNegative = 0.0005
+    max_rest_displacement: NonNegative = 0.0025
+    early_stop_speed: NonNegative = 0.0003
+    early_stop_displacement: NonNegative = 0.001
+    early_stop_tilt_deg: NonNegative = 0.3
+    early_stop_samples: Annotated[int, InRange(1)] = 4
+    chatter_displacement: NonNegative = 0.0005
 
 
 @config_class
@@ -108,54 +119,59 @@ class ClutterConfig:
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> ClutterConfig:
     """Return the simulated world, see `load_config_as`."""
-    return load_config_as(ClutterConfig(), path, settings, upgrade)
+    return load_config_as(ClutterConfig(), path, settings, upgrade_config)
 
 
-def upgrade(given: Any) -> Any:
+def upgrade_config(given: Any) -> Any:
     """Return a document with the camera, tray and arm of version 0.1 in its cell."""
     if not isinstance(given, dict):
         return given
-    made = {key: value if key == "cell" else upgrade(value) for key, value in given.items()}
+    upgraded = {
+        key: value if key == "cell" else upgrade_config(value) for key, value in given.items()
+    }
     cell: dict[str, Any] = {}
-    if isinstance(camera := made.get("camera"), dict):
-        del made["camera"]
-        cell["cameras"] = {"overhead": _camera(camera)}
-    if isinstance(layout := made.get("layout"), dict) and "tray_side" in layout:
-        made["layout"] = {key: value for key, value in layout.items() if key != "tray_side"}
+    if isinstance(camera := upgraded.get("camera"), dict):
+        del upgraded["camera"]
+        cell["cameras"] = {"overhead": _upgrade_camera(camera)}
+    if isinstance(layout := upgraded.get("layout"), dict) and "tray_side" in layout:
+        upgraded["layout"] = {key: value for key, value in layout.items() if key != "tray_side"}
         cell["support"] = {"size": [layout["tray_side"]] * 2}
-    if isinstance(arm := made.get("arm"), dict):
-        del made["arm"]
-        made["world"] = _over({"cell": upgrade_cell(arm)}, made.get("world", {}))
-    if "camera_noise" in made:
-        noise = {"overhead": {"depth_noise": made.pop("camera_noise")}}
-        made["world"] = _over({"cell": {"cameras": noise}}, made.get("world", {}))
+    if isinstance(arm := upgraded.get("arm"), dict):
+        del upgraded["arm"]
+        upgraded["world"] = _merge_over({"cell": upgrade_cell(arm)}, upgraded.get("world", {}))
+    if "camera_noise" in upgraded:
+        noise = {"overhead": {"depth_noise": upgraded.pop("camera_noise")}}
+        upgraded["world"] = _merge_over({"cell": {"cameras": noise}}, upgraded.get("world", {}))
     if cell:
-        made["cell"] = _over(cell, made.get("cell", {}))
-    return made
+        upgraded["cell"] = _merge_over(cell, upgraded.get("cell", {}))
+    return upgraded
 
 
-def _over(moved: Any, given: Any) -> Any:
+def _merge_over(base: Any, given: Any) -> Any:
     """Return what moved from elsewhere with what is given over it."""
-    if not isinstance(given, dict) or not isinstance(moved, dict):
+    if not isinstance(given, dict) or not isinstance(base, dict):
         return given
-    return {**moved, **{key: _over(moved.get(key), value) for key, value in given.items()}}
+    return {**base, **{key: _merge_over(base.get(key), value) for key, value in given.items()}}
 
 
-def upgrade_head(given: Any) -> Any:
+def upgrade_record_head(given: Any) -> Any:
     """Return a document that holds configs of version 0.1, with complete cells instead of their cameras and arms."""
-    return _with_complete_cells(upgrade(given))
+    return _complete_configs(upgrade_config(given))
 
 
-def _with_complete_cells(given: Any) -> Any:
+def _complete_configs(given: Any) -> Any:
     if not isinstance(given, dict):
         return given
-    made = {key: _with_complete_cells(value) for key, value in given.items()}
+    completed = {key: _complete_configs(value) for key, value in given.items()}
+    for key, schema in (("layout", LayoutConfig), ("settle", SettleConfig)):
+        if key in completed:
+            completed[key] = with_current_names(schema, completed[key])
     if isinstance(cell := given.get("cell"), dict):
-        made["cell"] = to_plain(override_config(default_cell(), cell, "cell"))
-    return made
+        completed["cell"] = to_plain(override_config(default_cell(), cell, "cell"))
+    return completed
 
 
-def _camera(old: dict[str, Any]) -> dict[str, Any]:
+def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
     camera = {key: value for key, value in old.items() if key not in ("altitude", "hidden_below")}
     if "altitude" in old:
         camera["pose"] = {"translation": [0.0, 0.0, old["altitude"]], "rpy_deg": [180.0, 0.0, 0.0]}
@@ -169,7 +185,7 @@ def upgrade_cell(old: Any) -> Any:
     if not isinstance(old, dict):
         return old
     robot = {key: old[key] for key in ("home", "payload") if key in old}
-    made = {
+    upgraded = {
         key: value
         for key, value in old.items()
         if key not in ("home", "payload", "suction", "base")
@@ -178,9 +194,9 @@ def upgrade_cell(old: Any) -> Any:
     if isinstance(base, list) and len(base) == 4:
         robot["base"] = {"translation": base[:3], "rpy_deg": [0.0, 0.0, base[3]]}
     elif "base" in old:
-        made["base"] = base
+        upgraded["base"] = base
     if robot:
-        made["robot"] = robot
+        upgraded["robot"] = robot
     if "suction" in old:
-        made["gripper"] = old["suction"]
-    return made
+        upgraded["gripper"] = old["suction"]
+    return upgraded

@@ -20,9 +20,9 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.assets import MOTIFS, build_assets, build_class
-from drake_clutter.assets.contact import FRICTION, HYDROELASTIC_MODULUS
+from drake_clutter.assets.contact_properties import HYDROELASTIC_MODULUS, SURFACE_FRICTION
 from drake_clutter.assets.textures import draw_texture
-from drake_clutter.catalog import ObjectClass, Rest, Shape, load_catalog
+from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
@@ -55,7 +55,7 @@ def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
             properties.GetProperty("hydroelastic", "hydroelastic_modulus") == HYDROELASTIC_MODULUS
         )
     friction = properties.GetProperty("material", "coulomb_friction")
-    assert friction.static_friction() == friction.dynamic_friction() == FRICTION
+    assert friction.static_friction() == friction.dynamic_friction() == SURFACE_FRICTION
 
 
 def document(folder: Path) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def test_shipped_model(entry: ObjectClass) -> None:
     if entry.shape is Shape.CYLINDER:
         # Drake puts ceil(circumference / hint) edges around, at any size.
         edges = math.ceil(math.pi * x / contact.GetProperty("hydroelastic", "resolution_hint"))
-        assert edges == (16 if entry.only_rest is Rest.UPRIGHT else 32)
+        assert edges == (16 if entry.only_rest is RestOrientation.UPRIGHT else 32)
 
 
 @pytest.mark.parametrize("entry", CLASSES.values(), ids=list(CLASSES))

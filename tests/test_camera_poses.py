@@ -18,7 +18,7 @@ from drake_clutter.cell.pinhole import backproject, point_to_camera, pose_to_cam
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.render_scene import render_scene
-from drake_clutter.config import upgrade
+from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
@@ -360,7 +360,9 @@ def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
 
 def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
     scenario = load_config_as(
-        Scenario(), settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"], upgrade=upgrade
+        Scenario(),
+        settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"],
+        upgrade=upgrade_config,
     )
     assert not scenario.world.cell.camera.depth_noise
     assert scenario.world.cell.camera.pose == DEFAULT_CELL.camera.pose

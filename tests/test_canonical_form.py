@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import CLASSES, GRAMMARS
 
-from drake_clutter.catalog import ObjectClass, Rest
+from drake_clutter.catalog import ObjectClass, RestOrientation
 from drake_clutter.grammar import Orientation, canonical_form, resting_rotation
 
 YCB = GRAMMARS["ycb7"]
@@ -89,9 +89,9 @@ def test_canonical_form_of_a_tower_of_pairs_stays_short() -> None:
 def test_resting_rotations(entry: ObjectClass) -> None:
     shortest, middle, longest = sorted(entry.size)
     extents = {
-        Rest.FLAT: (longest, shortest),
-        Rest.SIDE: (longest, middle),
-        Rest.UPRIGHT: (middle, longest),
+        RestOrientation.FLAT: (longest, shortest),
+        RestOrientation.SIDE: (longest, middle),
+        RestOrientation.UPRIGHT: (middle, longest),
     }
     for orientation in Orientation:
         R_TO = resting_rotation(entry, orientation)
@@ -105,10 +105,10 @@ def test_resting_rotations(entry: ObjectClass) -> None:
 
 def test_orientations_are_ten() -> None:
     assert Counter(orientation.rest for orientation in Orientation) == {
-        Rest.FLAT: 6,
-        Rest.SIDE: 2,
-        Rest.UPRIGHT: 2,
+        RestOrientation.FLAT: 6,
+        RestOrientation.SIDE: 2,
+        RestOrientation.UPRIGHT: 2,
     }
-    assert [np.degrees(o.yaw) for o in Orientation if o.rest is Rest.FLAT] == pytest.approx(
-        [0, 30, 60, 90, 120, 150]
-    )
+    assert [
+        np.degrees(o.yaw) for o in Orientation if o.rest is RestOrientation.FLAT
+    ] == pytest.approx([0, 30, 60, 90, 120, 150])

@@ -9,7 +9,7 @@ from conftest import TRAY
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.assets import build_assets
-from drake_clutter.catalog import ObjectClass, PairArrangement, Rest, Shape, load_catalog
+from drake_clutter.catalog import ObjectClass, PairArrangement, RestOrientation, Shape, load_catalog
 from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.files import InputError
 from drake_clutter.simulation.scene_plant import add_scene_plant
@@ -59,7 +59,9 @@ def test_ycb_measures(
 
 def test_cans_stand_and_pairs_follow_the_grammar() -> None:
     classes = load_catalog().classes
-    assert {name for name, entry in classes.items() if entry.only_rest is Rest.UPRIGHT} == {
+    assert {
+        name for name, entry in classes.items() if entry.only_rest is RestOrientation.UPRIGHT
+    } == {
         "master_chef_can",
         "tomato_soup_can",
         "pringles_can",

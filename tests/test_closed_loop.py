@@ -14,7 +14,7 @@ from drake_clutter.agents.explorers import largest_clear
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run_scenario import load_or_generate_scene as scenario_scene
 from drake_clutter.commands.run_scenario import run_closed_loop, write_scenario_results
-from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade
+from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
@@ -273,7 +273,7 @@ def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig
 def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
     (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
-    told = load_config_as(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade)
+    told = load_config_as(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config)
     cell = told.world.cell
     assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == (
         (-0.65, 0.0, 0.3),

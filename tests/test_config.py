@@ -7,7 +7,13 @@ import pytest
 from conftest import DEFAULT_CELL, cell_with, tray, world_with
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.config import ClutterConfig, load_config, upgrade
+from drake_clutter.config import (
+    ClutterConfig,
+    SettleConfig,
+    load_config,
+    upgrade_config,
+    upgrade_record_head,
+)
 from drake_clutter.files import InputError
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import config_yaml, load_config_as
@@ -46,6 +52,25 @@ def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
     )
 
 
+def test_fields_under_their_earlier_names(tmp_path: Path) -> None:
+    text = "{rest_drift: 0.1, calm_speed: 0.2, calm_displacement: 0.3, calm_tilt_deg: 0.4, calm_samples: 5}"
+    path = config_file(tmp_path, f"settle: {text}\nlayout: {{placement_tries: 7}}\n")
+    config = load_config(path, ["settle.still_displacement=0.6"])
+    assert config.settle == SettleConfig(
+        max_rest_displacement=0.1,
+        early_stop_speed=0.2,
+        early_stop_displacement=0.3,
+        early_stop_tilt_deg=0.4,
+        early_stop_samples=5,
+        chatter_displacement=0.6,
+    )
+    assert config.layout.placement_attempts == 7
+    head = {"world": {"settle": {"rest_drift": 0.1}, "layout": {"placement_tries": 7}}}
+    assert upgrade_record_head(head) == {
+        "world": {"settle": {"max_rest_displacement": 0.1}, "layout": {"placement_attempts": 7}}
+    }
+
+
 def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
     tmp_path: Path,
 ) -> None:
@@ -71,7 +96,7 @@ def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
 )
 def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"world\.yaml: .*allowed"):
-        load_config_as(Scenario(), config_file(tmp_path, text), upgrade=upgrade)
+        load_config_as(Scenario(), config_file(tmp_path, text), upgrade=upgrade_config)
 
 
 def test_two_cameras_are_read_back(tmp_path: Path) -> None:
@@ -130,7 +155,9 @@ def test_a_cell_that_cannot_be(setting: str, message: str) -> None:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     config = world_with(
-        f"cell.support.size={[0.1 + 0.2, 0.5]}", "settle.calm_samples=7", "cell.robot.base.yaw=10"
+        f"cell.support.size={[0.1 + 0.2, 0.5]}",
+        "settle.early_stop_samples=7",
+        "cell.robot.base.yaw=10",
     )
     assert config.cell.support.size == (0.1 + 0.2, 0.5)
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
@@ -164,9 +191,9 @@ def test_the_focal_length_is_that_of_the_field_of_view() -> None:
         ("camera: {fov_y_deg: 0}", "cameras.overhead.fov_y_deg"),
         ("camera: {fov_y_deg: 180}", "cameras.overhead.fov_y_deg"),
         ("camera: {hidden_below: 1.5}", "cameras.overhead.visibility_threshold"),
-        ("layout: {placement_tries: 0}", "layout.placement_tries"),
+        ("layout: {placement_tries: 0}", "layout.placement_attempts"),
         ("layout: {tray_side: 5}", "cell.support.size"),
-        ("settle: {calm_samples: 0}", "settle.calm_samples"),
+        ("settle: {calm_samples: 0}", "settle.early_stop_samples"),
         ("explorer: {}", "explorer"),
         ("- a list", "world.yaml"),
         ("settle: {time_step: 0.001", "world.yaml"),

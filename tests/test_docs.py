@@ -19,7 +19,7 @@ from conftest import DEFAULT_CELL, resting, scene_of, training_script
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
-from drake_clutter.config import load_config, upgrade
+from drake_clutter.config import load_config, upgrade_config
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import load_config_as, to_plain, validate
@@ -179,7 +179,7 @@ def test_training_scripts_parse(page: Path) -> None:
         given = typer.main.get_command(script).make_context(name, words).params
         if "settings" in given:
             config = ROOT / given["config"] if given["config"] else None
-            load_config_as(module.CONFIG, config, given["settings"] or [], upgrade)
+            load_config_as(module.CONFIG, config, given["settings"] or [], upgrade_config)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

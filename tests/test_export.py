@@ -20,10 +20,10 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.assets import build_assets
-from drake_clutter.assets.contact import FRICTION
+from drake_clutter.assets.contact_properties import SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.export import ExportFormat, export_scene
-from drake_clutter.export.parts import class_inertial, class_visual
+from drake_clutter.export.model_parts import load_inertial, load_visual
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
@@ -121,7 +121,7 @@ def check_in_drake(scene: Scene, main_file: Path, package_xml: Path | None) -> N
             friction = inspector.GetProximityProperties(geometry).GetProperty(
                 "material", "coulomb_friction"
             )
-            assert friction.static_friction() == friction.dynamic_friction() == FRICTION
+            assert friction.static_friction() == friction.dynamic_friction() == SURFACE_FRICTION
             assert inspector.GetProximityProperties(geometry).HasProperty(
                 "hydroelastic", "hydroelastic_modulus"
             )
@@ -188,9 +188,9 @@ def check_in_mujoco(scene: Scene, main_file: Path) -> None:
         assert [int(geom.contype[0]) for geom in visuals] == [0]
         assert model.mat_texid[visuals[0].matid[0]].max() >= 0
         assert len(contacts) == len(scene[name].object_class.convex_pieces)
-        assert all(geom.friction[0] == FRICTION for geom in contacts)
+        assert all(geom.friction[0] == SURFACE_FRICTION for geom in contacts)
     for name in scene.names:
-        inertial = class_inertial(scene[name].object_class)
+        inertial = load_inertial(scene[name].object_class)
         xx, yy, zz, xy, xz, yz = inertial.inertia
         assert model.body(name).ipos == pytest.approx(inertial.com, abs=1e-9)
         R_OI = Rotation.from_quat(model.body(name).iquat, scalar_first=True).as_matrix()
@@ -262,7 +262,7 @@ def test_textures_are_the_labels(exported: tuple[ExportFormat, Path], scene: Sce
     if format in (ExportFormat.SDF, ExportFormat.MJCF):
         for object_class in {scene_object.object_class for scene_object in scene.objects}:
             with Image.open(main_file.parent / object_class.name / "label.png") as picture:
-                label = class_visual(object_class).visual.material.baseColorTexture.convert("RGB")
+                label = load_visual(object_class).visual.material.baseColorTexture.convert("RGB")
                 assert np.array_equal(np.asarray(picture), np.asarray(label))
 
 

@@ -106,7 +106,7 @@ def test_the_hill_climber_hides_more_than_chance() -> None:
         total, over = 0.0, False
         for name in agent.derive(grammar, NodeBudget(12), rng(seed)).rules:
             if not over:
-                _, reward, over, _, _ = environment.step(environment.grammar.index[name])
+                _, reward, over, _, _ = environment.step(environment.grammar.rule_indices[name])
                 total += float(reward)
         assert over
         return total

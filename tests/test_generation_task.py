@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from drake_clutter.grammar import ClutterGraph, NodeBudget, canonical_form
-from drake_clutter.grammar.graph import DUMMY, END, NON_TERMINAL_KINDS, PRIMITIVE
+from drake_clutter.grammar.clutter_graph import DUMMY, END, NON_TERMINAL_KINDS, PRIMITIVE
 from drake_clutter.tasks.generation_task import (
     ClutterGeneration,
     GenerationObservation,
@@ -40,7 +40,7 @@ def graph_of(observation: GenerationObservation, environment: ClutterGeneration)
 def finished_stacks(graph: ClutterGraph) -> set[int]:
     """The objects of the stacks of which every attribute is terminal."""
     found = set()
-    for bottom in graph.stacks():
+    for bottom in graph.stack_bases():
         members = set(bottom).union(*(nx.descendants(graph.nx, node) for node in bottom))
         edges = [
             e for e in graph.nx.edges(data="kind") if e[1] in members and graph.kind(e[1]) != END
@@ -75,7 +75,7 @@ def test_what_is_observed_is_the_graph(objects: str) -> None:
             shown = graph_of(observation, environment)
             assert [shown.kind(k) for k in shown.nx] == graph.kinds()
             assert dict(shown.nx.edges) == dict(graph.nx.edges)
-            assert (info["action_mask"] == grammar.feasible(graph, NodeBudget(14))).all()
+            assert (info["action_mask"] == grammar.feasible_rules(graph, NodeBudget(14))).all()
             assert (observation["node_mask"] == (observation["node_kind"] > 0)).all()
             assert (observation["edge_mask"] == (observation["edge_kind"] > 0)).all()
             assert observation["remaining"] == pytest.approx((14 - len(graph)) / 25)
@@ -183,7 +183,7 @@ def derived(
     info: dict[str, object] = {}
     for name in rules:
         assert not over, f"over before {name}"
-        _, reward, over, _, info = environment.step(environment.grammar.index[name])
+        _, reward, over, _, info = environment.step(environment.grammar.rule_indices[name])
         total += float(reward)
     return total, over, info
 

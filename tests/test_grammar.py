@@ -20,8 +20,8 @@ from drake_clutter.grammar import (
     SceneGrammar,
     uniform_choice,
 )
-from drake_clutter.grammar.graph import DUMMY, END, OBJECT_SLOT, OPEN_SLOT, PRIMITIVE, TRAY
-from drake_clutter.grammar.rules import KEEP, ProductionRule
+from drake_clutter.grammar.clutter_graph import DUMMY, END, OBJECT_SLOT, OPEN_SLOT, PRIMITIVE, TRAY
+from drake_clutter.grammar.production_rules import KEEP, ProductionRule
 
 Choose = Callable[[ClutterGraph, NDArray[np.bool_]], int]
 Nodes = list[tuple[int, str]]
@@ -148,7 +148,7 @@ def test_left_and_right_of_every_kind_of_rule() -> None:
         assert rules[name].left.nodes["child"] == set(YCB.classes)
         assert edges_by_kind(rules[name]) == {("parent", "child", orientation): 1}
     growth = {"drop_object": 2, "stack_object": 1} | {name: 2 for name in rules if "meta" in name}
-    assert {name: rule.growth for name, rule in rules.items() if rule.growth} == growth
+    assert {name: rule.nodes_added for name, rule in rules.items() if rule.nodes_added} == growth
     assert {rule.name: rule.open_slots_added for rule in YCB.rules if rule.open_slots_added} == {
         "drop_object": 1,
         "end": -1,
@@ -204,19 +204,19 @@ def test_an_insertion_waits_for_a_closed_top_and_a_terminal_parent() -> None:
     budget = NodeBudget(20)
 
     def feasible(*rules: str) -> set[str]:
-        mask = YCB.feasible(YCB.replay(rules), budget)
+        mask = YCB.feasible_rules(YCB.replay(rules), budget)
         return {
             rule.name.split("_")[0]
             for rule, allowed in zip(YCB.rules, mask, strict=True)
             if allowed
         }
 
-    assert YCB.feasible(graph, budget).sum() == 1
+    assert YCB.feasible_rules(graph, budget).sum() == 1
     assert feasible("drop_object") == {"drop", "stack", "end"}
     assert feasible("drop_object", "end") == {"drop", "insert"}
     assert feasible("drop_object", "stack_object") == {"drop", "stack", "end", "insert"}
     two = YCB.replay(["drop_object", "stack_object", "stack_object", "end"])
-    inserted = YCB.apply(two, YCB.rules[YCB.index["insert_sugar_box"]])
+    inserted = YCB.apply_rule(two, YCB.rules[YCB.rule_indices["insert_sugar_box"]])
     assert [inserted.kind(node) for node in range(5)] == [
         TRAY,
         "sugar_box",
@@ -246,9 +246,9 @@ def test_the_first_match_is_breadth_first_with_siblings_in_order() -> None:
 def test_apply_leaves_its_argument_alone() -> None:
     graph = YCB.replay(EXAMPLE[:5])
     before = ordered(graph.copy())
-    for rule, feasible in zip(YCB.rules, YCB.feasible(graph, NodeBudget(20)), strict=True):
+    for rule, feasible in zip(YCB.rules, YCB.feasible_rules(graph, NodeBudget(20)), strict=True):
         if feasible:
-            YCB.apply(graph, rule)
+            YCB.apply_rule(graph, rule)
     assert ordered(graph) == before
 
 
@@ -324,7 +324,7 @@ def test_every_derivation_ends_terminal_and_in_budget(
     graph = derivation.graph
     assert graph.is_terminal
     assert len(graph) == nodes if exact else nodes - 1 <= len(graph) <= nodes
-    assert len(graph.breadth_first()) == len(graph)
+    assert len(graph.breadth_first_order()) == len(graph)
     assert ordered(grammar.replay(derivation.rules)) == ordered(graph)
     rebuilt = ClutterGraph.from_parts(
         dict(ordered(graph)[0]), {(a, b): kind for a, b, kind in ordered(graph)[1]}
@@ -341,7 +341,7 @@ def test_both_object_sets_use_every_rule() -> None:
             for _ in range(60)
             for name in grammar.derive(NodeBudget(25), uniform_choice(generator)).rules
         }
-        assert used == set(grammar.index)
+        assert used == set(grammar.rule_indices)
 
 
 def matches_by_networkx(graph: ClutterGraph, rule: ProductionRule) -> bool:
@@ -368,17 +368,19 @@ def test_feasible_rules_are_those_that_match_and_fit(objects: str) -> None:
         generator = rng(seed)
         budget = NodeBudget(5 + 3 * seed, exact=seed % 2 == 0)
         graph = ClutterGraph()
-        while (mask := grammar.feasible(graph, budget)).any():
+        while (mask := grammar.feasible_rules(graph, budget)).any():
             for rule, feasible in zip(grammar.rules, mask, strict=True):
                 expected = matches_by_networkx(graph, rule)
                 if expected:
-                    result = grammar.apply(graph, rule)
+                    result = grammar.apply_rule(graph, rule)
                     left = budget.nodes - len(result)
                     can_stack = OPEN_SLOT in dict(ordered(result)[0]).values()
                     expected = left >= 0 and (not budget.exact or left != 1 or can_stack)
                 assert feasible == expected, f"{rule.name} at seed {seed}"
                 compared[expected] += 1
-            graph = grammar.apply(graph, grammar.rules[int(generator.choice(np.flatnonzero(mask)))])
+            graph = grammar.apply_rule(
+                graph, grammar.rules[int(generator.choice(np.flatnonzero(mask)))]
+            )
     assert min(compared.values()) > 500
 
 
@@ -404,7 +406,7 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
     while queue:
         graph = queue.pop()
         results = {
-            rule.name: grammar.apply(graph, rule)
+            rule.name: grammar.apply_rule(graph, rule)
             for rule in rules
             if matches_by_networkx(graph, rule)
         }
@@ -435,7 +437,11 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
     while queue:
         graph = queue.pop()
         mask = dict(
-            zip(grammar.index, grammar.feasible(graph, NodeBudget(nodes, exact)), strict=True)
+            zip(
+                grammar.rule_indices,
+                grammar.feasible_rules(graph, NodeBudget(nodes, exact)),
+                strict=True,
+            )
         )
         following = successors[key(graph)]
         for rule in rules:

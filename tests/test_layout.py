@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
-from drake_clutter.grammar.graph import DUMMY
+from drake_clutter.grammar.clutter_graph import DUMMY
 from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.layout import LayoutFailure, LayoutFailureReason, lay_out
 from drake_clutter.scenes.scene import Scene, SceneObject
@@ -101,7 +101,7 @@ def footprints(scene: Scene) -> list[tuple[Footprint, Footprint]]:
     """The axis-aligned footprints of every two stacks."""
     assert scene.graph is not None
     stack_of: dict[int, int] = {}
-    for node in scene.graph.breadth_first():
+    for node in scene.graph.breadth_first_order():
         if node in {o.node for o in scene.objects}:
             below = carriers(scene.graph, node)
             pair = next((pair for pair in twins(scene.graph) if node in pair), (node,))
@@ -207,7 +207,7 @@ BOX_ON_TRAY = ("drop_object", "end", "insert_cracker_box", "orient_flat_0")
     ],
 )
 def test_no_room(count: int, side: float) -> None:
-    config = world_with(f"layout.tray_side={side}", "layout.placement_tries=20")
+    config = world_with(f"layout.tray_side={side}", "layout.placement_attempts=20")
     failure = lay_out(derived(*BOX_ON_TRAY * count), CLASSES, config, rng())
     assert isinstance(failure, LayoutFailure)
     assert failure.reason is LayoutFailureReason.NO_ROOM

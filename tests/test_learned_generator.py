@@ -104,7 +104,7 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
         ClutterGeneration(list(g.classes.values()), GenerationTaskConfig(nodes=12))
         for g in (small, large)
     ]
-    both = [large.index[rule.name] for rule in small.rules]
+    both = [large.rule_indices[rule.name] for rule in small.rules]
     draw = rng(3)
     for episode in range(5):
         (one, info), (other, _) = (environment.reset(seed=episode) for environment in environments)

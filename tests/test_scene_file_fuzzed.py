@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_scene_file import DOCUMENT, GONE, SCENE, Path_, changed, loads_or_is_refused
 
-from drake_clutter.config import upgrade
+from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
-from drake_clutter.grammar.graph import OBJECT_SLOT
+from drake_clutter.grammar.clutter_graph import OBJECT_SLOT
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import load_config_as
 from drake_clutter.yaml_io import to_yaml
@@ -152,7 +152,7 @@ def test_any_value_anywhere_in_a_config_loads_or_is_refused(
     fuzzed.write_text(to_yaml(document))
     message = f"{fuzzed}: "
     try:
-        load_config_as(Scenario(), fuzzed, upgrade=upgrade)
+        load_config_as(Scenario(), fuzzed, upgrade=upgrade_config)
     except InputError as refusal:
         message = str(refusal)
     assert message.startswith(f"{fuzzed}: ")

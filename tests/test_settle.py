@@ -232,14 +232,14 @@ def test_the_end_comes_when_all_are_calm_or_still() -> None:
     calm = settle([box], TRAY, SettleConfig(), record=True)
     assert calm.instability is None
     assert calm.motion[-1].time == pytest.approx(0.2)  # four calm samples
-    still = settle([box], TRAY, SettleConfig(max_time=0.8, calm_samples=100), record=True)
+    still = settle([box], TRAY, SettleConfig(max_time=0.8, early_stop_samples=100), record=True)
     assert still.motion[-1].time == pytest.approx(0.5), (
         "half a second in which nothing left its place"
     )
     patient = settle(
         [box],
         TRAY,
-        SettleConfig(max_time=0.8, calm_samples=100, still_displacement=0.0),
+        SettleConfig(max_time=0.8, early_stop_samples=100, chatter_displacement=0.0),
         record=True,
     )
     assert patient.motion[-1].time == pytest.approx(0.8)

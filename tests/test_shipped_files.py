@@ -9,7 +9,7 @@ import pytest
 from conftest import CATALOG, DEFAULT_CELL, training_script
 
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.config import ClutterConfig, upgrade, upgrade_cell, upgrade_head
+from drake_clutter.config import ClutterConfig, upgrade_cell, upgrade_config, upgrade_record_head
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.records import read_jsonl
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
@@ -55,12 +55,12 @@ def test_cells(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", CONFIGS, ids=name_of)
 def test_training_configs(path: Path) -> None:
     default = script_config(path.stem)
-    assert type(load_config_as(default, path, upgrade=upgrade)) is type(default)
+    assert type(load_config_as(default, path, upgrade=upgrade_config)) is type(default)
 
 
 @pytest.mark.parametrize("path", CHECKPOINTS, ids=name_of)
 def test_checkpoints_and_their_configs(path: Path) -> None:
-    given = upgrade(load_checkpoint(path).metadata["config"])
+    given = upgrade_config(load_checkpoint(path).metadata["config"])
     if "detector" in path.stem:
         del given["layout"]  # of version 0.1; a detector has no use for it
     config = override_config(script_config(path.stem), given, str(path))
@@ -89,18 +89,21 @@ def configs_in(document: Any) -> Iterator[tuple[str, Any]]:
 def test_results(path: Path) -> None:
     is_record_file = path.name.endswith(".jsonl.gz")
     document = read_jsonl(path)[0] if is_record_file else json.loads(path.read_text())
-    upgrade_head(document)
+    upgrade_record_head(document)
     for key, value in configs_in(document):
         if isinstance(value, str):  # YAML, or the name of a config
             value = parse_yaml(value, str(path))
         if not isinstance(value, dict):
             continue
         if key == "scenario":
-            assert override_config(Scenario(), upgrade(value), str(path)).world.cell == DEFAULT_CELL
+            assert (
+                override_config(Scenario(), upgrade_config(value), str(path)).world.cell
+                == DEFAULT_CELL
+            )
         elif key in ("arm", "cell"):
             assert override_config(DEFAULT_CELL, upgrade_cell(value), str(path)) == DEFAULT_CELL
         else:
             of_training = "learning" in value
             default: Any = script_config("sg") if of_training else ClutterConfig()
-            config = override_config(default, upgrade(value), str(path))
+            config = override_config(default, upgrade_config(value), str(path))
             assert (config.world if of_training else config).cell == DEFAULT_CELL

@@ -391,7 +391,8 @@ def test_stable_scenes_look_as_drake_says(
     assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
     for name in scene.names:
         assert (
-            np.linalg.norm(mine.settled[name].p - drakes.settled[name].p) < config.settle.rest_drift
+            np.linalg.norm(mine.settled[name].p - drakes.settled[name].p)
+            < config.settle.max_rest_displacement
         )
         assert np.hypot(*(mine.settled[name].p - scene[name].X_TO.p)[:2]) <= 0.001
     assert fast.find_instability(scene.with_poses(drakes.settled)) is None

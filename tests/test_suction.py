@@ -7,7 +7,7 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_clutter.catalog import Rest, Shape, load_catalog
+from drake_clutter.catalog import RestOrientation, Shape, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
 from drake_clutter.cell.suction import (
     GRAVITY,
@@ -71,7 +71,11 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
     def seals(diameter: float) -> bool:
         for o in load_catalog().object_set("pantry14"):
             for axis in (
-                range(3) if o.shape is Shape.BOX else [2] if o.only_rest is Rest.UPRIGHT else []
+                range(3)
+                if o.shape is Shape.BOX
+                else [2]
+                if o.only_rest is RestOrientation.UPRIGHT
+                else []
             ):
                 z = -np.eye(3)[axis]
                 x = np.eye(3)[(axis + 1) % 3]

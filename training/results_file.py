@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import drake_clutter
-from drake_clutter.config import upgrade_head
+from drake_clutter.config import upgrade_record_head
 from drake_clutter.files import InputError, write_json
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
@@ -51,7 +51,7 @@ class ResultsFile:
             InputError: The file is no results file, or has another header.
         """
         try:
-            document = upgrade_head(json.loads(self.path.read_text(encoding="utf-8")))
+            document = upgrade_record_head(json.loads(self.path.read_text(encoding="utf-8")))
             rows: list[Row] = document["rows"]
             differing = [key for key, value in self.header.items() if document[key] != value]
         except FileNotFoundError:
@@ -120,5 +120,5 @@ def collect_records(
             record = result if isinstance(result, dict) else asdict(result)
             yield record | software
 
-    with closing(resume_jsonl(path, header, compute, upgrade_head)) as lines:
+    with closing(resume_jsonl(path, header, compute, upgrade_record_head)) as lines:
         return list(islice(lines, 1, 1 + len(items)))

@@ -18,7 +18,7 @@ import typer
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
-from drake_clutter.config import upgrade
+from drake_clutter.config import upgrade_config
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.perception.image_dataset import ImageDataset
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, ImageWindow, SegmentationNetwork
@@ -133,7 +133,7 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch on a CPU.")] = 2,
 ) -> None:
     """Train a detector and write detector.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade)
+    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
     torch.set_num_threads(threads)
     torch_device = resolve_device(device)
     catalog = load_catalog(Path(training.catalog) if training.catalog else None)

@@ -15,7 +15,7 @@ from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrai
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.agents.ppo import PPOConfig, PPOLearner
-from drake_clutter.config import upgrade
+from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
@@ -54,7 +54,7 @@ def main(
     device: DeviceOption = "auto",
 ) -> None:
     """Train an explorer by PPO and write explorer.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade)
+    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
     limit_operations_to_one_thread()
     environment = training.make_environment(privileged=training.privileged)
     learner = PPOLearner(environment, training.learning, training.seed, resolve_device(device))

@@ -25,7 +25,7 @@ from drake_clutter.agents.soft_q import (
     sample_episodes,
 )
 from drake_clutter.catalog import load_catalog
-from drake_clutter.config import ClutterConfig, upgrade
+from drake_clutter.config import ClutterConfig, upgrade_config
 from drake_clutter.grammar import canonical_form
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
@@ -121,7 +121,7 @@ def main(
     ] = NUM_GRADIENT_SHARDS,
 ) -> None:
     """Train a scene generator and write generator.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade)
+    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
     torch_device = resolve_device(device)
     limit_operations_to_one_thread()
     catalog = load_catalog(Path(training.catalog) if training.catalog else None)

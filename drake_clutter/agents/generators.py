@@ -90,7 +90,7 @@ class HillClimber:
             partial = PartialScene(grammar, task, self._config, self._judge)
             kept: tuple[str, ...] = best.rules[: rng.integers(len(best.rules))] if best else ()
             for name in kept:
-                partial.apply(grammar.index[name])
+                partial.apply(grammar.rule_indices[name])
             while not partial.finished:
                 partial.apply(int(rng.choice(np.flatnonzero(partial.action_mask))))
             worth = (
@@ -245,9 +245,9 @@ def summarize_scenes(
     largest = []
     for scene, verdict in scenes:
         assert scene.graph is not None
-        stacks.append(len(scene.graph.stacks()))
+        stacks.append(len(scene.graph.stack_bases()))
         objects.append(len(scene.objects))
-        largest.append(scene.graph.largest_stack_share())
+        largest.append(scene.graph.largest_stack_fraction())
         kinds.update(o.object_class.name for o in scene.objects)
         forms.add(canonical_form(scene.graph, classes))
         if verdict.instability is None:

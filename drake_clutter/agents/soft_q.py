@@ -448,7 +448,9 @@ class SoftQLearner:
         ):
             observation, info = environment.reset()
             for rule in saved["rules"]:
-                observation, _, _, _, info = environment.step(environment.grammar.index[rule])
+                observation, _, _, _, info = environment.step(
+                    environment.grammar.rule_indices[rule]
+                )
             environment.np_random.bit_generator.state = saved["rng"]
             self._scores[k], self._observations[k], self._masks[k] = (
                 saved["score"],

@@ -11,19 +11,19 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Pen:
+class MotifPen:
     """Draws one piece in its own coordinates: the piece fits the unit circle, x right, y down.
 
     Attributes:
         draw: the picture.
-        centre, radius: pixels, where the piece lies and how large it is.
+        center, radius: pixels, where the piece lies and how large it is.
         angle: rad, how it is turned.
         accent: the label's accent colour.
         rng: for what differs between pieces.
     """
 
     draw: ImageDraw.ImageDraw
-    centre: Point
+    center: Point
     radius: float
     angle: float
     accent: str
@@ -31,7 +31,7 @@ class Pen:
 
     def _pixels(self, points: Iterable[Point]) -> list[Point]:
         c, s = math.cos(self.angle) * self.radius, math.sin(self.angle) * self.radius
-        return [(self.centre[0] + c * x - s * y, self.centre[1] + s * x + c * y) for x, y in points]
+        return [(self.center[0] + c * x - s * y, self.center[1] + s * x + c * y) for x, y in points]
 
     def polygon(self, points: Sequence[Point], fill: str) -> None:
         """A filled polygon."""
@@ -49,11 +49,11 @@ class Pen:
         )
 
 
-def _dots(pen: Pen) -> None:
+def _dots(pen: MotifPen) -> None:
     pen.oval(0, 0, 0.6, 0.6, "#ffffff")
 
 
-def _cracker(pen: Pen) -> None:
+def _cracker(pen: MotifPen) -> None:
     notched = [(-0.72 + 0.18 * i, -0.72 + 0.05 * (i % 2)) for i in range(9)]
     outline = [
         (x * c - y * s, x * s + y * c)
@@ -68,7 +68,7 @@ def _cracker(pen: Pen) -> None:
             pen.oval(0.4 * (i - 1), 0.4 * (j - 1), 0.08, 0.08, "#8a5320")
 
 
-def _sugar_cube(pen: Pen) -> None:
+def _sugar_cube(pen: MotifPen) -> None:
     pen.polygon([(0, -0.95), (0.8, -0.5), (0, -0.05), (-0.8, -0.5)], "#ffffff")
     pen.polygon([(-0.8, -0.5), (0, -0.05), (0, 0.9), (-0.8, 0.45)], "#d7e0ee")
     pen.polygon([(0.8, -0.5), (0, -0.05), (0, 0.9), (0.8, 0.45)], "#b4c3dc")
@@ -76,7 +76,7 @@ def _sugar_cube(pen: Pen) -> None:
         pen.oval(pen.rng.uniform(-0.7, 0.7), pen.rng.uniform(-0.35, 0.4), 0.03, 0.03, "#ffffff")
 
 
-def _pudding_cup(pen: Pen) -> None:
+def _pudding_cup(pen: MotifPen) -> None:
     pen.oval(0, 0.82, 0.95, 0.14, "#c9b48c")
     pen.polygon([(-0.85, -0.2), (0.85, -0.2), (0.5, 0.8), (-0.5, 0.8)], "#6b3a1c")
     pen.polygon([(-0.85, -0.2), (-0.6, -0.2), (-0.35, 0.8), (-0.5, 0.8)], "#8a5230")
@@ -87,7 +87,7 @@ def _pudding_cup(pen: Pen) -> None:
     pen.oval(0, -0.82, 0.13, 0.13, "#c2182b")
 
 
-def _jelly(pen: Pen) -> None:
+def _jelly(pen: MotifPen) -> None:
     pen.oval(0, 0.62, 0.98, 0.2, "#f7e9ef")
     scallops = [math.pi * i / 6 for i in range(7)]
     pen.polygon([(-0.85, 0.6), (-0.55, -0.5), (0.55, -0.5), (0.85, 0.6)], "#ff3d78")
@@ -102,13 +102,13 @@ def _jelly(pen: Pen) -> None:
     pen.oval(-0.2, -0.54, 0.16, 0.05, "#ffffff")
 
 
-def _coffee_bean(pen: Pen) -> None:
+def _coffee_bean(pen: MotifPen) -> None:
     pen.oval(0, 0, 0.95, 0.62, "#2b1509")
     pen.oval(0, -0.03, 0.88, 0.54, "#5f3516")
     pen.line([(-0.85, 0.05), (-0.4, 0.14), (0, 0), (0.4, -0.14), (0.85, -0.05)], "#2b1509", 0.13)
 
 
-def _tomato(pen: Pen) -> None:
+def _tomato(pen: MotifPen) -> None:
     pen.oval(0, 0.1, 0.92, 0.8, "#8f1410")
     pen.oval(-0.03, 0.07, 0.85, 0.74, "#df2b1f")
     pen.oval(-0.4, -0.18, 0.2, 0.13, "#ff9a85")
@@ -126,7 +126,7 @@ def _tomato(pen: Pen) -> None:
     pen.line([(0, -0.45), (0.08, -0.85)], "#2f7d32", 0.12)
 
 
-def _flake(pen: Pen) -> None:
+def _flake(pen: MotifPen) -> None:
     turns = [2 * math.pi * i / 9 for i in range(9)]
     edge = [
         (r * math.cos(t), 0.8 * r * math.sin(t))
@@ -141,14 +141,14 @@ def _flake(pen: Pen) -> None:
     pen.oval(-0.1, -0.1, 0.32, 0.2, "#fbd988")
 
 
-def _ring(pen: Pen) -> None:
-    colour = pen.rng.choice(["#e8413c", "#f08a24", "#7cc142", "#8e4bb5", "#f7f7f2"])
+def _ring(pen: MotifPen) -> None:
+    color = pen.rng.choice(["#e8413c", "#f08a24", "#7cc142", "#8e4bb5", "#f7f7f2"])
     turns = [2 * math.pi * i / 24 for i in range(25)]
-    for radius, width, fill in ((0.66, 0.62, "#40526a"), (0.66, 0.48, colour)):
+    for radius, width, fill in ((0.66, 0.62, "#40526a"), (0.66, 0.48, color)):
         pen.line([(radius * math.cos(t), radius * math.sin(t)) for t in turns], fill, width)
 
 
-def _oat(pen: Pen) -> None:
+def _oat(pen: MotifPen) -> None:
     kind = pen.rng.random()
     if kind < 0.2:
         pen.oval(0, 0, 0.6, 0.45, "#4a1c2e")
@@ -162,7 +162,7 @@ def _oat(pen: Pen) -> None:
         pen.line([(-0.6, 0), (0.6, 0)], "#9c7434", 0.09)
 
 
-def _spaghetti(pen: Pen) -> None:
+def _spaghetti(pen: MotifPen) -> None:
     for i in range(-13, 14):
         low, high = (
             0.075 * i + pen.rng.uniform(-0.06, 0.06),
@@ -173,20 +173,20 @@ def _spaghetti(pen: Pen) -> None:
         )
 
 
-def _lasagna_slice(pen: Pen) -> None:
+def _lasagna_slice(pen: MotifPen) -> None:
     pen.oval(0, 0.72, 1.0, 0.16, "#ffffff")
-    for i, colour in enumerate(
+    for i, color in enumerate(
         ["#f4cf73", "#c8321f", "#fff3cf", "#f4cf73", "#c8321f", "#fff3cf", "#f4cf73"]
     ):
         y = 0.62 - 0.16 * i
         wave = [(-0.8 + 0.1 * k, y + (0.04 if k % 2 else -0.04)) for k in range(17)]
-        pen.polygon([*wave, *((x, below - 0.2) for x, below in reversed(wave))], colour)
+        pen.polygon([*wave, *((x, below - 0.2) for x, below in reversed(wave))], color)
     pen.oval(0, -0.55, 0.8, 0.12, "#e6a83a")
     for x in (-0.45, 0.05, 0.5):
         pen.oval(x, -0.56, 0.12, 0.05, "#2f7d32")
 
 
-def _tortilla_chip(pen: Pen) -> None:
+def _tortilla_chip(pen: MotifPen) -> None:
     corner = [(0.95, 0.1), (-0.55, 0.8), (-0.5, -0.82)]
     pen.polygon(corner, "#8a4a08")
     pen.polygon([(0.88 * x, 0.88 * y) for x, y in corner], pen.rng.choice(["#f2b63d", "#eaa52a"]))
@@ -194,7 +194,7 @@ def _tortilla_chip(pen: Pen) -> None:
         pen.oval(pen.rng.uniform(-0.4, 0.3), pen.rng.uniform(-0.3, 0.3), 0.06, 0.06, "#b5651d")
 
 
-def _crisp(pen: Pen) -> None:
+def _crisp(pen: MotifPen) -> None:
     pen.oval(0, 0, 1.0, 0.68, "#a9791c")
     pen.oval(-0.03, -0.05, 0.93, 0.6, "#f4cf62")
     pen.oval(0, -0.15, 0.6, 0.28, "#fbe59b")
@@ -202,7 +202,7 @@ def _crisp(pen: Pen) -> None:
         pen.oval(pen.rng.uniform(-0.6, 0.6), pen.rng.uniform(-0.3, 0.35), 0.05, 0.05, "#3f7d2a")
 
 
-def _marker_stroke(pen: Pen) -> None:
+def _marker_stroke(pen: MotifPen) -> None:
     pen.line([(-0.8, 0.3), (-0.3, -0.3), (0.1, 0.3), (0.6, -0.3)], pen.accent, 0.2)
 
 
@@ -211,16 +211,16 @@ class Motif:
     """What a label is strewn with.
 
     Attributes:
-        piece: draws one piece.
+        draw_piece: draws one piece.
         radius: of a piece, as a share of the shorter side of the picture.
-        turned: every piece lies as it fell; else all are upright.
+        random_orientation: every piece lies as it fell; else all are upright.
         background: behind the pieces; the label's accent colour when empty.
         plastic_lid: a can of it is closed by a lid with its title; else by a metal one.
     """
 
-    piece: Callable[[Pen], None]
+    draw_piece: Callable[[MotifPen], None]
     radius: float
-    turned: bool = True
+    random_orientation: bool = True
     background: str = ""
     plastic_lid: bool = False
 
@@ -228,43 +228,45 @@ class Motif:
 MOTIFS: dict[str, Motif] = {
     "dots": Motif(_dots, 0.12),
     "crackers": Motif(_cracker, 0.30),
-    "cubes": Motif(_sugar_cube, 0.20, turned=False),
-    "pudding": Motif(_pudding_cup, 0.46, turned=False),
-    "jelly": Motif(_jelly, 0.46, turned=False),
+    "cubes": Motif(_sugar_cube, 0.20, random_orientation=False),
+    "pudding": Motif(_pudding_cup, 0.46, random_orientation=False),
+    "jelly": Motif(_jelly, 0.46, random_orientation=False),
     "beans": Motif(_coffee_bean, 0.15, plastic_lid=True),
-    "tomato": Motif(_tomato, 0.40, turned=False),
+    "tomato": Motif(_tomato, 0.40, random_orientation=False),
     "flakes": Motif(_flake, 0.15),
     "rings": Motif(_ring, 0.17),
     "oats": Motif(_oat, 0.12),
-    "spaghetti": Motif(_spaghetti, 0.55, turned=False, background="#8a5a12"),
-    "layers": Motif(_lasagna_slice, 0.46, turned=False),
+    "spaghetti": Motif(_spaghetti, 0.55, random_orientation=False, background="#8a5a12"),
+    "layers": Motif(_lasagna_slice, 0.46, random_orientation=False),
     "chips": Motif(_tortilla_chip, 0.19, background="#a3202a"),
     "crisps": Motif(_crisp, 0.22, plastic_lid=True),
-    "marker": Motif(_marker_stroke, 0.30, turned=False),
+    "marker": Motif(_marker_stroke, 0.30, random_orientation=False),
 }
 
 
-def strew(draw: ImageDraw.ImageDraw, size: tuple[int, int], motif: Motif, accent: str) -> None:
+def scatter_motif(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], motif: Motif, accent: str
+) -> None:
     """Fills a picture of `size` (width, height) pixels with the motif's pieces; the same picture every time."""
     width, height = size
     draw.rectangle((0, 0, width, height), fill=motif.background or accent)
     radius = motif.radius * min(size)
     columns, rows = (max(1, math.ceil(side / (1.75 * radius) - 0.5)) for side in size)
     rng = random.Random(0)
-    places = [
-        (i + (0.5 if motif.turned and j % 2 else 0), j)
-        for j in range(rows + motif.turned)
-        for i in range(columns + motif.turned)
+    cells = [
+        (i + (0.5 if motif.random_orientation and j % 2 else 0), j)
+        for j in range(rows + motif.random_orientation)
+        for i in range(columns + motif.random_orientation)
     ]
-    if motif.turned:
-        rng.shuffle(places)  # pieces overlap in no order
-    for i, j in places:
-        shake = 0.18 * radius if motif.turned else 0.0
+    if motif.random_orientation:
+        rng.shuffle(cells)  # pieces overlap in no order
+    for i, j in cells:
+        jitter = 0.18 * radius if motif.random_orientation else 0.0
         # Strewn pieces run over the edge; upright ones are centred in their cells.
-        offset = 0.0 if motif.turned else 0.5
-        centre = (
-            (i + offset) * width / columns + rng.uniform(-shake, shake),
-            (j + offset) * height / rows + rng.uniform(-shake, shake),
+        offset = 0.0 if motif.random_orientation else 0.5
+        center = (
+            (i + offset) * width / columns + rng.uniform(-jitter, jitter),
+            (j + offset) * height / rows + rng.uniform(-jitter, jitter),
         )
-        angle = rng.uniform(0, 2 * math.pi) if motif.turned else 0.0
-        motif.piece(Pen(draw, centre, radius, angle, accent, rng))
+        angle = rng.uniform(0, 2 * math.pi) if motif.random_orientation else 0.0
+        motif.draw_piece(MotifPen(draw, center, radius, angle, accent, rng))

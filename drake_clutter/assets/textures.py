@@ -14,20 +14,20 @@ from pathlib import Path
 import matplotlib
 from PIL import Image, ImageDraw, ImageFont
 
-from drake_clutter.assets.gltf import Region
-from drake_clutter.assets.motifs import MOTIFS, strew
-from drake_clutter.catalog import Label, ObjectClass, Shape, catalog_path
+from drake_clutter.assets.motifs import MOTIFS, scatter_motif
+from drake_clutter.assets.textured_mesh import Region
+from drake_clutter.catalog import LabelDesign, ObjectClass, Shape, catalog_path
 from drake_clutter.files import InputError
 
-__all__ = ["MOTIFS", "Texture", "draw_texture", "png_bytes"]
+__all__ = ["MOTIFS", "Texture", "draw_texture", "encode_png"]
 
 _TEXTURE_SIDE = 512
 _OVERSAMPLING = 3
 _MAX_PIXELS_PER_MM = 6.0
-_COLOURS = 96
+_PALETTE_SIZE = 96
 _TITLE_LENGTH = 24
-_METAL, _METAL_DARK, _METAL_LIGHT = "#b4b8bd", "#8d9298", "#d6d9dc"
-_INK = "#1c1c1c"
+_METAL_COLOR, _DARK_METAL_COLOR, _LIGHT_METAL_COLOR = "#b4b8bd", "#8d9298", "#d6d9dc"
+_INK_COLOR = "#1c1c1c"
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,16 @@ class Texture:
 
 @dataclass(frozen=True)
 class _Panel:
-    """One face while it is drawn; `unit` is the number of pixels per millimetre."""
+    """One face while it is drawn; `pixels_per_mm` is the number of pixels per millimetre."""
 
     image: Image.Image
-    unit: float
+    pixels_per_mm: float
 
     @staticmethod
-    def blank(width_mm: float, height_mm: float, unit: float, colour: str) -> "_Panel":
+    def blank(width_mm: float, height_mm: float, unit: float, color: str) -> "_Panel":
         return _Panel(
             Image.new(
-                "RGB", (max(1, round(width_mm * unit)), max(1, round(height_mm * unit))), colour
+                "RGB", (max(1, round(width_mm * unit)), max(1, round(height_mm * unit))), color
             ),
             unit,
         )
@@ -63,33 +63,35 @@ class _Panel:
     def size(self) -> tuple[int, int]:
         return self.image.size
 
-    def rectangle(self, left: float, top: float, right: float, bottom: float, fill: str) -> None:
+    def draw_rectangle(
+        self, left: float, top: float, right: float, bottom: float, fill: str
+    ) -> None:
         """Sides as shares of the panel's width and height."""
         w, h = self.size
         ImageDraw.Draw(self.image).rectangle(
             (left * w, top * h, right * w - 1, bottom * h - 1), fill=fill
         )
 
-    def motif(
+    def draw_motif(
         self, name: str, accent: str, left: float, top: float, right: float, bottom: float
     ) -> None:
         w, h = self.size
         area = Image.new(
             "RGB", (max(1, round((right - left) * w)), max(1, round((bottom - top) * h)))
         )
-        strew(ImageDraw.Draw(area), area.size, MOTIFS[name], accent)
+        scatter_motif(ImageDraw.Draw(area), area.size, MOTIFS[name], accent)
         self.image.paste(area, (round(left * w), round(top * h)))
 
-    def text(
+    def draw_text(
         self,
         words: str,
-        colour: str,
+        color: str,
         left: float,
         top: float,
         right: float,
         bottom: float,
         *,
-        turn: bool = True,
+        allow_rotation: bool = True,
     ) -> None:
         """As large as fits: in one line or one word a line, and turned to read upwards where that is larger."""
         w, h = self.size
@@ -97,9 +99,9 @@ class _Panel:
         choices = [
             (lines, turned)
             for lines in {words, words.replace(" ", "\n")}
-            for turned in ((False, True) if turn else (False,))
+            for turned in ((False, True) if allow_rotation else (False,))
         ]
-        size, lines, turned = max(
+        size, lines, is_rotated = max(
             (
                 (_font_size(lines, box[::-1] if turned else box), lines, turned)
                 for lines, turned in sorted(choices)
@@ -108,9 +110,9 @@ class _Panel:
         if size < 4:
             return
         mask = _text_mask(lines, size)
-        mask = mask.rotate(90, expand=True) if turned else mask
+        mask = mask.rotate(90, expand=True) if is_rotated else mask
         x, y = ((left + right) * w - mask.width) / 2, ((top + bottom) * h - mask.height) / 2
-        self.image.paste(Image.new("RGB", mask.size, colour), (round(x), round(y)), mask)
+        self.image.paste(Image.new("RGB", mask.size, color), (round(x), round(y)), mask)
 
 
 @lru_cache
@@ -121,19 +123,19 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 
 @lru_cache
-def _extent(lines: str, size: int) -> tuple[float, float, float, float]:
+def _text_extent(lines: str, size: int) -> tuple[float, float, float, float]:
     return ImageDraw.Draw(Image.new("L", (1, 1))).multiline_textbbox(
         (0, 0), lines, font=_font(size), align="center", spacing=size * 0.1
     )
 
 
 def _font_size(lines: str, box: tuple[float, float]) -> int:
-    left, top, right, bottom = _extent(lines, 100)
+    left, top, right, bottom = _text_extent(lines, 100)
     return int(100 * min(box[0] / max(1, right - left), box[1] / max(1, bottom - top)))
 
 
 def _text_mask(lines: str, size: int) -> Image.Image:
-    left, top, right, bottom = _extent(lines, size)
+    left, top, right, bottom = _text_extent(lines, size)
     mask = Image.new("L", (max(1, math.ceil(right - left)), max(1, math.ceil(bottom - top))))
     ImageDraw.Draw(mask).multiline_text(
         (-left, -top), lines, fill=255, font=_font(size), align="center", spacing=size * 0.1
@@ -141,14 +143,14 @@ def _text_mask(lines: str, size: int) -> Image.Image:
     return mask
 
 
-def _nutrition_panel(width: int, height: int) -> Image.Image:
+def _draw_nutrition_table(width: int, height: int) -> Image.Image:
     """A white table: heading, rule, rows of grey words and numbers."""
     table = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(table)
     w, h = table.size
-    draw.rectangle((0, 0, w - 1, h - 1), outline=_INK, width=max(1, w // 60))
-    draw.rectangle((w * 0.08, h * 0.06, w * 0.8, h * 0.13), fill=_INK)
-    draw.rectangle((w * 0.06, h * 0.18, w * 0.94, h * 0.205), fill=_INK)
+    draw.rectangle((0, 0, w - 1, h - 1), outline=_INK_COLOR, width=max(1, w // 60))
+    draw.rectangle((w * 0.08, h * 0.06, w * 0.8, h * 0.13), fill=_INK_COLOR)
+    draw.rectangle((w * 0.06, h * 0.18, w * 0.94, h * 0.205), fill=_INK_COLOR)
     for row in range(8):
         y = h * (0.25 + 0.09 * row)
         draw.rectangle(
@@ -158,7 +160,7 @@ def _nutrition_panel(width: int, height: int) -> Image.Image:
     return table
 
 
-def _barcode(width: int, height: int) -> Image.Image:
+def _draw_barcode(width: int, height: int) -> Image.Image:
     code = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(code)
     w, h = code.size
@@ -168,32 +170,35 @@ def _barcode(width: int, height: int) -> Image.Image:
         if x + bar * step > w * 0.92:
             break
         draw.rectangle(
-            (x, h * 0.1, x + bar * step * 0.9, h * (0.9 if index % 14 < 2 else 0.78)), fill=_INK
+            (x, h * 0.1, x + bar * step * 0.9, h * (0.9 if index % 14 < 2 else 0.78)),
+            fill=_INK_COLOR,
         )
         x += (bar + 1) * step
     return code
 
 
-def _front(panel: _Panel, label: Label, title: str, mass: float) -> None:
+def _draw_front(panel: _Panel, label: LabelDesign, title: str, mass: float) -> None:
     """Title above, picture below, weight at the foot."""
-    panel.rectangle(0, 0, 1, 0.035, label.accent)
+    panel.draw_rectangle(0, 0, 1, 0.035, label.accent)
     slim = panel.size[1] > 2.5 * panel.size[0]
     foot = 0.42 if slim else 0.36
-    panel.text(title, label.accent, 0.07, 0.06, 0.93, foot - 0.02)
-    panel.motif(label.motif, label.accent, 0, foot, 1, 0.90)
-    panel.text(f"NET WT {1000 * mass:.0f} g", label.accent, 0.06, 0.925, 0.94, 0.975, turn=False)
+    panel.draw_text(title, label.accent, 0.07, 0.06, 0.93, foot - 0.02)
+    panel.draw_motif(label.motif, label.accent, 0, foot, 1, 0.90)
+    panel.draw_text(
+        f"NET WT {1000 * mass:.0f} g", label.accent, 0.06, 0.925, 0.94, 0.975, allow_rotation=False
+    )
 
 
-def _side(panel: _Panel, label: Label, title: str, *, nutrition: bool) -> None:
+def _draw_side(panel: _Panel, label: LabelDesign, title: str, *, nutrition: bool) -> None:
     w, h = panel.size
-    panel.rectangle(0, 0, 1, 0.035, label.accent)
-    panel.rectangle(0, 0.90, 1, 1, label.accent)
-    panel.text(title, label.accent, 0.15, 0.06, 0.85, 0.52)
+    panel.draw_rectangle(0, 0, 1, 0.035, label.accent)
+    panel.draw_rectangle(0, 0.90, 1, 1, label.accent)
+    panel.draw_text(title, label.accent, 0.15, 0.06, 0.85, 0.52)
     info_width = round(0.8 * w)
     if nutrition:
-        info = _nutrition_panel(info_width, min(round(0.33 * h), round(1.6 * info_width)))
+        info = _draw_nutrition_table(info_width, min(round(0.33 * h), round(1.6 * info_width)))
     else:
-        info = _barcode(info_width, min(round(0.25 * h), info_width))
+        info = _draw_barcode(info_width, min(round(0.25 * h), info_width))
     panel.image.paste(info, (round(0.1 * w), round(0.72 * h - info.height / 2)))
 
 
@@ -201,87 +206,87 @@ def _box_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str,
     label = object_class.label
     depth, width, height = (1000 * side for side in object_class.size)
     front = _Panel.blank(width, height, unit, label.base)
-    _front(front, label, title, object_class.mass)
+    _draw_front(front, label, title, object_class.mass)
     sides = [_Panel.blank(depth, height, unit, label.base) for _ in range(2)]
     for side, nutrition in zip(sides, (True, False), strict=True):
-        _side(side, label, title, nutrition=nutrition)
+        _draw_side(side, label, title, nutrition=nutrition)
     top = _Panel.blank(width, depth, unit, label.base)
-    top.rectangle(0, 0, 0.05, 1, label.accent)
-    top.rectangle(0.95, 0, 1, 1, label.accent)
-    top.text(title, label.accent, 0.1, 0.12, 0.9, 0.88)
+    top.draw_rectangle(0, 0, 0.05, 1, label.accent)
+    top.draw_rectangle(0.95, 0, 1, 1, label.accent)
+    top.draw_text(title, label.accent, 0.1, 0.12, 0.9, 0.88)
     return {"front": front, "right": sides[0], "left": sides[1], "top": top}
 
 
-def _wrapper(panel: _Panel, label: Label, title: str, mass: float) -> None:
+def _draw_wrapper(panel: _Panel, label: LabelDesign, title: str, mass: float) -> None:
     """Two fronts, between them the nutrition table and the bar code."""
     w, h = panel.size
-    panel.motif(label.motif, label.accent, 0, 0.5, 1, 0.92)
-    panel.rectangle(0, 0.47, 1, 0.5, label.accent)
+    panel.draw_motif(label.motif, label.accent, 0, 0.5, 1, 0.92)
+    panel.draw_rectangle(0, 0.47, 1, 0.5, label.accent)
     for half in (0.0, 0.5):
-        panel.text(title, label.accent, half + 0.12, 0.08, half + 0.38, 0.46)
-        panel.text(
+        panel.draw_text(title, label.accent, half + 0.12, 0.08, half + 0.38, 0.46)
+        panel.draw_text(
             f"NET WT {1000 * mass:.0f} g",
             label.accent,
             half + 0.14,
             0.94,
             half + 0.36,
             0.975,
-            turn=False,
+            allow_rotation=False,
         )
-    table = _nutrition_panel(round(0.11 * w), min(round(0.5 * h), round(0.2 * w)))
+    table = _draw_nutrition_table(round(0.11 * w), min(round(0.5 * h), round(0.2 * w)))
     panel.image.paste(table, (round(0.445 * w), round(0.5 * h - table.height / 2)))
-    code = _barcode(round(0.11 * w), round(0.08 * w))
+    code = _draw_barcode(round(0.11 * w), round(0.08 * w))
     panel.image.paste(code, (round(0.885 * w), round(0.5 * h - code.height / 2)))
 
 
-def _metal_end(panel: _Panel) -> None:
+def _draw_metal_end(panel: _Panel) -> None:
     """Concentric pressed rings."""
     draw = ImageDraw.Draw(panel.image)
     w = panel.size[0]
     rings = (
-        (1.0, _METAL_DARK),
-        (0.96, _METAL_LIGHT),
-        (0.88, _METAL_DARK),
-        (0.85, _METAL),
-        (0.7, _METAL_LIGHT),
-        (0.67, _METAL),
-        (0.5, _METAL_DARK),
-        (0.48, _METAL),
+        (1.0, _DARK_METAL_COLOR),
+        (0.96, _LIGHT_METAL_COLOR),
+        (0.88, _DARK_METAL_COLOR),
+        (0.85, _METAL_COLOR),
+        (0.7, _LIGHT_METAL_COLOR),
+        (0.67, _METAL_COLOR),
+        (0.5, _DARK_METAL_COLOR),
+        (0.48, _METAL_COLOR),
     )
-    for share, colour in rings:
-        edge = w * (1 - share) / 2
-        draw.ellipse((edge, edge, w - edge, w - edge), fill=colour)
+    for fraction, color in rings:
+        inset = w * (1 - fraction) / 2
+        draw.ellipse((inset, inset, w - inset, w - inset), fill=color)
 
 
-def _plastic_lid(panel: _Panel, label: Label, title: str) -> None:
+def _draw_plastic_lid(panel: _Panel, label: LabelDesign, title: str) -> None:
     draw = ImageDraw.Draw(panel.image)
     w = panel.size[0]
-    for share, colour in (
+    for fraction, color in (
         (1.0, label.base),
         (0.86, label.accent),
         (0.82, label.base),
         (0.80, label.accent),
     ):
-        edge = w * (1 - share) / 2
-        draw.ellipse((edge, edge, w - edge, w - edge), fill=colour)
-    panel.text(title, label.base, 0.2, 0.3, 0.8, 0.7, turn=False)
+        inset = w * (1 - fraction) / 2
+        draw.ellipse((inset, inset, w - inset, w - inset), fill=color)
+    panel.draw_text(title, label.base, 0.2, 0.3, 0.8, 0.7, allow_rotation=False)
 
 
 def _can_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str, _Panel]:
     label = object_class.label
     diameter, _, height = (1000 * side for side in object_class.size)
     side = _Panel.blank(math.pi * diameter, height, unit, label.base)
-    _wrapper(side, label, title, object_class.mass)
+    _draw_wrapper(side, label, title, object_class.mass)
     rim = min(0.03, 3 / height)
-    side.rectangle(0, 1 - rim, 1, 1, _METAL)
-    top, bottom = (_Panel.blank(diameter, diameter, unit, _METAL) for _ in range(2))
-    _metal_end(bottom)
+    side.draw_rectangle(0, 1 - rim, 1, 1, _METAL_COLOR)
+    top, bottom = (_Panel.blank(diameter, diameter, unit, _METAL_COLOR) for _ in range(2))
+    _draw_metal_end(bottom)
     if MOTIFS[label.motif].plastic_lid:
-        _plastic_lid(top, label, title)
-        side.rectangle(0, 0, 1, 0.05, label.accent)
+        _draw_plastic_lid(top, label, title)
+        side.draw_rectangle(0, 0, 1, 0.05, label.accent)
     else:
-        _metal_end(top)
-        side.rectangle(0, 0, 1, rim, _METAL)
+        _draw_metal_end(top)
+        side.draw_rectangle(0, 0, 1, rim, _METAL_COLOR)
     return {"side": side, "top": top, "bottom": bottom}
 
 
@@ -290,11 +295,11 @@ def _marker_panels(object_class: ObjectClass, title: str, unit: float) -> dict[s
     label = object_class.label
     diameter, _, height = (1000 * side for side in object_class.size)
     side = _Panel.blank(math.pi * diameter, height, unit, label.base)
-    side.rectangle(0, 0, 1, 0.36, label.accent)
-    side.rectangle(0, 0.375, 1, 0.39, label.accent)
-    side.rectangle(0, 0.94, 1, 1, label.accent)
+    side.draw_rectangle(0, 0, 1, 0.36, label.accent)
+    side.draw_rectangle(0, 0.375, 1, 0.39, label.accent)
+    side.draw_rectangle(0, 0.94, 1, 1, label.accent)
     for third in range(3):
-        side.text(title, label.accent, third / 3 + 0.06, 0.44, third / 3 + 0.27, 0.88)
+        side.draw_text(title, label.accent, third / 3 + 0.06, 0.44, third / 3 + 0.27, 0.88)
     top, bottom = (_Panel.blank(diameter, diameter, unit, label.accent) for _ in range(2))
     return {"side": side, "top": top, "bottom": bottom}
 
@@ -302,11 +307,11 @@ def _marker_panels(object_class: ObjectClass, title: str, unit: float) -> dict[s
 def _mesh_panels(object_class: ObjectClass, unit: float) -> dict[str, _Panel]:
     """A strip over the height: the body's colour with a band of the accent below the top."""
     side = _Panel.blank(20, 200, unit, object_class.label.base)
-    side.rectangle(0, 0.12, 1, 0.30, object_class.label.accent)
+    side.draw_rectangle(0, 0.12, 1, 0.30, object_class.label.accent)
     return {"side": side, "top": side, "bottom": side}
 
 
-def _checked_label(object_class: ObjectClass) -> tuple[Label, str]:
+def _check_label(object_class: ObjectClass) -> tuple[LabelDesign, str]:
     """Its label, and the title to draw."""
     label = object_class.label
     where = f"{catalog_path(object_class.folder.parent)}: classes.{object_class.name}.label"
@@ -340,21 +345,21 @@ def draw_texture(object_class: ObjectClass) -> Texture:
     Raises:
         InputError: a field of its label that cannot be drawn.
     """
-    label, title = _checked_label(object_class)
+    label, title = _check_label(object_class)
     scale = min(_MAX_PIXELS_PER_MM, _TEXTURE_SIDE / max(_atlas_size(object_class)))
-    unit = scale * _OVERSAMPLING
+    pixels_per_mm = scale * _OVERSAMPLING
     if object_class.shape is Shape.BOX:
-        panels = _box_panels(object_class, title, unit)
+        panels = _box_panels(object_class, title, pixels_per_mm)
         rows = [["top"], ["front", "right", "left"]]
-        same = {"back": "front", "bottom": "top"}
+        copies = {"back": "front", "bottom": "top"}
     elif object_class.shape is Shape.CYLINDER:
         panels = (_marker_panels if label.motif == "marker" else _can_panels)(
-            object_class, title, unit
+            object_class, title, pixels_per_mm
         )
-        rows, same = [["top", "bottom"], ["side"]], {}
+        rows, copies = [["top", "bottom"], ["side"]], {}
     else:
-        panels = _mesh_panels(object_class, unit)
-        rows, same = [["side"]], {}
+        panels = _mesh_panels(object_class, pixels_per_mm)
+        rows, copies = [["side"]], {}
     width = max(sum(panels[name].size[0] for name in row) for row in rows)
     height = sum(panels[row[0]].size[1] for row in rows)
     atlas = Image.new("RGB", (width, height), label.base)
@@ -376,13 +381,13 @@ def draw_texture(object_class: ObjectClass) -> Texture:
             )
             x += image.width
         y += panels[row[0]].size[1]
-    regions |= {copy: regions[original] for copy, original in same.items()}
+    regions |= {copy: regions[original] for copy, original in copies.items()}
     final = (round(width / _OVERSAMPLING), round(height / _OVERSAMPLING))
     return Texture(atlas.resize(final, Image.Resampling.LANCZOS), regions)
 
 
-def png_bytes(image: Image.Image) -> bytes:
+def encode_png(image: Image.Image) -> bytes:
     """The picture as a PNG with a palette, which keeps it small."""
     buffer = io.BytesIO()
-    image.quantize(_COLOURS, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    image.quantize(_PALETTE_SIZE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

@@ -1,6 +1,6 @@
 """The support as a model. Frame T, the link `tray`: origin at the center of the floor's upper surface, z up."""
 
-from drake_clutter.assets.contact import proximity_properties
+from drake_clutter.assets.contact_properties import proximity_properties_sdf
 from drake_clutter.cell.support import Support
 
 _FLOOR_COLOR, _WALL_COLOR = "0.72 0.60 0.46 1", "0.55 0.42 0.30 1"
@@ -23,7 +23,7 @@ def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
       </visual>
       <collision name="{name}">
         {box}
-{proximity_properties(1.0, compliant=False)}
+{proximity_properties_sdf(1.0, compliant=False)}
       </collision>"""
 
 

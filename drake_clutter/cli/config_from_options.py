@@ -126,8 +126,8 @@ def _override(
     base: "ClutterConfig", config_file: Path | None, settings: Sequence[str] | None
 ) -> "ClutterConfig":
     """Return a configuration with the fields of a file, then of settings, replaced."""
-    from drake_clutter.config import upgrade
+    from drake_clutter.config import upgrade_config
     from drake_clutter.validation import load_config_as
 
     full_settings = [qualify_setting(setting) for setting in settings or ()]
-    return load_config_as(base, config_file, full_settings, upgrade)
+    return load_config_as(base, config_file, full_settings, upgrade_config)

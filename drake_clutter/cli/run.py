@@ -52,7 +52,7 @@ def _load_scenario(
     """
     from drake_clutter.catalog import load_catalog
     from drake_clutter.cell.work_cell import load_cell
-    from drake_clutter.config import upgrade
+    from drake_clutter.config import upgrade_config
     from drake_clutter.scenes.scene_file import load_scene
     from drake_clutter.systems.scenario import Scenario
     from drake_clutter.validation import load_config_as
@@ -64,19 +64,19 @@ def _load_scenario(
         if setting.startswith(("scene=", "catalog=", "catalogue="))
     ]
     defaults = Scenario()
-    with_scene = load_config_as(defaults, file, scene_settings, upgrade)
+    with_scene = load_config_as(defaults, file, scene_settings, upgrade_config)
     if with_scene.scene:
         reject_support_settings(full_settings)
         catalog = load_catalog(Path(with_scene.catalog) if with_scene.catalog else None)
         scene_cell = load_scene(Path(with_scene.scene), catalog).cell
         defaults = replace(defaults, world=replace(defaults.world, cell=scene_cell))
-    scenario = load_config_as(defaults, file, upgrade=upgrade)
+    scenario = load_config_as(defaults, file, upgrade=upgrade_config)
     if cell_file is not None:
         cell = load_cell(cell_file)
         if with_scene.scene:
             cell = cell.with_support(defaults.world.cell.support)
         scenario = replace(scenario, world=replace(scenario.world, cell=cell))
-    scenario = load_config_as(scenario, settings=full_settings, upgrade=upgrade)
+    scenario = load_config_as(scenario, settings=full_settings, upgrade=upgrade_config)
     check_cell_models(scenario.world.cell, defaults.world.cell, cell_file or file)
     return scenario
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.config import ClutterConfig, upgrade_head
+from drake_clutter.config import ClutterConfig, upgrade_record_head
 from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.validation import to_plain, validate
 
@@ -44,7 +44,9 @@ def _read_job(path: Path) -> dict[str, Any]:
     job = {_RENAMED_FIELDS.get(key, key): value for key, value in written.items()}
     source = str(path)
     if "config" in job:
-        job["config"] = to_plain(validate(ClutterConfig, upgrade_head(job["config"]), source))
+        job["config"] = to_plain(
+            validate(ClutterConfig, upgrade_record_head(job["config"]), source)
+        )
     if "setups" in job:
         job["setups"] = {
             name: to_plain(validate(WorkCell, cell, source)) for name, cell in job["setups"].items()

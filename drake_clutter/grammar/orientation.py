@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalog import ObjectClass, Rest, Shape
+from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 
 
 class Orientation(Enum):
@@ -28,9 +28,9 @@ class Orientation(Enum):
     SIDE_90 = ("side", 90)
 
     @property
-    def rest(self) -> Rest:
+    def rest(self) -> RestOrientation:
         """Which axis points up."""
-        return Rest(self.value[0])
+        return RestOrientation(self.value[0])
 
     @property
     def yaw(self) -> float:
@@ -38,7 +38,7 @@ class Orientation(Enum):
         return float(np.radians(self.value[1]))
 
 
-def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
+def _resting_axes(object_class: ObjectClass, rest: RestOrientation) -> tuple[int, int]:
     """Indices of O's axes that lie along the tray's x, and point up."""
     # A mesh is made to stand on its z, whatever sticks out of it.
     by_extent = (
@@ -48,11 +48,15 @@ def _resting_axes(object_class: ObjectClass, rest: Rest) -> tuple[int, int]:
     )
     short, middle, long = (int(axis) for axis in by_extent)
     rest = object_class.only_rest or rest
-    return {Rest.FLAT: (long, short), Rest.SIDE: (long, middle), Rest.UPRIGHT: (middle, long)}[rest]
+    return {
+        RestOrientation.FLAT: (long, short),
+        RestOrientation.SIDE: (long, middle),
+        RestOrientation.UPRIGHT: (middle, long),
+    }[rest]
 
 
 @lru_cache(maxsize=4096)
-def _rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
+def _cached_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
     along_x, up = _resting_axes(object_class, orientation.rest)
     R_AO = np.zeros((3, 3))  # A: the tray's axes before the yaw
     R_AO[0, along_x] = R_AO[2, up] = 1.0
@@ -65,7 +69,7 @@ def _rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np
 
 def resting_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
     """R_TO, (3, 3): the rotation of an object of the class in the tray frame when it rests in the orientation."""
-    return _rotation(object_class, orientation)
+    return _cached_rotation(object_class, orientation)
 
 
 def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[int, ...]:
@@ -73,11 +77,11 @@ def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[i
     R_TO = resting_rotation(object_class, orientation)
     if object_class.shape is Shape.CYLINDER:
         axis = R_TO[:, 2]
-        described = np.outer(axis, axis)  # the axis up to its sign
+        description = np.outer(axis, axis)  # the axis up to its sign
     elif object_class.shape is Shape.BOX:
-        described = (
+        description = (
             R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T
         )  # the box's moments name it
     else:
-        described = R_TO
-    return tuple(int(value) for value in np.round(described * 1e6).ravel())
+        description = R_TO
+    return tuple(int(value) for value in np.round(description * 1e6).ravel())

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.catalog import ObjectClass, Rest
+from drake_clutter.catalog import ObjectClass, RestOrientation
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, Orientation, resting_rotation
-from drake_clutter.grammar.graph import DUMMY, END
+from drake_clutter.grammar.clutter_graph import DUMMY, END
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 
 
@@ -90,7 +90,11 @@ class Stack:
             resting = _resting_pose(classes[graph.kind(level[0])], orientation)
             offset = 0.0
             if len(level) == 2:
-                gap = config.lying_gap if orientation.rest is Rest.FLAT else config.standing_gap
+                gap = (
+                    config.lying_gap
+                    if orientation.rest is RestOrientation.FLAT
+                    else config.standing_gap
+                )
                 offset = (resting.upper[1] - resting.lower[1] + gap) / 2
             self.nodes += level
             self._resting += [resting] * len(level)
@@ -144,10 +148,10 @@ def _sample_positions(
     if (reach < 0).any():
         return None
     order = np.argsort(-half_sizes.prod(axis=1), kind="stable")
-    for _ in range(config.placement_tries):
+    for _ in range(config.placement_attempts):
         centers = np.full_like(half_sizes, np.nan)
         for num_placed, stack in enumerate(order):
-            samples = rng.uniform(-1, 1, (config.placement_tries, 2)) * reach[stack]
+            samples = rng.uniform(-1, 1, (config.placement_attempts, 2)) * reach[stack]
             placed = order[:num_placed]
             gap = (
                 np.abs(samples[:, None] - centers[placed]) - half_sizes[placed] - half_sizes[stack]
@@ -182,7 +186,7 @@ def lay_out(
         seed: noted in the scene.
     """
     graph = derivation.graph
-    stacks = [Stack(graph, classes, bottom, config.layout) for bottom in graph.stacks()]
+    stacks = [Stack(graph, classes, bottom, config.layout) for bottom in graph.stack_bases()]
     height = max(float(stack.upper[2]) for stack in stacks)
     if height > config.layout.max_stack_height:
         return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.layout.max_stack_height)

@@ -13,7 +13,7 @@ from drake_clutter.cell.support import Side
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.files import InputError, format_value, input_error, write_text
 from drake_clutter.grammar import ClutterGraph, Orientation
-from drake_clutter.grammar.graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
+from drake_clutter.grammar.clutter_graph import PRIMITIVE, STRUCTURE_KINDS, EdgeKind
 from drake_clutter.scenes.geometry import MAX_PENETRATION, max_penetration
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_clutter.catalog import ObjectClass, Rest, Shape
+from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
@@ -123,7 +123,7 @@ def add_objects(
         if (
             name != jointed
             and object_class.shape is Shape.CYLINDER
-            and object_class.only_rest is not Rest.UPRIGHT
+            and object_class.only_rest is not RestOrientation.UPRIGHT
         ):
             radius = object_class.size[0] / 2
             rolling_inertia = (

@@ -118,14 +118,14 @@ def settle(
                 return SettleResult(instability, poses, tuple(motion))
         reference = history[-2] if instability else history[0]
         is_calm = all(
-            speeds[o.name] < config.calm_speed
-            and _distance(poses[o.name], reference[o.name]) < config.calm_displacement
+            speeds[o.name] < config.early_stop_speed
+            and _distance(poses[o.name], reference[o.name]) < config.early_stop_displacement
             and tilt_between(o.object_class, reference[o.name], poses[o.name])
-            < math.radians(config.calm_tilt_deg)
+            < math.radians(config.early_stop_tilt_deg)
             for o in objects
         )
         num_calm_samples = num_calm_samples + 1 if is_calm else 0
-        if num_calm_samples >= config.calm_samples and (instability or not may_roll_slowly):
+        if num_calm_samples >= config.early_stop_samples and (instability or not may_roll_slowly):
             return SettleResult(instability, poses, tuple(motion))
         if (
             sample % 2 == 0
@@ -146,9 +146,9 @@ def _stayed_close(
     """Whether all objects have been close to where they are now."""
     *earlier, now = history
     return all(
-        _distance(poses[o.name], now[o.name]) < config.still_displacement
+        _distance(poses[o.name], now[o.name]) < config.chatter_displacement
         and tilt_between(o.object_class, poses[o.name], now[o.name])
-        < math.radians(config.calm_tilt_deg)
+        < math.radians(config.early_stop_tilt_deg)
         for poses in earlier
         for o in objects
     )
@@ -167,7 +167,7 @@ def _find_motion(
     """The object that went furthest since the earlier poses, if further than the config allows one at rest."""
     furthest = max(objects, key=lambda o: _distance(poses[o.name], earlier[o.name]))
     pose = poses[furthest.name]
-    if _distance(pose, earlier[furthest.name]) <= config.rest_drift:
+    if _distance(pose, earlier[furthest.name]) <= config.max_rest_displacement:
         return None
     tilt = tilt_between(furthest.object_class, furthest.X_TO, pose)
     return Instability(

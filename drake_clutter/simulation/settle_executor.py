@@ -39,8 +39,10 @@ class SettleExecutor:
         """See `MoveExecutor.execute`. Random offsets are added to the pose of release."""
         pick, X_TO = command.move.pick, command.X_TO_place
         # What is let go sinks by the height of release; else it would never count as calm.
-        sinks = self._config.settle.calm_displacement + self._config.exploration.release_height
-        settle_config = replace(self._config.settle, calm_displacement=sinks)
+        sinks = (
+            self._config.settle.early_stop_displacement + self._config.exploration.release_height
+        )
+        settle_config = replace(self._config.settle, early_stop_displacement=sinks)
         (released,) = perturb_poses([replace(scene[pick], X_TO=X_TO)], settle_config.jitter, rng)
         moved = scene.with_poses({pick: released.X_TO})
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, SceneGrammar
-from drake_clutter.grammar.graph import (
+from drake_clutter.grammar.clutter_graph import (
     DUMMY,
     END,
     NON_TERMINAL_KINDS,
@@ -114,8 +114,8 @@ class PartialScene:
         self._match_rules()
 
     def _match_rules(self) -> None:
-        self._matches = self._grammar.matches(self.graph)
-        self.action_mask = self._grammar.feasible(self.graph, self._budget, self._matches)
+        self._matches = self._grammar.find_matches(self.graph)
+        self.action_mask = self._grammar.feasible_rules(self.graph, self._budget, self._matches)
 
     @property
     def finished(self) -> bool:
@@ -124,9 +124,9 @@ class PartialScene:
 
     def apply(self, rule: int) -> None:
         """Applies a feasible rule to its first match, and judges the stack that it finishes, if it finishes one."""
-        match = self._matches[self._grammar.pattern[rule]]
+        match = self._matches[self._grammar.pattern_indices[rule]]
         assert match is not None, f"rule {self._grammar.rules[rule].name} is not feasible"
-        self._grammar.rewrite(self.graph, self._grammar.rules[rule], match)
+        self._grammar.rewrite_in_place(self.graph, self._grammar.rules[rule], match)
         self.rules.append(self._grammar.rules[rule].name)
         changed = match[self._grammar.rules[rule].left.rewritten]
         if changed != ClutterGraph.TRAY_NODE and (bottom := self._finished_stack(changed)):
@@ -176,7 +176,7 @@ class PartialScene:
 
     def terminal_reward(self, hidden: int) -> float:
         """Of the derived graph, if its scene is stable and hides that many objects."""
-        balanced = self.graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION
+        balanced = self.graph.largest_stack_fraction() <= MAX_BALANCED_STACK_FRACTION
         return self._task.hidden_reward * hidden + self._task.balance_reward * balanced
 
     def lay_out_and_judge(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:

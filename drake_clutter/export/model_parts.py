@@ -21,7 +21,7 @@ from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
 
-Z_UP_OF_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """(4, 4): points of a glTF file, whose up is y by its specification, in a frame whose up is z."""
 
 
@@ -41,30 +41,30 @@ class Inertial:
 
 
 @dataclass(frozen=True)
-class TrayBox:
+class SupportBox:
     """One of the boxes that make the tray.
 
     Attributes:
         name: unique in the tray.
         size: (3,) m.
         p_TG: (3,) m, its centre; its axes are T's.
-        colour: (4,) red, green, blue, alpha in 0 to 1.
+        color: (4,) red, green, blue, alpha in 0 to 1.
     """
 
     name: str
     size: Floats
     p_TG: Floats
-    colour: Floats
+    color: Floats
 
 
-def classes_of(scene: Scene) -> list[ObjectClass]:
+def classes_in_scene(scene: Scene) -> list[ObjectClass]:
     """The classes in a scene, each once, by name."""
     return sorted(
         {scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name
     )
 
 
-def text_of(numbers: Iterable[float]) -> str:
+def format_numbers(numbers: Iterable[float]) -> str:
     """Numbers with all their digits, separated by blanks."""
     return " ".join(repr(float(number)) for number in numbers)
 
@@ -75,7 +75,7 @@ def write_xml(path: Path, root: ElementTree.Element) -> None:
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def class_inertial(object_class: ObjectClass) -> Inertial:
+def load_inertial(object_class: ObjectClass) -> Inertial:
     """The mass properties in the class's built model."""
     inertial = ElementTree.parse(object_class.model_path).find("model/link/inertial")
     assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
@@ -87,22 +87,22 @@ def class_inertial(object_class: ObjectClass) -> Inertial:
     return Inertial(float(inertial.findtext("mass", "nan")), tuple(com), tuple(moments))
 
 
-def class_visual(object_class: ObjectClass) -> Any:
+def load_visual(object_class: ObjectClass) -> Any:
     """The class's mesh in O, a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture."""
     (mesh,) = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
-    mesh.apply_transform(Z_UP_OF_Y_UP)
+    mesh.apply_transform(Y_UP_TO_Z_UP)
     return mesh
 
 
-def tray_boxes(support: Support) -> list[TrayBox]:
+def support_boxes(support: Support) -> list[SupportBox]:
     """The boxes of a support."""
     boxes = []
     for visual in ElementTree.fromstring(support_sdf(support)).iter("visual"):
-        pose, size, colour = (
+        pose, size, color = (
             np.array([float(value) for value in visual.findtext(path, "").split()])
             for path in ("pose", "geometry/box/size", "material/diffuse")
         )
-        boxes.append(TrayBox(visual.get("name", ""), size, pose[:3], colour))
+        boxes.append(SupportBox(visual.get("name", ""), size, pose[:3], color))
     return boxes
 
 
@@ -116,7 +116,7 @@ def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:
     """
     target = folder / object_class.name
     target.mkdir()
-    visual = class_visual(object_class)
+    visual = load_visual(object_class)
     # Full white, or simulators that multiply the texture by the material's colour show it dark.
     visual.visual.material = trimesh.visual.material.SimpleMaterial(
         image=visual.visual.material.baseColorTexture.convert("RGB"),

@@ -4,14 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
-from drake_clutter.assets.contact import FRICTION
+from drake_clutter.assets.contact_properties import SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
-from drake_clutter.export.parts import (
-    class_inertial,
-    classes_of,
-    text_of,
-    tray_boxes,
+from drake_clutter.export.model_parts import (
+    classes_in_scene,
+    format_numbers,
+    load_inertial,
+    support_boxes,
     write_class_meshes,
     write_xml,
 )
@@ -26,7 +26,9 @@ def _add_defaults(root: Element) -> None:
     SubElement(visual, "geom", type="mesh", group="2", contype="0", conaffinity="0")
     collision = SubElement(default, "default", {"class": "collision"})
     # MuJoCo's own torsional and rolling coefficients; a contact has the larger friction of its two geoms.
-    SubElement(collision, "geom", group="3", friction=text_of([FRICTION, 0.005, 0.0001]))
+    SubElement(
+        collision, "geom", group="3", friction=format_numbers([SURFACE_FRICTION, 0.005, 0.0001])
+    )
 
 
 def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]) -> None:
@@ -40,12 +42,12 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
 
 def _add_tray(worldbody: Element, support: Support) -> None:
     tray = SubElement(worldbody, "body", name=TRAY)
-    for box in tray_boxes(support):
+    for box in support_boxes(support):
         geometry = {
             "type": "box",
-            "size": text_of(box.size / 2),
-            "pos": text_of(box.p_TG),
-            "rgba": text_of(box.colour),
+            "size": format_numbers(box.size / 2),
+            "pos": format_numbers(box.p_TG),
+            "rgba": format_numbers(box.color),
         }
         # Seen as well as touched, so it is in the group of the visuals.
         SubElement(
@@ -57,30 +59,30 @@ def _add_tray(worldbody: Element, support: Support) -> None:
 
 def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[str]) -> None:
     object_class, X_TO = scene_object.object_class, scene_object.X_TO
-    inertial = class_inertial(object_class)
+    inertial = load_inertial(object_class)
     body = SubElement(
         worldbody,
         "body",
         name=scene_object.name,
-        pos=text_of(X_TO.translation),
-        quat=text_of(X_TO.quaternion),
+        pos=format_numbers(X_TO.translation),
+        quat=format_numbers(X_TO.quaternion),
     )
     SubElement(body, "freejoint", name=scene_object.name)
     SubElement(
         body,
         "inertial",
-        pos=text_of(inertial.com),
+        pos=format_numbers(inertial.com),
         mass=repr(inertial.mass),
-        fullinertia=text_of(inertial.inertia),
+        fullinertia=format_numbers(inertial.inertia),
     )
     SubElement(
         body, "geom", {"class": "visual", "mesh": object_class.name, "material": object_class.name}
     )
     x, y, z = object_class.size
     if object_class.shape is Shape.BOX:
-        geometries = [{"type": "box", "size": text_of([x / 2, y / 2, z / 2])}]
+        geometries = [{"type": "box", "size": format_numbers([x / 2, y / 2, z / 2])}]
     elif object_class.shape is Shape.CYLINDER:
-        geometries = [{"type": "cylinder", "size": text_of([x / 2, z / 2])}]
+        geometries = [{"type": "cylinder", "size": format_numbers([x / 2, z / 2])}]
     else:
         geometries = [{"type": "mesh", "mesh": f"{object_class.name}/{piece}"} for piece in pieces]
     for geometry in geometries:
@@ -94,9 +96,9 @@ def write_mjcf(scene: Scene, folder: Path) -> Path:
     _add_defaults(root)
     asset = SubElement(root, "asset")
     pieces: Mapping[str, Sequence[str]] = {
-        entry.name: write_class_meshes(entry, folder) for entry in classes_of(scene)
+        entry.name: write_class_meshes(entry, folder) for entry in classes_in_scene(scene)
     }
-    for object_class in classes_of(scene):
+    for object_class in classes_in_scene(scene):
         _add_assets(asset, object_class, pieces[object_class.name])
     worldbody = SubElement(root, "worldbody")
     SubElement(worldbody, "light", pos="0 0 2", dir="0 0 -1", directional="true")

@@ -6,7 +6,12 @@ from pathlib import Path
 from pydrake.math import RollPitchYaw
 
 from drake_clutter.cell.support_sdf import support_sdf
-from drake_clutter.export.parts import classes_of, text_of, write_class_meshes, write_xml
+from drake_clutter.export.model_parts import (
+    classes_in_scene,
+    format_numbers,
+    write_class_meshes,
+    write_xml,
+)
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -37,7 +42,7 @@ def _model(text: str, name: str) -> ElementTree.Element:
 
 def _pose_text(pose: Pose) -> str:
     X_AB = rigid_transform(pose)
-    return text_of([*X_AB.translation(), *RollPitchYaw(X_AB.rotation()).vector()])
+    return format_numbers([*X_AB.translation(), *RollPitchYaw(X_AB.rotation()).vector()])
 
 
 def write_sdf(scene: Scene, folder: Path) -> Path:
@@ -45,7 +50,7 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
     ElementTree.register_namespace(
         "drake", _DRAKE
     )  # else the prefix is renamed, and Drake no longer knows it
-    for object_class in classes_of(scene):
+    for object_class in classes_in_scene(scene):
         write_class_meshes(object_class, folder)
     root = ElementTree.Element("sdf", version="1.10")
     world = ElementTree.SubElement(root, "world", name="scene")

@@ -13,20 +13,27 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from drake_clutter.assets.contact import proximity_properties
-from drake_clutter.assets.gltf import box_surface, cylinder_surface, embedded_gltf, mesh_surface
-from drake_clutter.assets.textures import draw_texture, png_bytes
-from drake_clutter.catalog import CATALOG_FILE, ObjectClass, Rest, Shape, catalog_path, load_catalog
+from drake_clutter.assets.contact_properties import proximity_properties_sdf
+from drake_clutter.assets.textured_mesh import box_mesh, cylinder_mesh, gltf_text, map_strip_texture
+from drake_clutter.assets.textures import draw_texture, encode_png
+from drake_clutter.catalog import (
+    CATALOG_FILE,
+    ObjectClass,
+    RestOrientation,
+    Shape,
+    catalog_path,
+    load_catalog,
+)
 from drake_clutter.files import InputError, write_text
 from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
-_BUILT = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
+_BUILT_FILE = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
 # Edge of a cylinder's contact mesh, in radii. One that may lie needs a fine rim, or it becomes a prism (32 sides); for one
 # that always stands 16 do: the same verdicts as 32 on 20 stacks of cans, in about half the time.
-_LYING_HINT, _STANDING_HINT = 0.2, 0.4
+_LYING_MESH_RESOLUTION, _STANDING_MESH_RESOLUTION = 0.2, 0.4
 # Few pieces rather than close ones, since every piece costs simulation time: CoACD's own defaults give the example's mug 48.
-_COACD = {
+_COACD_OPTIONS = {
     "threshold": 0.06,
     "mcts_iterations": 20,
     "mcts_nodes": 10,
@@ -36,7 +43,7 @@ _COACD = {
 }
 _CONVEX_VOLUME_RATIO = 0.999
 
-_PACKAGE = """<?xml version="1.0"?>
+_PACKAGE_XML = """<?xml version="1.0"?>
 <package format="2">
   <name>{name}</name>
   <version>0.0.0</version>
@@ -46,7 +53,7 @@ _PACKAGE = """<?xml version="1.0"?>
 </package>
 """
 
-_MODEL = """<?xml version="1.0"?>
+_MODEL_SDF = """<?xml version="1.0"?>
 <!-- Built by drake_clutter.assets from {catalog}; size and mass: {source}. -->
 <sdf version="1.10" xmlns:drake="drake.mit.edu">
   <model name="{name}">
@@ -84,13 +91,13 @@ class _Inertial:
     inertia: NDArray[np.float64]
 
 
-def _centred_mesh(path: Path) -> trimesh.Trimesh:
+def _load_centered_mesh(path: Path) -> trimesh.Trimesh:
     mesh = trimesh.load_mesh(path)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
 
 
-def _inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
+def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
     """Of a solid of uniform density."""
     mass = object_class.mass
     x, y, z = object_class.size
@@ -109,14 +116,14 @@ def _inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inert
     return _Inertial(np.zeros(3), np.diag(moments))
 
 
-def _convex_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Convex hulls that together cover the mesh (CoACD, Wei et al. 2022); one for a convex mesh."""
     if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
         return [mesh.convex_hull]
     import coacd  # not above: loaded before Drake, it breaks Drake's SDF reader
 
     coacd.set_log_level("error")
-    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD)
+    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
     low, high = mesh.bounds
     # Clipped: what stacks on an object relies on its pieces ending where its bounding box does.
     return [
@@ -131,56 +138,63 @@ def _obj_text(mesh: trimesh.Trimesh) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _collision(name: str, geometry: str, hint: float) -> str:
+def _collision_sdf(name: str, geometry: str, hint: float) -> str:
     return f"""      <collision name="{name}">
         <geometry>
           {geometry}
         </geometry>
-{proximity_properties(hint, compliant=True)}
+{proximity_properties_sdf(hint, compliant=True)}
       </collision>
 """
 
 
-def _collisions(object_class: ObjectClass, pieces: int) -> str:
+def _collisions_sdf(object_class: ObjectClass, num_pieces: int) -> str:
     x, y, z = object_class.size
     if object_class.shape is Shape.BOX:
-        return _collision("box", f"<box><size>{x!r} {y!r} {z!r}</size></box>", max(x, y, z))
+        return _collision_sdf("box", f"<box><size>{x!r} {y!r} {z!r}</size></box>", max(x, y, z))
     if object_class.shape is Shape.CYLINDER:
         radius = x / 2
         geometry = f"<cylinder><radius>{radius!r}</radius><length>{z!r}</length></cylinder>"
-        return _collision(
+        return _collision_sdf(
             "cylinder",
             geometry,
-            radius * (_STANDING_HINT if object_class.only_rest is Rest.UPRIGHT else _LYING_HINT),
+            radius
+            * (
+                _STANDING_MESH_RESOLUTION
+                if object_class.only_rest is RestOrientation.UPRIGHT
+                else _LYING_MESH_RESOLUTION
+            ),
         )
-    names = [f"convex_{index:03d}" for index in range(pieces)]
+    names = [f"convex_{index:03d}" for index in range(num_pieces)]
     return "".join(
-        _collision(name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z))
+        _collision_sdf(
+            name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z)
+        )
         for name in names
     )
 
 
-def _asset_files(object_class: ObjectClass) -> dict[str, str]:
+def _make_asset_files(object_class: ObjectClass) -> dict[str, str]:
     """Contents of every file of a class, by name."""
-    mesh = _centred_mesh(object_class.mesh) if object_class.mesh else None
+    mesh = _load_centered_mesh(object_class.mesh) if object_class.mesh else None
     texture = draw_texture(object_class)
     if mesh is not None:
-        surface = mesh_surface(mesh, texture.regions["side"])
+        surface = map_strip_texture(mesh, texture.regions["side"])
     elif object_class.shape is Shape.BOX:
-        surface = box_surface(object_class.size, texture.regions)
+        surface = box_mesh(object_class.size, texture.regions)
     else:
-        surface = cylinder_surface(object_class.size, texture.regions)
-    pieces = _convex_pieces(mesh) if mesh is not None else []
+        surface = cylinder_mesh(object_class.size, texture.regions)
+    pieces = _decompose_convex(mesh) if mesh is not None else []
     files = {f"convex_{index:03d}.obj": _obj_text(piece) for index, piece in enumerate(pieces)}
-    files["visual.gltf"] = embedded_gltf(surface, png_bytes(texture.image))
-    inertial = _inertial(object_class, mesh)
-    files["model.sdf"] = _MODEL.format(
+    files["visual.gltf"] = gltf_text(surface, encode_png(texture.image))
+    inertial = _compute_inertial(object_class, mesh)
+    files["model.sdf"] = _MODEL_SDF.format(
         name=object_class.name,
         catalog=CATALOG_FILE,
         source=_comment_text(object_class.source or "not stated"),
         com=" ".join(repr(float(value)) for value in inertial.com),
         mass=object_class.mass,
-        collisions=_collisions(object_class, len(pieces)),
+        collisions=_collisions_sdf(object_class, len(pieces)),
         **{
             f"i{'xyz'[i]}{'xyz'[j]}": float(inertial.inertia[i, j])
             for i in range(3)
@@ -205,25 +219,25 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
     """
     target = folder / object_class.name
     if target.exists():
-        strangers = (
-            [entry.name for entry in target.iterdir() if not _BUILT.fullmatch(entry.name)]
+        foreign_files = (
+            [entry.name for entry in target.iterdir() if not _BUILT_FILE.fullmatch(entry.name)]
             if target.is_dir()
             else [target.name]
         )
-        if strangers:
+        if foreign_files:
             raise InputError(
-                f"{target}: holds {sorted(strangers)[0]}; allowed is a folder that only `assets build` fills"
+                f"{target}: holds {sorted(foreign_files)[0]}; allowed is a folder that only `assets build` fills"
             )
-    files = _asset_files(object_class)
-    staged = folder / f".{object_class.name}.{secrets.token_hex(4)}"
-    staged.mkdir(parents=True)
+    files = _make_asset_files(object_class)
+    staging = folder / f".{object_class.name}.{secrets.token_hex(4)}"
+    staging.mkdir(parents=True)
     try:
         for name, text in files.items():
-            (staged / name).write_text(text, encoding="utf-8")
+            (staging / name).write_text(text, encoding="utf-8")
         shutil.rmtree(target, ignore_errors=True)
-        os.replace(staged, target)
+        os.replace(staging, target)
     finally:
-        shutil.rmtree(staged, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
     return target
 
 
@@ -241,24 +255,26 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
         InputError: a broken catalog, a class that it does not hold, or a folder that may not be written.
     """
     folder = folder.resolve()
-    own = {
+    own_classes = {
         name: entry
         for name, entry in load_catalog(folder).classes.items()
         if entry.folder.parent == folder
     }
-    unknown = sorted(set(names or ()) - set(own))
+    unknown = sorted(set(names or ()) - set(own_classes))
     if unknown:
         raise InputError(
-            f"{catalog_path(folder)}: classes: no {unknown[0]}; allowed are {', '.join(own)}"
+            f"{catalog_path(folder)}: classes: no {unknown[0]}; allowed are {', '.join(own_classes)}"
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")
     built = [
-        build_class(entry, folder) for name, entry in own.items() if names is None or name in names
+        build_class(entry, folder)
+        for name, entry in own_classes.items()
+        if names is None or name in names
     ]
     package = _SHIPPED_PACKAGE if folder == resource_path("sdf_assets") else folder.name
     description = "Object classes of drake_clutter: one folder per class."
     write_text(
-        folder / "package.xml", _PACKAGE.format(name=escape(package), description=description)
+        folder / "package.xml", _PACKAGE_XML.format(name=escape(package), description=description)
     )
     return built

@@ -9,21 +9,26 @@ import numpy as np
 import trimesh
 
 from drake_clutter.cell.support import Support
-from drake_clutter.export.parts import Z_UP_OF_Y_UP, class_visual, classes_of, tray_boxes
+from drake_clutter.export.model_parts import (
+    Y_UP_TO_Z_UP,
+    classes_in_scene,
+    load_visual,
+    support_boxes,
+)
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
-ROOT = "tray_frame"
+ROOT_NODE = "tray_frame"
 """The node of the tray frame T."""
 
 
 def _add_tray(picture: trimesh.Scene, support: Support) -> None:
-    picture.graph.update(frame_to=TRAY, frame_from=ROOT, matrix=np.eye(4))
-    for tray_box in tray_boxes(support):
+    picture.graph.update(frame_to=TRAY, frame_from=ROOT_NODE, matrix=np.eye(4))
+    for tray_box in support_boxes(support):
         box = trimesh.creation.box(tray_box.size)
         # glTF takes for metal whatever does not say otherwise.
         material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=tray_box.colour, metallicFactor=0.0, roughnessFactor=0.8
+            baseColorFactor=tray_box.color, metallicFactor=0.0, roughnessFactor=0.8
         )
         box.visual = trimesh.visual.TextureVisuals(material=material)
         name = f"{TRAY}/{tray_box.name}"
@@ -38,14 +43,14 @@ def write_glb(scene: Scene, folder: Path) -> Path:
     glTF's up is y; `tray_frame` turns T's z there. The pose of an object's node in `tray_frame` is X_TO.
     """
     picture = trimesh.Scene()
-    picture.graph.update(frame_to=ROOT, matrix=np.linalg.inv(Z_UP_OF_Y_UP))
-    for object_class in classes_of(scene):
-        picture.geometry[object_class.name] = class_visual(object_class)
+    picture.graph.update(frame_to=ROOT_NODE, matrix=np.linalg.inv(Y_UP_TO_Z_UP))
+    for object_class in classes_in_scene(scene):
+        picture.geometry[object_class.name] = load_visual(object_class)
     _add_tray(picture, scene.support)
     for scene_object in scene.objects:
         picture.graph.update(
             frame_to=scene_object.name,
-            frame_from=ROOT,
+            frame_from=ROOT_NODE,
             matrix=rigid_transform(scene_object.X_TO).GetAsMatrix4(),
             geometry=scene_object.object_class.name,
         )

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 Region = tuple[float, float, float, float]
 Floats = NDArray[np.float64]
 
-_SEGMENTS = 48
+_NUM_SEGMENTS = 48
 # Which way a face's picture runs to the right and up, in O; their cross product is the outward normal.
-_FACES = {
+_FACE_AXES = {
     "front": ((0, 1, 0), (0, 0, 1)),
     "back": ((0, -1, 0), (0, 0, 1)),
     "right": ((-1, 0, 0), (0, 0, 1)),
@@ -30,7 +30,7 @@ _FACES = {
 
 
 @dataclass(frozen=True)
-class Surface:
+class TexturedMesh:
     """A textured triangle mesh in O.
 
     Attributes:
@@ -46,9 +46,9 @@ class Surface:
     triangles: NDArray[np.int64]
 
 
-def _joined(parts: list[Surface]) -> Surface:
+def _concatenate(parts: list[TexturedMesh]) -> TexturedMesh:
     starts = np.cumsum([0] + [len(part.points) for part in parts[:-1]])
-    return Surface(
+    return TexturedMesh(
         np.vstack([part.points for part in parts]),
         np.vstack([part.normals for part in parts]),
         np.vstack([part.uv for part in parts]),
@@ -56,11 +56,11 @@ def _joined(parts: list[Surface]) -> Surface:
     )
 
 
-def box_surface(size: tuple[float, float, float], regions: dict[str, Region]) -> Surface:
+def box_mesh(size: tuple[float, float, float], regions: dict[str, Region]) -> TexturedMesh:
     """A box of `size` (3,) m; `regions` names the picture of front (+x), back, right (+y), left, top (+z) and bottom."""
     half = np.asarray(size) / 2
     parts = []
-    for face, (right, up) in _FACES.items():
+    for face, (right, up) in _FACE_AXES.items():
         u0, v0, u1, v1 = regions[face]
         normal = np.cross(right, up)
         corners = np.array(
@@ -71,47 +71,49 @@ def box_surface(size: tuple[float, float, float], regions: dict[str, Region]) ->
         )
         uv = np.array([[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
         parts.append(
-            Surface(corners * half, np.tile(normal, (4, 1)), uv, np.array([[0, 1, 2], [0, 2, 3]]))
+            TexturedMesh(
+                corners * half, np.tile(normal, (4, 1)), uv, np.array([[0, 1, 2], [0, 2, 3]])
+            )
         )
-    return _joined(parts)
+    return _concatenate(parts)
 
 
-def cylinder_surface(size: tuple[float, float, float], regions: dict[str, Region]) -> Surface:
+def cylinder_mesh(size: tuple[float, float, float], regions: dict[str, Region]) -> TexturedMesh:
     """A cylinder of `size` (diameter, diameter, height) m; `regions` names the picture of side, top and bottom.
 
     The side's picture starts at -y and runs counter-clockwise seen from above, so that +x lies at a quarter of its width.
     """
     half = np.asarray(size) / 2
-    turned = np.linspace(0, 1, _SEGMENTS + 1)
-    angle = 2 * math.pi * (turned - 0.25)
+    turns = np.linspace(0, 1, _NUM_SEGMENTS + 1)
+    angle = 2 * math.pi * (turns - 0.25)
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     u0, v0, u1, v1 = regions["side"]
-    u = u0 + (u1 - u0) * turned
-    upright = [np.column_stack([ring, np.full(len(ring), z)]) for z in (-1.0, 1.0)]
+    u = u0 + (u1 - u0) * turns
+    rings = [np.column_stack([ring, np.full(len(ring), z)]) for z in (-1.0, 1.0)]
     normals = np.column_stack([ring, np.zeros(len(ring))])
     uv = np.vstack([np.column_stack([u, np.full(len(u), v)]) for v in (v1, v0)])
-    low = np.arange(_SEGMENTS)
+    low = np.arange(_NUM_SEGMENTS)
     high = low + len(ring)
     quads = np.vstack(
         [np.column_stack([low, low + 1, high + 1]), np.column_stack([low, high + 1, high])]
     )
-    parts = [Surface(np.vstack(upright) * half, np.vstack([normals, normals]), uv, quads)]
+    parts = [TexturedMesh(np.vstack(rings) * half, np.vstack([normals, normals]), uv, quads)]
     for face in ("top", "bottom"):
-        right, up = (np.array(axis) for axis in _FACES[face])
+        right, up = (np.array(axis) for axis in _FACE_AXES[face])
         u0, v0, u1, v1 = regions[face]
         disc = np.vstack([[0, 0], ring[:-1]])
         points = np.cross(right, up) + disc[:, :1] * right + disc[:, 1:] * up
         uv = np.column_stack(
             [u0 + (u1 - u0) * (1 + disc[:, 0]) / 2, v1 + (v0 - v1) * (1 + disc[:, 1]) / 2]
         )
-        fan = np.array([[0, 1 + i, 1 + (i + 1) % _SEGMENTS] for i in range(_SEGMENTS)])
+        fan = np.array([[0, 1 + i, 1 + (i + 1) % _NUM_SEGMENTS] for i in range(_NUM_SEGMENTS)])
         parts.append(
-            Surface(points * half, np.tile(np.cross(right, up), (len(points), 1)), uv, fan)
+            TexturedMesh(points * half, np.tile(np.cross(right, up), (len(points), 1)), uv, fan)
         )
-    return _joined(parts)
+    return _concatenate(parts)
 
 
-def mesh_surface(mesh: trimesh.Trimesh, region: Region) -> Surface:
+def map_strip_texture(mesh: trimesh.Trimesh, region: Region) -> TexturedMesh:
     """A user's mesh in O; its texture runs with the height, from the bottom of `region` to its top."""
     shaded = trimesh.graph.smooth_shade(mesh, angle=math.radians(30))
     points = np.asarray(shaded.vertices, float)
@@ -119,7 +121,7 @@ def mesh_surface(mesh: trimesh.Trimesh, region: Region) -> Surface:
     u0, v0, u1, v1 = region
     v = v1 + (v0 - v1) * (points[:, 2] - low) / (high - low)
     uv = np.column_stack([np.full(len(points), (u0 + u1) / 2), v])
-    return Surface(
+    return TexturedMesh(
         points, np.asarray(shaded.vertex_normals, float), uv, np.asarray(shaded.faces, np.int64)
     )
 
@@ -128,7 +130,7 @@ def _data_uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def embedded_gltf(surface: Surface, texture_png: bytes) -> str:
+def gltf_text(surface: TexturedMesh, texture_png: bytes) -> str:
     """The surface with its PNG texture as the text of one glTF file that refers to no other file."""
     y_up = np.array(
         [[1, 0, 0], [0, 0, 1], [0, -1, 0]]

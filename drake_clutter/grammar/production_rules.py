@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drake_clutter.catalog import ObjectClass, PairArrangement
-from drake_clutter.grammar.graph import (
+from drake_clutter.grammar.clutter_graph import (
     DUMMY,
     END,
     OBJECT_SLOT,
@@ -52,7 +52,7 @@ class ProductionRule:
         left: G_L.
         right_nodes: G_R's nodes, the kind of each, or KEEP.
         right_edges: G_R's edges, the kind of each.
-        growth: nodes that it adds.
+        nodes_added: nodes that it adds.
         open_slots_added: open slots that it adds.
     """
 
@@ -62,7 +62,7 @@ class ProductionRule:
     right_edges: Mapping[tuple[str, str], EdgeKind]
 
     @property
-    def growth(self) -> int:
+    def nodes_added(self) -> int:
         return len(self.right_nodes) - len(self.left.nodes)
 
     @property
@@ -71,7 +71,7 @@ class ProductionRule:
         return sum(kind == OPEN_SLOT for kind in self.right_nodes.values()) - before
 
 
-def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
+def make_production_rules(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
     """The rules for a set of object classes: 3 of structure, the insertions of singles and pairs, 10 orientations.
 
     Source: `paper/grammar_rules.png`; 30 rules for the paper's 7 objects, 49 for 14. Beyond the sheet, an insertion asks that
@@ -126,17 +126,17 @@ def rule_sheet(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
             )
         )
         for number, arrangement in enumerate(object_class.pairs, start=1):
-            side_by_side = PAIR_ORIENTATION[arrangement]
+            orientation = PAIR_ORIENTATION[arrangement]
             rules.append(
                 ProductionRule(
                     f"insert_meta_{name}_{number}",
                     slot,
                     {"parent": KEEP, "slot": name, "twin": name, "dummy": DUMMY, "child": KEEP},
                     {
-                        ("parent", "slot"): side_by_side,
-                        ("parent", "twin"): side_by_side,
-                        ("slot", "dummy"): side_by_side,
-                        ("twin", "dummy"): side_by_side,
+                        ("parent", "slot"): orientation,
+                        ("parent", "twin"): orientation,
+                        ("slot", "dummy"): orientation,
+                        ("twin", "dummy"): orientation,
                         ("dummy", "child"): PRIMITIVE,
                     },
                 )

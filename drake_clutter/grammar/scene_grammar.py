@@ -8,10 +8,15 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.files import InputError
-from drake_clutter.grammar.graph import OPEN_SLOT, PRIMITIVE, ClutterGraph
-from drake_clutter.grammar.rules import KEEP, Pattern, ProductionRule, rule_sheet
+from drake_clutter.grammar.clutter_graph import OPEN_SLOT, PRIMITIVE, ClutterGraph
+from drake_clutter.grammar.production_rules import (
+    KEEP,
+    Pattern,
+    ProductionRule,
+    make_production_rules,
+)
 
-SMALLEST_BUDGET = 3  # tray, one object, end
+MIN_NODES = 3  # tray, one object, end
 
 
 @dataclass(frozen=True)
@@ -27,9 +32,9 @@ class NodeBudget:
     exact: bool = True
 
     def __post_init__(self) -> None:
-        if self.nodes < SMALLEST_BUDGET:
+        if self.nodes < MIN_NODES:
             raise InputError(
-                f"nodes: {self.nodes}; allowed is {SMALLEST_BUDGET} (tray, one object, end) or more"
+                f"nodes: {self.nodes}; allowed is {MIN_NODES} (tray, one object, end) or more"
             )
 
 
@@ -51,21 +56,21 @@ class SceneGrammar:
     Attributes:
         classes: by name.
         rules: in the order of the sheet.
-        index: of each rule, by name.
+        rule_indices: of each rule, by name.
         patterns: the few left-hand sides that the rules share.
-        pattern: (rules,) each rule's left-hand side among them.
+        pattern_indices: (rules,) each rule's left-hand side among them.
     """
 
     def __init__(self, classes: Sequence[ObjectClass]) -> None:
         self.classes = {object_class.name: object_class for object_class in classes}
-        self.rules = rule_sheet(classes)
-        self.index = {rule.name: index for index, rule in enumerate(self.rules)}
+        self.rules = make_production_rules(classes)
+        self.rule_indices = {rule.name: index for index, rule in enumerate(self.rules)}
         self.patterns = list({id(rule.left): rule.left for rule in self.rules}.values())
-        self.pattern = [
+        self.pattern_indices = [
             next(k for k, left in enumerate(self.patterns) if left is rule.left)
             for rule in self.rules
         ]
-        self._growth = np.array([rule.growth for rule in self.rules])
+        self._nodes_added = np.array([rule.nodes_added for rule in self.rules])
         self._open_slots_added = np.array([rule.open_slots_added for rule in self.rules])
 
     def find_match(self, graph: ClutterGraph, left: Pattern) -> Match | None:
@@ -74,14 +79,14 @@ class SceneGrammar:
         Returns:
             The graph's node for each node of G_L, or None if nothing matches.
         """
-        return _first_match(graph, left, graph.breadth_first())
+        return _first_match(graph, left, graph.breadth_first_order())
 
-    def matches(self, graph: ClutterGraph) -> list[Match | None]:
+    def find_matches(self, graph: ClutterGraph) -> list[Match | None]:
         """The first match of each of `patterns`."""
-        order = graph.breadth_first()
+        order = graph.breadth_first_order()
         return [_first_match(graph, left, order) for left in self.patterns]
 
-    def feasible(
+    def feasible_rules(
         self, graph: ClutterGraph, budget: NodeBudget, matches: Sequence[Match | None] | None = None
     ) -> NDArray[np.bool_]:
         """(rules,) which rules match and neither overrun the budget nor, if it is exact, leave it unfillable.
@@ -94,14 +99,14 @@ class SceneGrammar:
             matches: of the graph, if they are known.
         """
         open_slots = sum(kind == OPEN_SLOT for kind in graph.kinds())
-        remaining = budget.nodes - len(graph) - self._growth
+        remaining = budget.nodes - len(graph) - self._nodes_added
         allowed = remaining >= 0
         if budget.exact:
             allowed &= (remaining != 1) | (open_slots + self._open_slots_added > 0)
-        found = np.array([match is not None for match in matches or self.matches(graph)])
-        return np.asarray(allowed & found[self.pattern])
+        has_match = np.array([match is not None for match in matches or self.find_matches(graph)])
+        return np.asarray(allowed & has_match[self.pattern_indices])
 
-    def apply(self, graph: ClutterGraph, rule: ProductionRule) -> ClutterGraph:
+    def apply_rule(self, graph: ClutterGraph, rule: ProductionRule) -> ClutterGraph:
         """A new graph in which the first match of G_L is replaced by G_R.
 
         Raises:
@@ -111,11 +116,11 @@ class SceneGrammar:
         if match is None:
             raise ValueError(f"rule {rule.name} does not match the graph")
         result = graph.copy()
-        self.rewrite(result, rule, match)
+        self.rewrite_in_place(result, rule, match)
         return result
 
     @staticmethod
-    def rewrite(graph: ClutterGraph, rule: ProductionRule, match: Match) -> None:
+    def rewrite_in_place(graph: ClutterGraph, rule: ProductionRule, match: Match) -> None:
         """Replaces a match of G_L by G_R, in place."""
         nodes = dict(match)
         for parent, child in rule.left.edges:
@@ -139,9 +144,11 @@ class SceneGrammar:
         """
         graph = ClutterGraph()
         for name in rules:
-            if name not in self.index:
-                raise ValueError(f"rule {name!r} is unknown; known are {', '.join(self.index)}")
-            graph = self.apply(graph, self.rules[self.index[name]])
+            if name not in self.rule_indices:
+                raise ValueError(
+                    f"rule {name!r} is unknown; known are {', '.join(self.rule_indices)}"
+                )
+            graph = self.apply_rule(graph, self.rules[self.rule_indices[name]])
         return graph
 
     def derive(
@@ -154,11 +161,13 @@ class SceneGrammar:
             choose: given the graph and the mask of feasible rules, the index of the rule to apply.
         """
         graph, names = ClutterGraph(), []
-        while (mask := self.feasible(graph, budget, matches := self.matches(graph))).any():
-            chosen = choose(graph, mask)
-            rule, match = self.rules[chosen], matches[self.pattern[chosen]]
+        while (
+            mask := self.feasible_rules(graph, budget, matches := self.find_matches(graph))
+        ).any():
+            rule_index = choose(graph, mask)
+            rule, match = self.rules[rule_index], matches[self.pattern_indices[rule_index]]
             assert match is not None, f"rule {rule.name} was chosen, which is not feasible"
-            self.rewrite(graph, rule, match)
+            self.rewrite_in_place(graph, rule, match)
             names.append(rule.name)
         return Derivation(graph, tuple(names))
 

@@ -56,7 +56,9 @@ class ClutterGraph:
             if parent not in nodes or child not in nodes:
                 raise ValueError(f"edges: {parent} -> {child} joins a node that is not there")
             graph.nx.add_edge(parent, child, kind=edge_kind)
-        if len(graph.breadth_first()) != len(nodes) or not nx.is_directed_acyclic_graph(graph.nx):
+        if len(graph.breadth_first_order()) != len(nodes) or not nx.is_directed_acyclic_graph(
+            graph.nx
+        ):
             raise ValueError(
                 "edges: allowed is an acyclic graph in which the tray leads to every node"
             )
@@ -91,7 +93,7 @@ class ClutterGraph:
         """What a node carries, in order."""
         return list(self.nx.successors(node))
 
-    def breadth_first(self) -> list[int]:
+    def breadth_first_order(self) -> list[int]:
         """All nodes that the tray leads to, breadth first, siblings in order."""
         # networkx's own walk costs several times as much, and is taken at every rule.
         edges, order = self.nx._adj, [self.TRAY_NODE]
@@ -103,7 +105,7 @@ class ClutterGraph:
                     order.append(child)
         return order
 
-    def stacks(self) -> list[list[int]]:
+    def stack_bases(self) -> list[list[int]]:
         """The nodes that stand on the tray, stack by stack: one, or the two of a pair."""
         bases: dict[int, list[int]] = {}
         for node in self.children(self.TRAY_NODE):
@@ -113,15 +115,15 @@ class ClutterGraph:
 
     def stack_objects(self) -> list[list[int]]:
         """The object nodes of every stack, in the stacks' order."""
-        found = []
-        for bottom in self.stacks():
+        stacks = []
+        for bottom in self.stack_bases():
             members = set(bottom).union(*(nx.descendants(self.nx, node) for node in bottom))
-            found.append(
+            stacks.append(
                 [node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS]
             )
-        return found
+        return stacks
 
-    def largest_stack_share(self) -> float:
+    def largest_stack_fraction(self) -> float:
         """Of the objects, the share that the stack with most of them holds; 0 without objects."""
         sizes = [len(stack) for stack in self.stack_objects()]
         return max(sizes) / sum(sizes) if sizes else 0.0
@@ -151,8 +153,8 @@ def canonical_form(graph: ClutterGraph, classes: Mapping[str, ObjectClass]) -> s
         for child in graph.children(node):
             edge, kind = graph.edge_kind(node, child), graph.kind(child)
             # An edge into an end or a dummy says nothing that its neighbours do not.
-            oriented = isinstance(edge, Orientation) and kind in classes
-            label = str(symmetry_key(classes[kind], Orientation(edge))) if oriented else ""
+            is_oriented = isinstance(edge, Orientation) and kind in classes
+            label = str(symmetry_key(classes[kind], Orientation(edge))) if is_oriented else ""
             children.append(label + digests[child])
         description = f"{graph.kind(node)}({','.join(sorted(children))})"
         digests[node] = hashlib.sha256(description.encode()).hexdigest()

@@ -8,7 +8,7 @@ from pydrake.common.yaml import yaml_dump_typed
 from pydrake.multibody.parsing import AddModel, AddWeld, ModelDirective, ModelDirectives
 
 from drake_clutter.cell.support_sdf import support_sdf
-from drake_clutter.export.parts import classes_of
+from drake_clutter.export.model_parts import classes_in_scene
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -28,7 +28,7 @@ _PACKAGE_XML = f"""<?xml version="1.0"?>
 
 def write_dmd(scene: Scene, folder: Path) -> Path:
     """Writes `scene.dmd.yaml`, `package.xml`, `tray.sdf` and a folder per class; the models are the classes' own."""
-    for object_class in classes_of(scene):
+    for object_class in classes_in_scene(scene):
         target = folder / object_class.name
         target.mkdir()
         for file in object_class.folder.iterdir():

@@ -7,16 +7,18 @@ import shutil
 from enum import Enum
 from pathlib import Path
 
-from drake_clutter.export.dmd import write_dmd
-from drake_clutter.export.glb import ROOT, write_glb
-from drake_clutter.export.mjcf import write_mjcf
-from drake_clutter.export.parts import classes_of
-from drake_clutter.export.sdf import write_sdf
+from drake_clutter.export.dmd_writer import write_dmd
+from drake_clutter.export.glb_writer import ROOT_NODE, write_glb
+from drake_clutter.export.mjcf_writer import write_mjcf
+from drake_clutter.export.model_parts import classes_in_scene
+from drake_clutter.export.sdf_writer import write_sdf
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import TRAY, Scene
 
-_NAME = re.compile(r"\w([\w. -]*\w)?")
-_RESERVED = re.compile(rf"{TRAY}|{ROOT}|world|WorldModelInstance|DefaultModelInstance|__.*__")
+_VALID_NAME = re.compile(r"\w([\w. -]*\w)?")
+_RESERVED_NAME = re.compile(
+    rf"{TRAY}|{ROOT_NODE}|world|WorldModelInstance|DefaultModelInstance|__.*__"
+)
 
 
 class ExportFormat(Enum):
@@ -53,20 +55,20 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
         InputError: an object's name that not every program could take, or a class without built assets.
     """
     for name in scene.names:
-        if not _NAME.fullmatch(name) or _RESERVED.fullmatch(name):
+        if not _VALID_NAME.fullmatch(name) or _RESERVED_NAME.fullmatch(name):
             raise InputError(
                 f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, and . - or blanks "
-                f"between them, and no name that a format reserves ({_RESERVED.pattern.replace('|', ', ')})"
+                f"between them, and no name that a format reserves ({_RESERVED_NAME.pattern.replace('|', ', ')})"
             )
-    for object_class in classes_of(scene):
+    for object_class in classes_in_scene(scene):
         _ = object_class.model_path  # says what is wrong before anything is written
-    staged = out / f".export.{secrets.token_hex(4)}"
-    staged.mkdir()
+    staging = out / f".export.{secrets.token_hex(4)}"
+    staging.mkdir()
     try:
-        main_file = _WRITERS[format](scene, staged)
+        main_file = _WRITERS[format](scene, staging)
         # The file to open comes last: where it is, the export is complete.
-        for entry in sorted(staged.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
+        for entry in sorted(staging.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
             os.replace(entry, out / entry.name)
     finally:
-        shutil.rmtree(staged)
+        shutil.rmtree(staging)
     return out / main_file.name
