@@ -56,10 +56,21 @@ PAIRS = (
     ("sg_star_40", "student", "student-rg"),
 )
 """Scene set and two policies that are compared scene by scene."""
+_NAMES = (
+    ("RE", "random", "uniform choice among the legal moves (paper)"),
+    ("LF", "largest-first", "largest visible object, to the tray (paper)"),
+    ("LF-clear", "largest-clear", "largest visible object with a clear top, to the tray"),
+    ("SE^r", "student-rg", "student cloned (DAgger) on RG scenes"),
+    ("SE\\*, DAgger", "student-dagger", "student cloned (DAgger) on SG\\* scenes"),
+    ("SE\\*", "student", "the same, fine-tuned"),
+    ("SE-14", "student-14", "student cloned and fine-tuned on SG-14 scenes"),
+    ("oracle", "full-knowledge", "search with full state"),
+)
+"""Short name, name on the command line and description of each policy."""
 _SUCCESS = ["scene set", "policy", "episodes", "success in 10", "paper", "success in 20"]
 _SUCCESS += ["of the solvable", "collapsed"]
 _FOUND = ["scene set", "policy", "hidden", "found in 10", "paper", "found in 20"]
-_FOUND += ["fraction found", "moves", "moves / oracle", "moves / LU"]
+_FOUND += ["fraction found", "moves", "moves / oracle", "moves / LF-clear"]
 
 
 def success_row(row: Mapping[str, Any]) -> list[str]:
@@ -119,7 +130,7 @@ def _policies() -> str:
     text += (
         "\n### Objects found and moves\n\n"
         "*Hidden* and *found*: objects per scene. *Moves*: mean over the successes. *Moves / "
-        "oracle*, *moves / LU*: ratio on the scenes that both policies solve, if these are at "
+        "oracle*, *moves / LF-clear*: ratio on the scenes that both policies solve, if these are at "
         f"least {MIN_PAIRS}.\n\n"
     )
     text += table(_FOUND, [found_row(row) for row in rows])
@@ -297,12 +308,9 @@ def _environment() -> str:
 
 def page() -> str:
     """Return the page."""
-    intro = (
-        "# Exploration\n\n"
-        "Exploration policies compared on frozen scene sets. RE: random. LF: largest object "
-        "first. LU: largest unoccluded object first. SE^r: student cloned on RG scenes. SE\\*: "
-        "student on SG\\* scenes, cloned (DAgger) and fine-tuned. SE-14: the same on SG-14 "
-        "scenes. Oracle: search with full state.\n\n"
+    intro = "# Exploration\n\nExploration policies compared on frozen scene sets.\n\n" + table(
+        ["name", "`--agent`", "policy"],
+        [[name, f"`{agent}`" if agent else "", text] for name, agent, text in _NAMES],
     )
     parts = [_policies(), _pairs(), _static_and_drake(), _action_filter(), _seeds()]
-    return intro + "\n".join([*parts, _trainings(), _environment()])
+    return intro + "\n" + "\n".join([*parts, _trainings(), _environment()])

@@ -40,7 +40,7 @@ POLICIES = {
     "student-14": ("SE-14", "C0"),
     "student-dagger": ("SE*, DAgger", "C1"),
     "student-rg": ("SE^r", "C2"),
-    "largest-clear": ("LU", "C3"),
+    "largest-clear": ("LF-clear", "C3"),
     "largest-first": ("LF", "C4"),
     "random": ("RE", "C5"),
 }

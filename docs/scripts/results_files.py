@@ -24,7 +24,7 @@ GENERATORS = {
 POLICIES = {
     "random": "RE",
     "largest-first": "LF",
-    "largest-clear": "LU",
+    "largest-clear": "LF-clear",
     "student-rg": "SE^r",
     "student-dagger": "SE\\*, DAgger",
     "student": "SE\\*",

@@ -26,6 +26,14 @@ PAPER = {
 
 Source: Kumar et al. 2022, Table I.
 """
+_NAMES = (
+    ("RG", "random", "uniform choice among the feasible rules (paper)"),
+    ("HC", "hill-climbing", "best of 150 random graphs by the static judge"),
+    ("SG", "sg", "trained with 15 nodes of ycb7"),
+    ("SG\\*", "sg-star", "trained with 25 nodes of ycb7"),
+    ("SG-14", "sg-14", "trained with 25 nodes of pantry14"),
+)
+"""Short name, name on the command line and description of each generator."""
 _ORDER = ["sg-star", "sg", "hill-climbing", "random", "sg-14"]
 _TRAINING_FIGURES = (("stable", 3), ("hidden", 1), ("stacks", 2), ("balanced", 2))
 
@@ -317,11 +325,9 @@ def _speed() -> str:
 
 def page() -> str:
     """Return the page."""
-    intro = (
-        "# Scene generation\n\n"
-        "Scene generators compared by Drake. RG: uniformly random rules (Kumar et al. 2022). "
-        "HC: best of 150 random graphs by the static judge. SG, SG\\*, SG-14: trained with 15 and "
-        "25 nodes of ycb7, and 25 nodes of pantry14.\n\n"
+    intro = "# Scene generation\n\nScene generators compared by Drake.\n\n" + table(
+        ["name", "`--agent`", "generator"],
+        [[name, f"`{agent}`", text] for name, agent, text in _NAMES],
     )
     parts = (_scenes(), _trainings(), _sampled(), _disassembly(), _speed())
-    return intro + "\n".join(parts)
+    return intro + "\n" + "\n".join(parts)
