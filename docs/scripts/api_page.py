@@ -17,7 +17,8 @@ def page() -> str:
         if line.startswith("# ") and not line.startswith("# ruff")
     }
     page = (
-        "# Python API\n\nThe names below are exported by `drake_clutter` and imported when they are "
+        "# Python API\n\nThe names below are exported by `drake_clutter` and imported when they "
+        "are "
         "first used: `from drake_clutter import load_scene`. Other modules may change between "
         "versions.\n"
     )

@@ -1,4 +1,4 @@
-"""The page docs/reference/configuration.md, from the fields and docstrings of the config classes."""
+"""The page docs/reference/configuration.md, from fields and docstrings of config classes."""
 
 import math
 import types

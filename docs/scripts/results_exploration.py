@@ -130,7 +130,8 @@ def _policies() -> str:
     text += (
         "\n### Objects found and moves\n\n"
         "*Hidden* and *found*: objects per scene. *Moves*: mean over the successes. *Moves / "
-        "oracle*, *moves / LF-clear*: ratio on the scenes that both policies solve, if these are at "
+        "oracle*, *moves / LF-clear*: ratio on the scenes that both policies solve, if these are "
+        "at "
         f"least {MIN_PAIRS}.\n\n"
     )
     text += table(_FOUND, [found_row(row) for row in rows])
