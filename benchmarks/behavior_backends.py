@@ -113,7 +113,7 @@ def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
 
 def static(case: Case) -> list[Line]:
     """Moves by teleport, judged by the static judge alone."""
-    return _at_fidelity(case, "equilibrium")
+    return _at_fidelity(case, "static")
 
 
 def settle(case: Case) -> list[Line]:

@@ -118,7 +118,7 @@ def test_generate_goes_on_after_a_kill(tmp_path: Path) -> None:
     assert scenes_of(out) == scenes_of(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("fidelity", ["settle", "fast"])
+@pytest.mark.parametrize("fidelity", ["settle", "static_or_drake"])
 def test_explore_finds_what_is_below(fidelity: str, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "episode"
     options = ("--agent", "largest-clear", "--fidelity", fidelity, "--json")
@@ -214,7 +214,7 @@ def test_evaluate_knows_the_frozen_sets_by_name() -> None:
         "--agents",
         "largest-clear",
         "--fidelity",
-        "fast",
+        "static_or_drake",
         "--json",
     )
     (row,) = json.loads(shown.stdout)

@@ -64,7 +64,7 @@ def scenes(file: Path) -> SceneDataset:
 
 
 def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:
-    moves = np.argwhere(observation["allowed"])
+    moves = np.argwhere(observation["action_mask"])
     x, y = moves[draw.integers(len(moves))].tolist()
     return x, y
 
@@ -86,13 +86,13 @@ def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) 
     picked = 0
     while (
         environment.task.termination is None
-        and (moves := np.flatnonzero(observation["allowed"][:, 0])).size
+        and (moves := np.flatnonzero(observation["action_mask"][:, 0])).size
     ):
-        least = observation["feature"][:, NODE_FEATURES.index("z")][moves].argmin()
+        least = observation["node_features"][:, NODE_FEATURES.index("z")][moves].argmin()
         observation, *_ = environment.step((moves[least], 0))
         picked += 1
         assert environment.observation_space.contains(observation)
-    assert observation["feature"][:, NODE_FEATURES.index("times_picked")].max() == 10, picked
+    assert observation["node_features"][:, NODE_FEATURES.index("pick_count")].max() == 10, picked
 
 
 @pytest.mark.parametrize("privileged", [False, True])
@@ -108,7 +108,8 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -
         while environment.task.termination is None:
             names = (TRAY, *known)
             moves = [
-                Move(names[x], names[y]) for x, y in np.argwhere(observation["allowed"]).tolist()
+                Move(names[x], names[y])
+                for x, y in np.argwhere(observation["action_mask"]).tolist()
             ]
             legal = set(legal_moves(environment.task.perception.observation))
             assert len(moves) == len(set(moves))
@@ -136,10 +137,10 @@ def test_what_may_not_be_named_changes_nothing(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, privileged=True)
     observation, _ = environment.reset(options={"scene": 0})
     hidden = next(
-        k for k in range(1, len(environment.objects) + 1) if not observation["allowed"][k].any()
+        k for k in range(1, len(environment.objects) + 1) if not observation["action_mask"][k].any()
     )
     seen = next(
-        k for k in range(1, len(environment.objects) + 1) if observation["allowed"][k].any()
+        k for k in range(1, len(environment.objects) + 1) if observation["action_mask"][k].any()
     )
     for move in ((0, seen), (seen, seen), (hidden, 0), (seen, hidden), (seen, 24), (24, 0)):
         again, reward, over, out_of_moves, _ = environment.step(move)
@@ -166,14 +167,14 @@ def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
         scenes, fidelity=make_backend_factory(fidelity, ClutterConfig())
     )
     before, _ = environment.reset(options={"scene": 2})
-    height = before["feature"][:, NODE_FEATURES.index("z")]
+    height = before["node_features"][:, NODE_FEATURES.index("z")]
     highest = max(
-        np.flatnonzero(before["allowed"][:, 0]).tolist(), key=lambda node: float(height[node])
+        np.flatnonzero(before["action_mask"][:, 0]).tolist(), key=lambda node: float(height[node])
     )
     after, *_, info = environment.step((highest, 0))
     assert info["step"].outcome.result is MoveResult.PLACED
-    assert after["feature"][highest, NODE_FEATURES.index("z")] < height[highest] - 0.05
-    assert after["glob"].tolist() == [pytest.approx(1 / 20)]
+    assert after["node_features"][highest, NODE_FEATURES.index("z")] < height[highest] - 0.05
+    assert after["global_features"].tolist() == [pytest.approx(1 / 20)]
 
 
 def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDataset) -> None:

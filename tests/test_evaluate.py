@@ -37,7 +37,7 @@ def rows_of(
         assert total <= most
         return results
 
-    return evaluate_explorers(scenes, agents, 3, "equilibrium", 0, config, None, 1, out, progress)
+    return evaluate_explorers(scenes, agents, 3, "static", 0, config, None, 1, out, progress)
 
 
 def test_an_agent_that_is_named_twice_plays_once() -> None:
@@ -90,7 +90,7 @@ def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) 
             "--agents",
             "random",
             "--fidelity",
-            "fast",
+            "static_or_drake",
             "--max-moves",
             "1",
             "--out",

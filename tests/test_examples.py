@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 CASES = {
     "01_generate_scenes": ["--count", "2", "--nodes", "8"],
     "02_inspect_verdict": [],
-    "03_explore_scene": ["--fidelity", "fast"],
+    "03_explore_scene": ["--fidelity", "static_or_drake"],
     "04_plan_arm_motion": [],
     "05_train_generator": ["--steps", "96", "--scenes", "2"],
     "06_command_arm": [],

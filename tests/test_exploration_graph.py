@@ -47,25 +47,25 @@ def graph_of(
 
 
 def feature(graph: ExplorationObservation, node: int, name: str) -> float:
-    return float(graph["feature"][node, NODE_FEATURES.index(name)])
+    return float(graph["node_features"][node, NODE_FEATURES.index(name)])
 
 
 def edges(graph: ExplorationObservation, names: tuple[str, ...]) -> dict[tuple[str, str], str]:
     """Kinds by lower and upper."""
     named = (TRAY, *names)
-    joined = zip(graph["edge"].tolist(), graph["edge_kind"].tolist(), strict=True)
+    joined = zip(graph["edge_links"].tolist(), graph["edge_kind"].tolist(), strict=True)
     return {(named[a], named[b]): EDGE_KINDS[kind - 1] for (a, b), kind in joined if kind}
 
 
 def test_how_objects_lie_to_each_other() -> None:
     found = edges(graph_of(SCENE), SCENE.names)
     assert len(found) == 5 + 10
-    assert found["large_marker", "cracker_box"] == "carries"
-    assert found["cracker_box", "tomato_soup_can"] == "carries"
+    assert found["large_marker", "cracker_box"] == "supports"
+    assert found["cracker_box", "tomato_soup_can"] == "supports"
     assert found["large_marker", "tomato_soup_can"] == "is_below"
     assert {found[pair] for pair in found if set(pair) == {"cracker_box", "close"}} == {"is_beside"}
     assert {found[pair] for pair in found if set(pair) == {"close", "far"}} == {"is_apart_from"}
-    assert {upper for (lower, upper), kind in found.items() if kind == "tray_carries"} == {
+    assert {upper for (lower, upper), kind in found.items() if kind == "tray_supports"} == {
         "large_marker",
         "close",
         "far",
@@ -86,19 +86,19 @@ def test_what_is_known_of_each_object() -> None:
         0,
     ]
     assert [feature(graph, k, "in_view") for k in range(1, 6)] == [0, 1, 1, 1, 1]
-    assert [feature(graph, k, "covered") for k in range(1, 6)] == [1, 1, 0, 0, 0]
-    assert [feature(graph, k, "times_picked") for k in range(1, 6)] == pytest.approx(
+    assert [feature(graph, k, "is_covered") for k in range(1, 6)] == [1, 1, 0, 0, 0]
+    assert [feature(graph, k, "pick_count") for k in range(1, 6)] == pytest.approx(
         [0, 0, 0, 1 / 3, 2 / 3]
     )
-    assert [feature(graph, k, "unexplained_height") for k in range(1, 6)] == [0.0] * 5
+    assert [feature(graph, k, "support_gap") for k in range(1, 6)] == [0.0] * 5
     assert feature(graph, 2, "extent_x") == pytest.approx(0.230 / 0.35)
-    assert feature(graph, 4, "seen_share") == pytest.approx(1, abs=0.05)
-    assert feature(graph, 2, "seen_share") < 0.95
+    assert feature(graph, 4, "visible_fraction") == pytest.approx(1, abs=0.05)
+    assert feature(graph, 2, "visible_fraction") < 0.95
     allowed = np.zeros((9, 9), int)
     allowed[2:6, [0, 2, 3, 4, 5]] = 1
     np.fill_diagonal(allowed, 0)
-    assert np.array_equal(graph["allowed"], allowed)
-    assert graph["glob"] == pytest.approx([3 / 20])
+    assert np.array_equal(graph["action_mask"], allowed)
+    assert graph["global_features"] == pytest.approx([3 / 20])
 
 
 def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
@@ -109,7 +109,7 @@ def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
         for o in SCENE.objects:
             w, x, y, z = o.X_TO.quaternion
             turned[o.name] = Pose(o.X_TO.translation, (w + tilt, x - tilt, y + tilt, z - tilt))
-        tilted.append(graph_of(SCENE.with_poses(turned))["feature"])
+        tilted.append(graph_of(SCENE.with_poses(turned))["node_features"])
     assert tilted[0] == pytest.approx(tilted[1], abs=0.01)
     assert tilted[2] == pytest.approx(tilted[1], abs=0.01)
 
@@ -117,10 +117,10 @@ def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
 def test_what_has_failed_is_not_tried_again() -> None:
     onto_all = [Move("far", name) for name in (TRAY, "cracker_box", "tomato_soup_can", "close")]
     graph = graph_of(SCENE, failed=[Move("close"), *onto_all])
-    free = graph_of(SCENE)["allowed"]
+    free = graph_of(SCENE)["action_mask"]
     assert free[4, 0] == free[5, 2] == 1
     free[4, 0], free[5] = 0, 0
-    assert np.array_equal(graph["allowed"], free)
+    assert np.array_equal(graph["action_mask"], free)
     torch.manual_seed(0)
     moves, _, _, picks = sample_actions(
         ExplorerNetwork(len(NUMBERS)), collate_graphs([graph] * 500), rng()
@@ -135,7 +135,7 @@ def test_something_must_carry_a_box_that_floats() -> None:
     known = Belief().update(observation).objects
     assert [o.name for o in known] == ["cracker_box", "tomato_soup_can", "close", "far"]
     graph = build_exploration_graph(known, observation, (), NUMBERS)
-    heights = [feature(graph, k, "unexplained_height") for k in range(1, 5)]
+    heights = [feature(graph, k, "support_gap") for k in range(1, 5)]
     assert heights == pytest.approx([(0.018 - 0.006) / 0.35, 0, 0, 0], abs=1e-6)
 
 
@@ -146,7 +146,7 @@ def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
     assert known[0].name == "large_marker"
     assert {o.name: o.X_TO for o in known}["large_marker"] == covered["large_marker"].X_TO
     graph = build_exploration_graph(known, RAYS.observe(SCENE)[0], (), NUMBERS)
-    assert graph["allowed"].any(axis=1).tolist() == [False, False, True, True, True, True]
+    assert graph["action_mask"].any(axis=1).tolist() == [False, False, True, True, True, True]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -193,7 +193,7 @@ def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
     count = 4000
     moves, chance, _, picks = sample_actions(network, collate_graphs([graph] * count), rng())
     assert picks[0].sum() == pytest.approx(1, abs=1e-5)
-    assert (graph["allowed"][moves[:, 0], moves[:, 1]] == 1).all()
+    assert (graph["action_mask"][moves[:, 0], moves[:, 1]] == 1).all()
     drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
     assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
     found = network(collate_graphs([graph] * 50))

@@ -30,7 +30,7 @@ def graph_of(observation: GenerationObservation, environment: ClutterGeneration)
     edges = {
         (parent, child): edge_kinds[kind - 1]
         for (parent, child), kind in zip(
-            observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True
+            observation["edge_links"].tolist(), observation["edge_kind"].tolist(), strict=True
         )
         if kind
     }
@@ -78,7 +78,7 @@ def test_what_is_observed_is_the_graph(objects: str) -> None:
             assert (info["action_mask"] == grammar.feasible_rules(graph, NodeBudget(14))).all()
             assert (observation["node_mask"] == (observation["node_kind"] > 0)).all()
             assert (observation["edge_mask"] == (observation["edge_kind"] > 0)).all()
-            assert observation["remaining"] == pytest.approx((14 - len(graph)) / 25)
+            assert observation["remaining_nodes"] == pytest.approx((14 - len(graph)) / 25)
             simulated = set(np.flatnonzero(observation["node_flags"][:, 0]).tolist())
             assert simulated == finished_stacks(graph)
             stacks_seen += bool(simulated)

@@ -54,7 +54,7 @@ def edges(observation: GenerationObservation) -> Iterator[tuple[int, int, int]]:
     """Sender, receiver, and number of the kind, both ways."""
     kinds = len(ENVIRONMENT.vocabulary.edge_kinds)
     for (parent, child), kind in zip(
-        observation["edge"].tolist(), observation["edge_kind"].tolist(), strict=True
+        observation["edge_links"].tolist(), observation["edge_kind"].tolist(), strict=True
     ):
         if kind > 0:
             yield parent, child, kind - 1
@@ -80,7 +80,9 @@ def by_loops(values: RuleQNetwork, observation: GenerationObservation) -> Tensor
                 + net.node_encoder(features)
             )
         )
-    glob = leaky(net.global_encoder(torch.tensor(observation["remaining"], dtype=torch.float64)))
+    glob = leaky(
+        net.global_encoder(torch.tensor(observation["remaining_nodes"], dtype=torch.float64))
+    )
     for layer in map(LayerWeights._make, zip(*net.layers.weights, strict=True)):
         most: list[Tensor | None] = [None] * count
         for sender, receiver, kind in edges(observation):
@@ -138,7 +140,9 @@ def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
         other = {name: array.copy() for name, array in observation.items()}
         for name in ("node_kind", "node_flags", "position"):
             other[name][:nodes] = observation[name][order]
-        other["edge"][:linked] = np.argsort(order)[observation["edge"][:linked]][edge_order]
+        other["edge_links"][:linked] = np.argsort(order)[observation["edge_links"][:linked]][
+            edge_order
+        ]
         other["edge_kind"][:linked] = observation["edge_kind"][:linked][edge_order]
         torch.testing.assert_close(
             values(collate([other])), values(collate([observation])), rtol=1e-9, atol=1e-9
@@ -149,7 +153,7 @@ def test_what_is_known_of_a_graph_matters() -> None:
     """Every feature reaches the values."""
     values, (observation,) = network(3), observations(1, seed=5)
     before = values(collate([observation]))
-    for name in ("node_kind", "node_flags", "position", "edge_kind", "remaining"):
+    for name in ("node_kind", "node_flags", "position", "edge_kind", "remaining_nodes"):
         other = {key: array.copy() for key, array in observation.items()}
         other[name].reshape(-1)[0] += 1
         assert not torch.allclose(values(collate([other])), before), name

@@ -109,16 +109,16 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
         numbers = 10 * moment + np.arange(4)
         replay.add(
             **step,
-            mask=np.ones((4, 5), bool),
+            action_mask=np.ones((4, 5), bool),
             action=numbers,
-            chance=np.ones(4, np.float32),
+            behavior_prob=np.ones(4, np.float32),
             reward=numbers.astype(np.float32),
-            over=numbers % 3 == 0,
+            terminated=numbers % 3 == 0,
         )
         if moment >= 5:
             drawn = replay.sample_sequences(50, 4, draw)
             assert drawn is not None
-            assert drawn["mask"].shape == (50, 5, 5)
+            assert drawn["action_mask"].shape == (50, 5, 5)
             assert (np.diff(drawn["action"], axis=1) == 10).all()
             assert (drawn["action"] == drawn["reward"]).all()
             assert drawn["action"].max() <= 10 * moment + 3

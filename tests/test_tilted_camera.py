@@ -26,7 +26,7 @@ def generated() -> Scene:
     return load_or_generate_scene(SCENARIO)[0]
 
 
-@pytest.mark.parametrize("fidelity", ["fast", "settle", "arm"])
+@pytest.mark.parametrize("fidelity", ["static_or_drake", "settle", "arm"])
 def test_scenes_are_explored(fidelity: str, generated: Scene) -> None:
     """The moves that are offered can be made, and what they uncover is found."""
     backend = make_backend_factory(fidelity, WORLD)(generated, item_rng(0))

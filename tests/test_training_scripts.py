@@ -75,7 +75,7 @@ def test_episodes_are_run_once(tmp_path: Path) -> None:
     script = training_script("evaluate_explorers")
     scenes = load_scene_dataset(script.SCENES / "sg_star_25.json", CATALOG)
     path = tmp_path / "random.jsonl.gz"
-    options = {"fidelity": "equilibrium", "seed": 0, "workers": 1}
+    options = {"fidelity": "static", "seed": 0, "workers": 1}
     records = script.collect_episodes(path, scenes, "random", 1, **options)
     before = path.read_bytes()
     assert script.collect_episodes(path, scenes, "random", 1, **options) == records
@@ -110,7 +110,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
 
 def test_an_explorer_is_compared_with_the_records_of_a_baseline(tmp_path: Path) -> None:
     script, out = training_script("evaluate_explorers"), tmp_path / "table.json"
-    options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "equilibrium", "out": out}
+    options: dict[str, Any] = {"only": "sg_star_10", "fidelity": "static", "out": out}
     script.main(tmp_path, agents=["largest-clear"], count=1, **options)
     baseline = tmp_path / "sg_star_10_largest-clear.jsonl.gz"
     content = baseline.read_bytes()

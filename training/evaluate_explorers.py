@@ -30,6 +30,7 @@ from drake_clutter.records import read_jsonl
 from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import bootstrap_ratio_interval
+from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.validation import to_plain
 from training.results_file import ResultsFile, Row, collect_records
@@ -241,6 +242,7 @@ def main(
 
     Without --out, the rows go into table2.json and table3.json in training/results.
     """
+    fidelity = current_fidelity(fidelity)
     if folder == EPISODES and fidelity != "settle":
         raise InputError(f"DIR: {folder}: is for episodes under settle; give another folder")
     if out is None and (agents or count or fidelity != "settle"):

@@ -18,6 +18,7 @@ from drake_clutter.config import upgrade_record_head
 from drake_clutter.files import InputError, write_json
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
+from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import progress
 
@@ -51,7 +52,7 @@ class ResultsFile:
             InputError: The file is no results file, or has another header.
         """
         try:
-            document = upgrade_record_head(json.loads(self.path.read_text(encoding="utf-8")))
+            document = _upgrade_header(json.loads(self.path.read_text(encoding="utf-8")))
             rows: list[Row] = document["rows"]
             differing = [key for key, value in self.header.items() if document[key] != value]
         except FileNotFoundError:
@@ -82,6 +83,14 @@ class ResultsFile:
 
     def _key(self, row: Row) -> tuple[Any, ...]:
         return tuple(row[key] for key in self.keys)
+
+
+def _upgrade_header(header: Any) -> Any:
+    """Return a header with its configs and its fidelity under their current names."""
+    upgraded = upgrade_record_head(header)
+    if isinstance(upgraded, dict) and "fidelity" in upgraded:
+        upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
+    return upgraded
 
 
 def collect_records(
@@ -120,5 +129,5 @@ def collect_records(
             record = result if isinstance(result, dict) else asdict(result)
             yield record | software
 
-    with closing(resume_jsonl(path, header, compute, upgrade_record_head)) as lines:
+    with closing(resume_jsonl(path, header, compute, _upgrade_header)) as lines:
         return list(islice(lines, 1, 1 + len(items)))

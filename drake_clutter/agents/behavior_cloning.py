@@ -26,10 +26,11 @@ from drake_clutter.learning.checkpoint import (
     restore_learner,
     save_tensors,
     tensors_with_prefix,
+    with_current_keys,
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.tasks.exploration_graph import ExplorationObservation
+from drake_clutter.tasks.exploration_graph import RENAMED_ARRAYS, ExplorationObservation
 from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
 
 
@@ -167,8 +168,7 @@ class BehaviorCloningLearner:
         """Goes on where `save` was called, in a training of the same config, seed and teacher."""
         tensors, state = load_tensors(path)
         restore_learner(self.network, self._optimizer, tensors)
-        self._states = {
-            name: value.numpy() for name, value in tensors_with_prefix(tensors, "states").items()
-        }
+        states = with_current_keys(tensors_with_prefix(tensors, "states"), RENAMED_ARRAYS)
+        self._states = {name: value.numpy() for name, value in states.items()}
         self._moves = self._states.pop("moves")
         self.step = state["step"]

@@ -30,11 +30,11 @@ def collate_graphs(observations: Sequence[ExplorationObservation]) -> Exploratio
     edges = nodes * (nodes - 1) // 2
     shapes = {
         "node_kind": (nodes,),
-        "feature": (nodes, len(NODE_FEATURES)),
-        "edge": (edges, 2),
+        "node_features": (nodes, len(NODE_FEATURES)),
+        "edge_links": (edges, 2),
         "edge_kind": (edges,),
-        "glob": (len(GLOBAL_FEATURES),),
-        "allowed": (nodes, nodes),
+        "global_features": (len(GLOBAL_FEATURES),),
+        "action_mask": (nodes, nodes),
     }
     batch = {
         name: np.zeros((len(observations), *shape), observations[0][name].dtype)
@@ -95,13 +95,16 @@ class ExplorerNetwork(RenamedParameters):
         """The network's input, and the number of each node in its graph."""
         weight = self.value_head.weight
         graph, number, kind, *joined = pack_graphs(
-            observation["node_kind"], observation["edge"], observation["edge_kind"], len(EDGE_KINDS)
+            observation["node_kind"],
+            observation["edge_links"],
+            observation["edge_kind"],
+            len(EDGE_KINDS),
         )
-        feature = torch.from_numpy(observation["feature"][graph, number]).to(weight)
+        feature = torch.from_numpy(observation["node_features"][graph, number]).to(weight)
         links = BatchConnectivity(
             *(torch.from_numpy(array).to(weight.device) for array in (graph, *joined))
         )
-        glob = torch.from_numpy(observation["glob"]).to(weight)
+        glob = torch.from_numpy(observation["global_features"]).to(weight)
         return GraphBatch(
             torch.from_numpy(kind).to(weight.device), feature, links, glob
         ), torch.from_numpy(number).to(weight.device)
@@ -110,7 +113,7 @@ class ExplorerNetwork(RenamedParameters):
         """What to pick, and what is to be expected."""
         batch, number = self.make_batch(observation)
         node, glob = self.encoder(batch)
-        allowed = torch.from_numpy(observation["allowed"]).to(node.device) > 0
+        allowed = torch.from_numpy(observation["action_mask"]).to(node.device) > 0
         pick = _log_softmax(
             self.pick_head(node).squeeze(1),
             batch.connectivity.node_graph,

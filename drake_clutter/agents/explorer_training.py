@@ -4,6 +4,8 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
+from pydantic import AfterValidator
+
 from drake_clutter.agents.backend_factory import make_backend_factory
 from drake_clutter.agents.explorer_network import ExplorerNetwork
 from drake_clutter.agents.rollouts import collect_rollouts, episode_metrics, make_policy_fn
@@ -11,6 +13,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.validation import InRange, config_class, renamed_fields
 
 CHECKPOINT_FILE = "explorer.safetensors"
@@ -32,7 +35,7 @@ class ExplorerTrainingConfig:
     scenes: str = "training/scenes/train_sg_star.json"
     catalog: str = ""
     seed: Annotated[int, InRange(0)] = 0
-    fidelity: str = "equilibrium"
+    fidelity: Annotated[str, AfterValidator(current_fidelity)] = "static"
     max_moves: Annotated[int, InRange(1)] = 20
     max_objects: Annotated[int, InRange(1, 64)] = 24
     evaluation_episodes: Annotated[int, InRange(1)] = 200

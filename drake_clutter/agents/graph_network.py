@@ -146,14 +146,18 @@ class RuleQNetwork(RenamedParameters):
     def make_batch(self, observation: Mapping[str, NDArray[Any]]) -> GraphBatch:
         """The network's input: arrays as in `ClutterGeneration`, with a first axis of graphs."""
         weight = self.q_head.weight
-        kinds, edges = observation["node_kind"], (observation["edge"], observation["edge_kind"])
+        kinds, edges = (
+            observation["node_kind"],
+            (observation["edge_links"], observation["edge_kind"]),
+        )
         graph, number, kind, *joined = pack_graphs(kinds, *edges, self._edge_kinds)
         feature = np.concatenate(
             [observation["node_flags"][graph, number], observation["position"][graph, number]],
             axis=1,
         )
         features = (
-            torch.from_numpy(array).to(weight) for array in (feature, observation["remaining"])
+            torch.from_numpy(array).to(weight)
+            for array in (feature, observation["remaining_nodes"])
         )
         links = BatchConnectivity(
             *(torch.from_numpy(array).to(weight.device) for array in (graph, *joined))

@@ -19,7 +19,12 @@ from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import Backend
-from drake_clutter.tasks.exploration_graph import EDGE_KINDS, NODE_FEATURES, build_exploration_graph
+from drake_clutter.tasks.exploration_graph import (
+    EDGE_KINDS,
+    NODE_FEATURES,
+    RENAMED_FEATURES,
+    build_exploration_graph,
+)
 
 TEACHER, STUDENT = "teacher", "student"
 
@@ -54,6 +59,9 @@ def load_explorer(
             f"{path.with_suffix('.json')}: network: lacks node_kinds or width; allowed is the file as it was written"
         )
     numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
+    for key in ("features", "edge_kinds"):
+        names = [RENAMED_FEATURES.get(name, name) for name in network.get(key, ())]
+        network = {**network, key: names}
     if network != explorer_metadata(numbers, network["width"]):
         raise InputError(
             f"{path}: was trained on other features; allowed is a checkpoint of this version"
@@ -117,7 +125,7 @@ class LearnedExplorer:
             self._numbers,
             belief.invalid_moves,
         )
-        allowed, names = graph["allowed"], tuple(o.name for o in shown)
+        allowed, names = graph["action_mask"], tuple(o.name for o in shown)
         chances: dict[str, float] = {}
         while allowed.any():
             moves, _, _, picks = sample_actions(self._network, collate_graphs([graph]), None)

@@ -5,7 +5,7 @@ grammar, the optimal soft policy then draws every derivation as the random gener
 a distribution of scenes, the better the likelier, and no state is worth more because more rules are feasible there.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from itertools import pairwise
@@ -25,6 +25,7 @@ from drake_clutter.learning.checkpoint import (
     restore_learner,
     save_tensors,
     tensors_with_prefix,
+    with_current_keys,
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationObservation
@@ -33,8 +34,27 @@ from drake_clutter.validation import InRange, NonNegative, config_class, renamed
 NUM_GRADIENT_SHARDS = 2
 """Of an update, that are worked on side by side; always so many, so that the number of threads changes no result."""
 
-NETWORK_INPUT_KEYS = ("node_kind", "node_flags", "position", "edge", "edge_kind", "remaining")
+NETWORK_INPUT_KEYS = (
+    "node_kind",
+    "node_flags",
+    "position",
+    "edge_links",
+    "edge_kind",
+    "remaining_nodes",
+)
 """What of an observation the network looks at; the masks follow from the kinds."""
+
+
+RENAMED_ARRAYS: Mapping[str, str] = {
+    "edge": "edge_links",
+    "remaining": "remaining_nodes",
+    "mask": "action_mask",
+    "chance": "behavior_prob",
+    "over": "terminated",
+}
+"""Current name of a replay buffer's array by its name in version 0.1."""
+RENAMED_STATE: Mapping[str, str] = {"remembered": "num_added", "score": "episodic_return"}
+"""Current key of a saved training state by its name in version 0.1."""
 
 
 @config_class
@@ -184,11 +204,11 @@ class ReplayBuffer:
 
         self.arrays = {name: room(observation[name]) for name in NETWORK_INPUT_KEYS}
         others = {
-            "mask": np.zeros(actions, bool),
+            "action_mask": np.zeros(actions, bool),
             "action": np.int64(0),
-            "chance": np.float32(0),
+            "behavior_prob": np.float32(0),
             "reward": np.float32(0),
-            "over": np.bool_(False),
+            "terminated": np.bool_(False),
         }
         self.arrays |= {name: room(np.asarray(like)) for name, like in others.items()}
         self.num_added = 0
@@ -335,8 +355,10 @@ class SoftQLearner:
             with torch.no_grad():
                 values = self.network(collate(self._observations)).cpu().numpy()
         actions = sample_softmax_actions(values, masks, self.config.temperature, self._rng)
-        step = collate(self._observations) | {"mask": masks, "action": actions}
-        step["chance"] = action_probabilities(values, masks, actions, self.config.temperature)
+        step = collate(self._observations) | {"action_mask": masks, "action": actions}
+        step["behavior_prob"] = action_probabilities(
+            values, masks, actions, self.config.temperature
+        )
         rewards, overs = np.zeros(len(actions), np.float32), np.zeros(len(actions), bool)
         for k, environment in enumerate(self._environments):
             observation, reward, over, _, info = environment.step(int(actions[k]))
@@ -347,7 +369,7 @@ class SoftQLearner:
                 self._scores[k] = 0.0
                 observation, info = environment.reset()
             self._observations[k], self._masks[k] = observation, info["action_mask"].astype(bool)
-        self._replay.add(**step, reward=rewards, over=overs)
+        self._replay.add(**step, reward=rewards, terminated=overs)
         updates_before, self.step = self._updates_due(), self.step + len(self._environments)
         self.losses = [
             loss
@@ -382,7 +404,7 @@ class SoftQLearner:
 
     def _loss(self, drawn: dict[str, NDArray[Any]]) -> tuple[float, tuple[Tensor, ...]]:
         """Summed over some segments, and its gradients."""
-        names = ("mask", "action", "chance", "reward", "over")
+        names = ("action_mask", "action", "behavior_prob", "reward", "terminated")
         mask, action, chance, reward, over = (
             torch.from_numpy(drawn[name]).to(self.device) for name in names
         )
@@ -421,12 +443,12 @@ class SoftQLearner:
         }
         state = {
             "step": self.step,
-            "remembered": self._replay.num_added,
+            "num_added": self._replay.num_added,
             "rng": self._rng.bit_generator.state,
             "environments": [
                 {
                     "rules": environment.partial.rules,
-                    "score": score,
+                    "episodic_return": score,
                     "rng": environment.np_random.bit_generator.state,
                 }
                 for environment, score in zip(self._environments, self._scores, strict=True)
@@ -437,15 +459,18 @@ class SoftQLearner:
     def load(self, path: Path) -> None:
         """Goes on where `save` was called, in a training of the same config and seed."""
         tensors, state = load_tensors(path)
+        state = with_current_keys(state, RENAMED_STATE)
+        arrays = with_current_keys(tensors_with_prefix(tensors, "replay"), RENAMED_ARRAYS)
         restore_learner(self.network, self._optimizer, tensors)
         self._target.load_state_dict(tensors_with_prefix(tensors, "target"))
-        for name, value in tensors_with_prefix(tensors, "replay").items():
+        for name, value in arrays.items():
             self._replay.arrays[name][: len(value)] = value.numpy()
-        self._replay.num_added, self.step = state["remembered"], state["step"]
+        self._replay.num_added, self.step = state["num_added"], state["step"]
         self._rng.bit_generator.state = state["rng"]
         for k, (environment, saved) in enumerate(
             zip(self._environments, state["environments"], strict=True)
         ):
+            saved = with_current_keys(saved, RENAMED_STATE)
             observation, info = environment.reset()
             for rule in saved["rules"]:
                 observation, _, _, _, info = environment.step(
@@ -453,7 +478,7 @@ class SoftQLearner:
                 )
             environment.np_random.bit_generator.state = saved["rng"]
             self._scores[k], self._observations[k], self._masks[k] = (
-                saved["score"],
+                saved["episodic_return"],
                 observation,
                 info["action_mask"].astype(bool),
             )

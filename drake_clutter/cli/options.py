@@ -10,7 +10,7 @@ import typer
 class Fidelity(Enum):
     """Physical fidelity at which moves are executed."""
 
-    FAST = "fast"
+    STATIC_OR_DRAKE = "static_or_drake"
     SETTLE = "settle"
     ARM = "arm"
 

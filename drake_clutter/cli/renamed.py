@@ -13,7 +13,7 @@ RENAMED_OPTIONS: Mapping[str, str] = {
     "--laid-out": "--initial-poses",
 }
 """Current option by its earlier spelling, for every command that has only the current one."""
-RENAMED_VALUES: Mapping[str, Mapping[str, str]] = {}
+RENAMED_VALUES: Mapping[str, Mapping[str, str]] = {"--fidelity": {"fast": "static_or_drake"}}
 """Current value by its earlier spelling, of each option."""
 
 

@@ -89,6 +89,16 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
         return {name: file.get_tensor(name) for name in names}, json.loads(file.metadata()["state"])
 
 
+def with_current_keys(mapping: Mapping[str, Any], renamed: Mapping[str, str]) -> dict[str, Any]:
+    """Return a mapping with the current names of its keys.
+
+    Args:
+        mapping: What was read from a file.
+        renamed: Current name of a key by its earlier name.
+    """
+    return {renamed.get(key, key): value for key, value in mapping.items()}
+
+
 def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Those that are called `PART.NAME`, by NAME."""
     return {

@@ -53,7 +53,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         scenes: SceneDataset | Path | str | None = None,
         *,
         privileged: bool = False,
-        fidelity: str | BackendFactory = "fast",
+        fidelity: str | BackendFactory = "static_or_drake",
         max_moves: int | None = None,
         max_objects: int = 24,
         config: ClutterConfig | None = None,
@@ -85,11 +85,13 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.node_kind_ids), (n,), np.int8),
-            "feature": box(-FEATURE_BOUND, FEATURE_BOUND, (n, len(NODE_FEATURES)), np.float32),
-            "edge": box(0, n - 1, (e, 2), np.int16),
+            "node_features": box(
+                -FEATURE_BOUND, FEATURE_BOUND, (n, len(NODE_FEATURES)), np.float32
+            ),
+            "edge_links": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(EDGE_KINDS), (e,), np.int8),
-            "glob": box(0, FEATURE_BOUND, (len(GLOBAL_FEATURES),), np.float32),
-            "allowed": box(0, 1, (n, n), np.int8),
+            "global_features": box(0, FEATURE_BOUND, (len(GLOBAL_FEATURES),), np.float32),
+            "action_mask": box(0, 1, (n, n), np.int8),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.MultiDiscrete([n, n])
@@ -148,7 +150,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
 
     def _noted(self, observation: ExplorationObservation) -> ExplorationObservation:
         """Keeps which moves it allows, for the next step."""
-        self._allowed = observation["allowed"].copy()
+        self._allowed = observation["action_mask"].copy()
         return observation
 
     @property
@@ -200,7 +202,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         observation, end = self._noted(self.observe()), self.task.termination
         if end is None and self._spent:
             end = TerminationReason.OUT_OF_MOVES
-        if end is None and not observation["allowed"].any():
+        if end is None and not observation["action_mask"].any():
             end = TerminationReason.GAVE_UP
         over = end in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
         info: dict[str, Any] = {"step": step}

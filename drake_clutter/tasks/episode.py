@@ -1,6 +1,6 @@
 """One loop that plays an episode, over backends in which an explorer's moves are carried out."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Protocol
 
@@ -211,10 +211,19 @@ class SteppedBackend:
 BackendFactory = Callable[[Scene, np.random.Generator], SteppedBackend]
 """Starts an episode on a scene at rest; its executor and detector are kept from one to the next."""
 
-TELEPORT_FIDELITIES = ("equilibrium", "fast", "settle")
+TELEPORT_FIDELITIES = ("static", "static_or_drake", "settle")
 """How moves are judged when objects are teleported: by the static judge; by Drake where that cannot
-judge; by Drake. What `equilibrium` cannot judge cannot be done: for training, where asking Drake
+judge; by Drake. What `static` cannot judge cannot be done: for training, where asking Drake
 about one move in a hundred would take half the time."""
+
+
+RENAMED_FIDELITIES: Mapping[str, str] = {"equilibrium": "static", "fast": "static_or_drake"}
+"""Current name of a fidelity by its name in version 0.1."""
+
+
+def current_fidelity(name: str) -> str:
+    """Return the current name of a fidelity."""
+    return RENAMED_FIDELITIES.get(name, name)
 
 
 def make_teleport_backend_factory(
@@ -236,10 +245,10 @@ def make_teleport_backend_factory(
     """
     executor: MoveExecutor
     detector: Detector = RayDetector(config.cell.camera)
-    match fidelity:
-        case "equilibrium":
+    match current_fidelity(fidelity):
+        case "static":
             executor = StaticExecutor(config)
-        case "fast":
+        case "static_or_drake":
             executor = HybridExecutor(config, simulate_collapse=follow_falls)
         case "settle":
             executor = SettleExecutor(config, simulate_collapse=follow_falls)

@@ -19,16 +19,40 @@ NODE_FEATURES = (
     *("x", "y", "z"),
     *("qw", "qx", "qy", "qz"),
     *("extent_x", "extent_y", "extent_z"),
-    *("in_view", "seen_share", "covered", "unexplained_height", "times_picked"),
+    *("in_view", "visible_fraction", "is_covered", "support_gap", "pick_count"),
 )
 """Of a node: position and extents of its axis-aligned box in `_LENGTH`; quaternion; whether it is in view; of its box seen from
 above, the share that is seen; whether another object of the graph is above it; how far below it, in `_LENGTH`, the next object of
 the graph or the tray is, so that something else must carry it; how often it was picked, in `_MANY_PICKS`."""
-EDGE_KINDS = ("carries", "is_below", "is_beside", "is_apart_from", "tray_carries", "tray_is_below")
+EDGE_KINDS = (
+    "supports",
+    "is_below",
+    "is_beside",
+    "is_apart_from",
+    "tray_supports",
+    "tray_is_below",
+)
 """Of the edge from the lower to the upper of two objects, or from the tray to an object: the upper rests on the lower, is above
 it without touching it, is beside it, or is further away."""
-GLOBAL_FEATURES = ("moves_made",)
+GLOBAL_FEATURES = ("num_moves",)
 """Of the graph, in `_MANY_MOVES`."""
+
+RENAMED_ARRAYS: Mapping[str, str] = {
+    "feature": "node_features",
+    "edge": "edge_links",
+    "glob": "global_features",
+    "allowed": "action_mask",
+}
+"""Current name of an array of the observation by its name in version 0.1."""
+RENAMED_FEATURES: Mapping[str, str] = {
+    "seen_share": "visible_fraction",
+    "covered": "is_covered",
+    "unexplained_height": "support_gap",
+    "times_picked": "pick_count",
+    "carries": "supports",
+    "tray_carries": "tray_supports",
+}
+"""Current name of a node feature or kind of edges by its name in version 0.1."""
 
 FEATURE_BOUND = 10.0
 """That no number of the graph exceeds."""
@@ -138,9 +162,9 @@ def build_exploration_graph(
     glob = np.array([min(FEATURE_BOUND, len(history) / _MANY_MOVES)], np.float32)
     return {
         "node_kind": kind,
-        "feature": feature,
-        "edge": edge,
+        "node_features": feature,
+        "edge_links": edge,
         "edge_kind": edge_kind,
-        "glob": glob,
-        "allowed": allowed,
+        "global_features": glob,
+        "action_mask": allowed,
     }

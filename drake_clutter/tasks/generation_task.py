@@ -222,10 +222,10 @@ class PartialScene:
             "node_mask": (kind > 0).astype(np.int8),
             "node_flags": flags,
             "position": position,
-            "edge": ends,
+            "edge_links": ends,
             "edge_kind": edge_kind,
             "edge_mask": (edge_kind > 0).astype(np.int8),
-            "remaining": remaining,
+            "remaining_nodes": remaining,
         }
 
 
@@ -276,10 +276,10 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
             "node_mask": box(0, 1, (n,), np.int8),
             "node_flags": box(0, 1, (n, 4), np.int8),
             "position": box(-far, far, (n, 3), np.float32),
-            "edge": box(0, n - 1, (e, 2), np.int16),
+            "edge_links": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(self.vocabulary.edge_kinds), (e,), np.int8),
             "edge_mask": box(0, 1, (e,), np.int8),
-            "remaining": box(0, np.inf, (1,), np.float32),
+            "remaining_nodes": box(0, np.inf, (1,), np.float32),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(self.grammar.rules))
