@@ -36,9 +36,9 @@ def first_column(page: str, heading: str) -> list[str]:
 def test_episode_file() -> None:
     scene = scene_of(resting("cracker_box"), resting("sugar_box", xy=(0.2, 0.2)))
     rng = np.random.default_rng(0)
-    backend = make_teleport_backend_factory("equilibrium", ClutterConfig())(scene, rng)
+    backend = make_teleport_backend_factory("static", ClutterConfig())(scene, rng)
     task = run_episode(backend, random_explorer, max_moves=1, stop_when_all_found=False)
-    written = episode_to_dict(task, "random", "equilibrium", 0)
+    written = episode_to_dict(task, "random", "static", 0)
     added = ["cell", "timing", "scenes_tried"]
     page = "reference/episode_file.md"
     assert first_column(page, "## Fields") == [*written, *added]

@@ -19,22 +19,22 @@ GENERATION = {
     "node_flags": "belongs to a finished stack (`is_simulated` in the paper); next structure, "
     "insertion, orientation rule rewrites it",
     "position": "position of an object of a finished stack at the center of the tray [m]",
-    "edge": "parent and child of each edge",
+    "edge_links": "parent and child of each edge",
     "edge_kind": "orientation of each edge; 0 is padding",
     "edge_mask": "1 for an edge of the graph",
-    "remaining": "nodes still to be added, divided by 25",
+    "remaining_nodes": "nodes still to be added, divided by 25",
 }
 """Meaning of the parts of an observation of `ClutterGeneration-v0`."""
 EXPLORATION = {
     "node_kind": "class of each node; 0 is padding",
-    "feature": "node features, see below",
-    "edge": "lower and upper node of each pair",
+    "node_features": "node features, see below",
+    "edge_links": "lower and upper node of each pair",
     "edge_kind": "relation of each pair; 0 is padding: "
     + ", ".join(f"`{kind}`" for kind in EDGE_KINDS),
-    "glob": "global features: "
+    "global_features": "global features: "
     + ", ".join(f"`{name}`" for name in GLOBAL_FEATURES)
     + ", divided by 20",
-    "allowed": "action mask: row x may be placed on column y",
+    "action_mask": "row x may be placed on column y",
 }
 """Meaning of the parts of an observation of `ClutterExploration-v0`."""
 FEATURE_MEANINGS = {
@@ -42,10 +42,10 @@ FEATURE_MEANINGS = {
     "qw": "orientation as a unit quaternion",
     "extent_x": "extents of the axis-aligned bounding box, divided by 0.35 m",
     "in_view": "1 if the object is visible now",
-    "seen_share": "visible pixels relative to the top view of the bounding box",
-    "covered": "1 if another known object is above",
-    "unexplained_height": "gap to the next known object or the tray below, divided by 0.35 m",
-    "times_picked": "number of picks, divided by 3",
+    "visible_fraction": "visible pixels relative to the top view of the bounding box",
+    "is_covered": "1 if another known object is above",
+    "support_gap": "gap to the next known object or the tray below, divided by 0.35 m",
+    "pick_count": "number of picks, divided by 3",
 }
 """Meaning of node features; a feature without an entry continues the one before."""
 

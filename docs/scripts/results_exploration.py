@@ -180,7 +180,7 @@ def _static_and_drake() -> str:
         "Static stability model and Drake",
         "The same scenes, seeds and policies with two transition models: static stability "
         "judge (Drake only where it is inconclusive) / Drake settles every move.",
-        command="python training/evaluate_explorers.py runs/table2 --fidelity fast"
+        command="python training/evaluate_explorers.py runs/table2 --fidelity static_or_drake"
         " --out training/results/explorers_fast.json",
         seed=2000,
         results=["training/results/explorers_fast.json", "training/results/table2.json"],
