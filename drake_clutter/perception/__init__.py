@@ -1,1 +1,1 @@
-"""From images to detections."""
+"""Perception: rendered images, detectors and the training of the segmentation network."""

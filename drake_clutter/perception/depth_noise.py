@@ -1,4 +1,7 @@
-"""A stereo camera's depth, made of rendered depth: noise, steps, shadows and holes, as of a RealSense D435."""
+"""Depth noise of an active stereo camera such as the RealSense D435.
+
+Rendered depth gets disparity noise, disparity quantization, occlusion shadows and speckle holes.
+"""
 
 import math
 from dataclasses import dataclass
@@ -11,20 +14,25 @@ from drake_clutter.cell.camera import D435_FOCAL_LENGTH
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """What a stereo camera makes of depth.
+    """Parameters of a stereo camera's depth noise.
 
-    It measures disparity, f b / z in pixels, so an error of the disparity becomes one of the depth that grows with its square:
-    sigma_z = z^2 sigma_disparity / (f b) (Keselman et al. 2017, "Intel RealSense stereoscopic depth cameras", 3.4).
+    A stereo camera measures the disparity f b / z, so a disparity error causes a depth error that
+    grows with the square of the depth: sigma_z = z^2 sigma_disparity / (f b) (Keselman et al.
+    2017, "Intel RealSense stereoscopic depth cameras", Sec. 3.4).
 
     Attributes:
-        focal_length: px, f.
-        baseline: m, b; the right eye is to the right of the one whose image this is, so shadows fall to the left.
-        disparity_noise: px, standard deviation of a single match (Intel's guide to tuning the D400). Matching smooths it over
-            three pixels each way, which leaves 0.375 of it: 1.0 mm at 1 m, 2.5 mm at 1.6 m.
-        disparity_step: px, of which the disparity is a multiple.
-        shadow_edge_noise: px, standard deviation of how much of a shadow is filled from beside it.
-        mean_speckle_count: holes elsewhere in an image, on average.
-        max_speckle_radius: px, of the largest.
+        focal_length: f [px].
+        baseline: b [m]. The second imager is to the right of the one that the image belongs to, so
+            occlusion shadows fall to the left of objects.
+        disparity_noise: Standard deviation of the disparity of a single match [px] (Intel, "Best
+            known methods for tuning Intel RealSense D400 depth cameras for best performance").
+            Smoothing over three pixels in both directions leaves 0.375 of it, which is 1.0 mm at
+            a depth of 1 m and 2.5 mm at 1.6 m.
+        disparity_step: Disparities are multiples of this [px].
+        shadow_edge_noise: Standard deviation of the width of the part of a shadow that is filled
+            from its border [px].
+        mean_speckle_count: Mean number of speckle holes in an image.
+        max_speckle_radius: Largest radius of a speckle hole [px].
     """
 
     focal_length: float = D435_FOCAL_LENGTH
@@ -37,71 +45,79 @@ class DepthNoise:
 
 
 D435_DEPTH_NOISE = DepthNoise()
-_LEFT_BY_SMOOTHING = 0.375
-"""Of the standard deviation."""
+"""Noise of the RealSense D435."""
+SMOOTHED_STANDARD_DEVIATION = 0.375
+"""Standard deviation of unit white noise after `_smooth`: (1 + 4 + 1) / 16."""
 
 
 def add_depth_noise(
     depth: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise = D435_DEPTH_NOISE
 ) -> NDArray[np.float32]:
-    """Depth as a stereo camera measures it.
+    """Return a rendered depth image as a stereo camera would measure it.
 
     Args:
-        depth: (H, W) m, as rendered; inf or 0 where nothing is seen.
-        rng: of the noise.
-        noise: how much.
+        depth: Rendered depth [m]; inf or 0 where there is no surface. Shape (H, W).
+        rng: Random generator of the noise.
+        noise: Parameters of the noise.
 
     Returns:
-        (H, W) m, 0 where nothing is measured.
+        Measured depth [m]; 0 where there is no measurement. Shape (H, W).
     """
-    seen = np.isfinite(depth) & (depth > 0)
-    fb = np.float32(noise.focal_length * noise.baseline)
+    valid = np.isfinite(depth) & (depth > 0)
+    focal_length_times_baseline = np.float32(noise.focal_length * noise.baseline)
     disparity = np.zeros_like(depth)
-    np.divide(fb, depth, out=disparity, where=seen)
+    np.divide(focal_length_times_baseline, depth, out=disparity, where=valid)
     error = _smooth(rng.standard_normal((depth.shape[0] + 2, depth.shape[1] + 2), np.float32))
-    shadow = _hidden_from_right_eye(disparity) > np.abs(error) * (
-        noise.shadow_edge_noise / _LEFT_BY_SMOOTHING
-    )
+    filled_width = np.abs(error) * (noise.shadow_edge_noise / SMOOTHED_STANDARD_DEVIATION)
+    shadow = _distance_behind_occluder(disparity) > filled_width
     steps = np.round((disparity + noise.disparity_noise * error) / noise.disparity_step)
     measured = np.asarray(steps * noise.disparity_step, np.float32)
-    measured[~seen | shadow | (measured <= 0)] = np.inf
-    _punch_speckles(measured, rng, noise)
-    return np.asarray(fb / measured, np.float32)
+    measured[~valid | shadow | (measured <= 0)] = np.inf
+    _add_speckle_holes(measured, rng, noise)
+    return np.asarray(focal_length_times_baseline / measured, np.float32)
 
 
-def _smooth(white: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) of (H + 2, W + 2), with the weights 1, 2, 1 each way."""
-    down = white[:-2] + 2 * white[1:-1] + white[2:]
-    return np.asarray((down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:]) / 16)
+def _smooth(white_noise: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return an (H + 2, W + 2) image filtered by the weights 1, 2, 1 in both directions.
+
+    Returns:
+        The filtered image without its border. Shape (H, W).
+    """
+    vertical = white_noise[:-2] + 2 * white_noise[1:-1] + white_noise[2:]
+    return np.asarray((vertical[:, :-2] + 2 * vertical[:, 1:-1] + vertical[:, 2:]) / 16)
 
 
-def _hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) px, how far each point lies behind the left rim, in the right eye's image, of what is before it; < 0: it is seen."""
-    column = np.arange(disparity.shape[1], dtype=np.float32) - disparity
-    rim = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    hidden = np.full_like(disparity, -np.inf)
-    hidden[:, :-1] = column[:, :-1] - rim[:, 1:]
-    return hidden
+def _distance_behind_occluder(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how far each point is behind an occluding edge in the right image.
+
+    Args:
+        disparity: Disparity of each pixel of the left image [px]. Shape (H, W).
+
+    Returns:
+        Distance in the right image from the left edge of the nearest occluder to the point [px];
+        negative where the right imager sees the point. Shape (H, W).
+    """
+    right_column = np.arange(disparity.shape[1], dtype=np.float32) - disparity
+    occluding_edge = np.minimum.accumulate(right_column[:, ::-1], axis=1)[:, ::-1]
+    occlusion = np.full_like(disparity, -np.inf)
+    occlusion[:, :-1] = right_column[:, :-1] - occluding_edge[:, 1:]
+    return occlusion
 
 
-def _punch_speckles(
-    measured: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise
+def _add_speckle_holes(
+    disparity: NDArray[np.float32], rng: np.random.Generator, noise: DepthNoise
 ) -> None:
-    height, width = measured.shape
+    """Set the disparity to infinity, which is a depth of 0, in small random disks."""
+    height, width = disparity.shape
     reach = math.ceil(noise.max_speckle_radius)
     for _ in range(rng.poisson(noise.mean_speckle_count)):
-        row, column, radius = (
-            rng.integers(height),
-            rng.integers(width),
-            rng.uniform(0.5, noise.max_speckle_radius),
-        )
-        rows, columns = (
-            slice(max(0, row - reach), row + reach + 1),
-            slice(max(0, column - reach), column + reach + 1),
-        )
-        y, x = np.ogrid[
-            : min(rows.stop, height) - rows.start, : min(columns.stop, width) - columns.start
-        ]
-        measured[rows, columns][
-            np.hypot(y + rows.start - row, x + columns.start - column) <= radius
-        ] = np.inf
+        row = rng.integers(height)
+        column = rng.integers(width)
+        radius = rng.uniform(0.5, noise.max_speckle_radius)
+        rows = slice(max(0, row - reach), row + reach + 1)
+        columns = slice(max(0, column - reach), column + reach + 1)
+        num_rows = min(rows.stop, height) - rows.start
+        num_columns = min(columns.stop, width) - columns.start
+        y, x = np.ogrid[:num_rows, :num_columns]
+        distance = np.hypot(y + rows.start - row, x + columns.start - column)
+        disparity[rows, columns][distance <= radius] = np.inf

@@ -1,4 +1,4 @@
-"""The perfect detector: it reads the rendered labels."""
+"""Perfect detector that reads the labels of rendered images."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,12 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer
 
 @dataclass(frozen=True)
 class PerceptionResult:
-    """One look at a scene.
+    """Observation of a scene together with the ground truth about visibility.
 
     Attributes:
-        observation: what an explorer may know.
-        visible_fractions: the truth behind it, by name: of each object's unoccluded pixels, the share that is seen.
+        observation: Depth image and detections, which is all that an explorer may use.
+        visible_fractions: Visible fraction of each object's unoccluded pixels, by name; ground
+            truth for evaluation.
     """
 
     observation: Observation
@@ -22,21 +23,20 @@ class PerceptionResult:
 
 
 class LabelDetector:
-    """Detects every object that is in the frame and not hidden, with its true class and pose."""
+    """Detect every object that is in the image and not hidden, with its true class and pose."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = CameraRenderer(camera)
 
     def perceive(self, scene: Scene) -> PerceptionResult:
-        """What the camera shows of a scene."""
+        """Return the observation of a scene and the visible fraction of each object."""
         depth, label = self.camera.render_depth_and_label(scene)
-        shares = self.camera.visible_fractions(scene, label)
-        hidden = self.camera.hidden_objects(shares)
+        visible_fractions = self.camera.visible_fractions(scene, label)
+        hidden = self.camera.hidden_objects(visible_fractions)
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, o in enumerate(scene.objects)
             if o.name not in hidden and (mask := label == index).any()
         )
-        return PerceptionResult(
-            Observation(depth, detections, self.camera.camera, scene.support), shares
-        )
+        observation = Observation(depth, detections, self.camera.camera, scene.support)
+        return PerceptionResult(observation, visible_fractions)

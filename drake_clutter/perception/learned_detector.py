@@ -1,4 +1,4 @@
-"""The detector that knows nothing but images: a network finds the objects, geometry fits their poses."""
+"""Detector that sees only images: a network segments the objects, geometry fits their poses."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -45,69 +45,103 @@ from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 MIN_SCORE = 0.3
-"""Of a fitted pose; what is worse is no detection."""
-CONFIDENT_SCORE, MAX_CLAIMED_FRACTION = 0.6, 0.7
-"""A pose with that score is sure; a segment of which that share lies in what sure poses explain is a piece of one."""
+"""Smallest score of a fitted pose that may become a detection."""
+CONFIDENT_SCORE = 0.6
+"""Score from which a pose claims the pixels that it explains."""
+MAX_CLAIMED_FRACTION = 0.7
+"""Segments with a larger fraction of claimed pixels are parts of fitted objects, and not fitted."""
 MAX_RIM_OVERHANG = 0.02
-"""m, by which what is recognised may reach past the rim; the arm does, and it is no object."""
+"""By how much a detection may extend beyond the rim [m]; the arm, which is no object, does more."""
 CONCURRENT_FITS = 2
-"""Segments that are fitted at the same time; always so many, so that the number of cores changes no result."""
+"""Number of segments that are fitted at a time; constant, because it influences the results."""
 FLOOR_DEPTH_TOLERANCE = 0.008
-"""m, of the floor; what is measured there is the floor: nothing that lies on it is so flat."""
+"""Largest depth difference at which a pixel is taken for the floor [m]; no object is so flat."""
 MAX_PENETRATION = 0.010
-"""m; what penetrates deeper is not there together."""
+"""Largest penetration of two detections [m]."""
 MIN_VISIBLE_FRACTION = 0.2
-"""Of the pixels that an object would cover alone, that must be seen of it."""
-CONFIDENT_VOTE_FRACTION, VOTE_RADIUS = 0.8, 0.03
-"""A detection is sure if such a share of its pixels, by their chances of its class, votes for its middle within so many m."""
+"""Smallest fraction of a detection's unoccluded pixels that must be consistent with its pose."""
+CONFIDENT_VOTE_FRACTION = 0.8
+"""Probability-weighted fraction of a confident detection's cells that vote for its center."""
+VOTE_RADIUS = 0.03
+"""Largest distance of a vote from the center that it is for [m]."""
 SPLIT_FREE_SPACE_RATIO = 0.1
-"""Of the pixels in which a pose is seen, that in which the camera sees past it, if two may be there instead."""
+"""Free-space violations per consistent pixel from which a pose may be that of two objects."""
 
 
 class _Candidate(NamedTuple):
+    """A fitted pose with its evidence.
+
+    Attributes:
+        object_class: Class of the object.
+        fitted: Pose and score.
+        evidence: Comparison of the pose with the depth image.
+    """
+
     object_class: ObjectClass
     fitted: FittedPose
     evidence: PoseEvidence
 
 
-def _may_be_two_objects(explains: PoseEvidence) -> bool:
-    """Whether the camera sees past so much of a pose that two smaller objects may lie side by side there."""
-    return explains.free_space_violations > SPLIT_FREE_SPACE_RATIO * int(
-        np.count_nonzero(explains.consistent)
-    )
+class _CellPredictions(NamedTuple):
+    """Output of the network for the (h, w) cells of its window.
+
+    Attributes:
+        class_map: Most probable class of each cell plus 1; 0: no object. Shape (h, w).
+        class_probabilities: Probability of each class. Shape (classes, h, w).
+        votes_T: Predicted position of the object's center [m]. Shape (h, w, 3).
+    """
+
+    class_map: NDArray[np.int64]
+    class_probabilities: NDArray[np.float32]
+    votes_T: NDArray[np.float32]
 
 
-def _is_confident(X_TO: Pose, chances: NDArray[np.float32], votes_T: NDArray[np.float32]) -> bool:
-    """Whether the network's answers, chances (n,) of the class and votes (n, 3) m for the middle, say so of a pose."""
-    here = np.linalg.norm(votes_T - X_TO.p, axis=1) < VOTE_RADIUS  # false where it is NaN
-    return bool((here * chances).sum() > CONFIDENT_VOTE_FRACTION * len(chances))
+def _may_be_two_objects(evidence: PoseEvidence) -> bool:
+    """Return whether two smaller objects side by side may explain the pixels of a pose better."""
+    num_consistent = int(np.count_nonzero(evidence.consistent))
+    return evidence.free_space_violations > SPLIT_FREE_SPACE_RATIO * num_consistent
+
+
+def _is_confident(
+    X_TO: Pose, probabilities: NDArray[np.float32], votes_T: NDArray[np.float32]
+) -> bool:
+    """Return whether the network's predictions confirm a detection.
+
+    Args:
+        X_TO: Pose of the detection.
+        probabilities: Probability of its class in each of its cells. Shape (n,).
+        votes_T: Predicted center in each of its cells [m]; may be NaN. Shape (n, 3).
+    """
+    is_near = np.linalg.norm(votes_T - X_TO.p, axis=1) < VOTE_RADIUS  # False for NaN.
+    return bool((is_near * probabilities).sum() > CONFIDENT_VOTE_FRACTION * len(probabilities))
 
 
 def _select_candidates(
-    candidates: Sequence[_Candidate], shape: tuple[int, int]
+    candidates: Sequence[_Candidate], image_shape: tuple[int, int]
 ) -> list[_Candidate]:
-    """Those that together explain an image best, and of which no two are in the same place."""
+    """Return the candidates that together explain an image best and do not penetrate each other."""
     objects = [SceneObject(str(k), c.object_class, c.fitted.X_TO) for k, c in enumerate(candidates)]
 
     @cache
-    def clash(a: int, b: int) -> bool:
+    def conflict(a: int, b: int) -> bool:
         return penetration_depth(objects[a], objects[b]) > MAX_PENETRATION
 
-    numbers = select_consistent_poses(
+    indices = select_consistent_poses(
         [c.evidence for c in candidates],
         [c.fitted.score for c in candidates],
-        shape,
+        image_shape,
         MIN_VISIBLE_FRACTION,
-        clash,
+        conflict,
     )
-    return [candidates[k] for k in numbers]
+    return [candidates[k] for k in indices]
 
 
 class LearnedDetector:
-    """Detects objects of some classes in depth, or in depth and colour.
+    """Detect objects in a depth image, or in depth and color.
 
-    The shipped networks learned from the default cell's camera: from above the tray's middle,
-    straight down. What another one shows them is not rectified; the poses are fitted to any.
+    A segmentation network finds the objects, and geometric methods fit their poses. The shipped
+    networks are trained for the default cell's camera, which looks straight down at the center of
+    the tray. Images of other cameras are not rectified for the network.
     """
 
     def __init__(
@@ -117,141 +151,175 @@ class LearnedDetector:
         camera: Camera,
         support: Support,
     ) -> None:
-        """With a trained network, for objects of these classes, of which it must know all."""
-        self._network, self._camera, self._support = network, camera, support
+        """Make a detector.
+
+        Args:
+            network: Trained network.
+            classes: Classes to detect, all of which the network must know.
+            camera: Camera of the images.
+            support: What the objects stand on.
+        """
+        self._network = network
+        self._camera = camera
+        self._support = support
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._classes, self._window = (
-            {c.name: c for c in classes},
-            ImageWindow.around_support(camera, support),
-        )
-        self._unknown = torch.tensor(
+        self._classes = {c.name: c for c in classes}
+        self._window = ImageWindow.around_support(camera, support)
+        self._is_excluded = torch.tensor(
             [False] + [name not in self._classes for name in self._network.classes]
         )
-        self._radii = [
+        self._vote_radii = [
             min(self._classes[n].size) / 2 if n in self._classes else 0.0
             for n in self._network.classes
         ]
-        self._fitter, self._workers = PoseFitter(camera), ThreadPoolExecutor(CONCURRENT_FITS)
+        self._fitter = PoseFitter(camera)
+        self._executor = ThreadPoolExecutor(CONCURRENT_FITS)
 
     def detect(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> Observation:
-        """What two images show; names count the objects of each class, and mean nothing beyond this image.
-
-        The depth of what was recognised, and of the tray's floor, is that of the models: without noise.
+        """Detect the objects in a depth and color image.
 
         Args:
-            depth: (height, width) m along the camera's axis; 0 or infinite where nothing is measured.
-            color: (height, width, 3).
+            depth: Measured depth [m]; 0 or infinite where there is no measurement. Shape (H, W).
+            color: Color image. Shape (H, W, 3).
+
+        Returns:
+            The detections, whose names number the objects of each class in this image, and the
+            depth image. Depth of detected objects and of the floor is that of their models, without
+            noise, and holes are filled.
         """
         window, network = self._window, self._network
         p_TP = backproject_window(depth, self._camera, window)
-        given = make_network_input(
-            p_TP, color[window.rows, window.columns] if network.use_color else None
+        predictions = self._predict(p_TP, color)
+        segments = extract_segments(
+            predictions.class_map,
+            predictions.votes_T,
+            self._vote_radii,
+            network.classes,
+            window,
+            depth.shape,
+            MIN_SEGMENT_CELLS,
         )
-        with torch.inference_mode():
-            logits, votes = network(
-                torch.from_numpy(given)[None].to(memory_format=torch.channels_last)
-            )
-            logits = logits[0].masked_fill(self._unknown[:, None, None], -torch.inf)
-            kind, chances = logits.argmax(dim=0).numpy(), torch.softmax(logits, dim=0)[1:].numpy()
-        votes_T = downsample(p_TP) + np.moveaxis(votes[0].numpy(), 0, 2)
-        poses = self._fit_largest_first(
-            extract_segments(
-                kind, votes_T, self._radii, network.classes, window, depth.shape, MIN_SEGMENT_CELLS
-            ),
-            depth,
-        )
+        candidates = self._fit_largest_first(segments, depth)
         surface = label_surfaces(downsample(p_TP)[..., 2])
-        for again in (1, 2):
-            best = _select_candidates(poses, depth.shape)
+        for is_first_round in (True, False):
+            selected = _select_candidates(candidates, depth.shape)
             explained = [
-                downsample(one.evidence.mask(depth.shape)[window.rows, window.columns])
-                for one in best
+                downsample(c.evidence.mask(depth.shape)[window.rows, window.columns])
+                for c in selected
             ]
             masks = find_unexplained_surfaces(surface, explained)
-            if again == 1:
-                classes = [network.classes.index(one.object_class.name) for one in best]
-                masks += find_ambiguous_regions(surface, explained, classes, chances)
+            if is_first_round:
+                classes = [network.classes.index(c.object_class.name) for c in selected]
+                masks += find_ambiguous_regions(
+                    surface, explained, classes, predictions.class_probabilities
+                )
             else:
                 masks += [
                     mask
-                    for one, mask in zip(best, explained, strict=True)
-                    if _may_be_two_objects(one.evidence)
+                    for c, mask in zip(selected, explained, strict=True)
+                    if _may_be_two_objects(c.evidence)
                 ]
-                masks = [half for mask in masks for half in split_mask(mask, votes_T)]
-            poses += self._fit(self._propose_segments(masks, chances, votes_T, depth.shape), depth)
-        counted, found = Counter[str](), list[Detection]()
-        clean = fill_holes(np.where(depth > 0, depth, np.nan))
-        floor = self._camera.floor_depth
-        at_floor = np.abs(clean - floor) < FLOOR_DEPTH_TOLERANCE
-        clean[at_floor] = floor[at_floor]
-        for candidate in _select_candidates(poses, depth.shape):
-            name, e = candidate.object_class.name, candidate.evidence
-            mask = e.mask(depth.shape)
-            counted[name] += 1
-            clean[mask] = e.rendered_depth[e.consistent]
-            answers = downsample(mask[window.rows, window.columns])
-            sure = _is_confident(
-                candidate.fitted.X_TO,
-                chances[network.classes.index(name)][answers],
-                votes_T[answers],
+                masks = [half for mask in masks for half in split_mask(mask, predictions.votes_T)]
+            candidates += self._fit(self._propose_segments(masks, predictions, depth.shape), depth)
+        return self._observation(depth, _select_candidates(candidates, depth.shape), predictions)
+
+    def _predict(self, p_TP: NDArray[np.float32], color: NDArray[np.uint8]) -> _CellPredictions:
+        """Return the network's predictions.
+
+        Args:
+            p_TP: Measured points of the window [m]. Shape (side, side, 3).
+            color: Color image. Shape (H, W, 3).
+        """
+        window_color = color[self._window.rows, self._window.columns]
+        network_input = make_network_input(p_TP, window_color if self._network.use_color else None)
+        with torch.inference_mode():
+            logits, offsets = self._network(
+                torch.from_numpy(network_input)[None].to(memory_format=torch.channels_last)
             )
-            found.append(
+            logits = logits[0].masked_fill(self._is_excluded[:, None, None], -torch.inf)
+            class_map = logits.argmax(dim=0).numpy()
+            class_probabilities = torch.softmax(logits, dim=0)[1:].numpy()
+        votes_T = downsample(p_TP) + np.moveaxis(offsets[0].numpy(), 0, 2)
+        return _CellPredictions(class_map, class_probabilities, votes_T)
+
+    def _observation(
+        self,
+        depth: NDArray[np.float32],
+        selected: Sequence[_Candidate],
+        predictions: _CellPredictions,
+    ) -> Observation:
+        """Return the observation of the selected candidates."""
+        window = self._window
+        clean_depth = fill_holes(np.where(depth > 0, depth, np.nan))
+        floor_depth = self._camera.floor_depth
+        is_floor = np.abs(clean_depth - floor_depth) < FLOOR_DEPTH_TOLERANCE
+        clean_depth[is_floor] = floor_depth[is_floor]
+        num_detected = Counter[str]()
+        detections = list[Detection]()
+        for candidate in selected:
+            name = candidate.object_class.name
+            evidence = candidate.evidence
+            mask = evidence.mask(depth.shape)
+            num_detected[name] += 1
+            clean_depth[mask] = evidence.rendered_depth[evidence.consistent]
+            cells = downsample(mask[window.rows, window.columns])
+            is_confident = _is_confident(
+                candidate.fitted.X_TO,
+                predictions.class_probabilities[self._network.classes.index(name)][cells],
+                predictions.votes_T[cells],
+            )
+            detections.append(
                 Detection(
-                    f"{name}_{counted[name]}",
+                    f"{name}_{num_detected[name]}",
                     candidate.object_class,
                     candidate.fitted.X_TO,
                     mask,
-                    sure,
+                    is_confident,
                 )
             )
-        return Observation(clean, tuple(found), self._camera, self._support)
+        return Observation(clean_depth, tuple(detections), self._camera, self._support)
 
     def _propose_segments(
-        self,
-        masks: Sequence[Mask],
-        chances: NDArray[np.float32],
-        votes_T: NDArray[np.float32],
-        shape: tuple[int, int],
+        self, masks: Sequence[Mask], predictions: _CellPredictions, image_shape: tuple[int, int]
     ) -> list[Segment]:
-        """A segment for each class that may be in a mask of the network's answers."""
-        found = []
+        """Return a segment for each probable class of each mask of cells."""
+        segments = []
         for mask in masks:
-            votes = votes_T[mask]
+            votes = predictions.votes_T[mask]
             votes = votes[np.isfinite(votes).all(axis=1)]
             if len(votes) >= MIN_SEGMENT_CELLS:
-                whole, p_TO = (
-                    upsample(mask, self._window, shape),
-                    np.median(votes.astype(np.float64), axis=0),
-                )
-                found += [
-                    Segment(self._network.classes[k], whole, p_TO)
-                    for k in candidate_classes(mask, chances)
+                image_mask = upsample(mask, self._window, image_shape)
+                p_TO = np.median(votes.astype(np.float64), axis=0)
+                segments += [
+                    Segment(self._network.classes[k], image_mask, p_TO)
+                    for k in candidate_classes(mask, predictions.class_probabilities)
                 ]
-        return found
+        return segments
 
     def _fit_largest_first(
-        self, found: Sequence[Segment], depth: NDArray[np.float32]
+        self, segments: Sequence[Segment], depth: NDArray[np.float32]
     ) -> list[_Candidate]:
-        """Poses of segments, the largest first; what a sure pose has explained already is left out."""
-        fitted, claimed = list[_Candidate](), np.zeros(depth.shape, bool)
-        left = deque(sorted(found, key=lambda segment: -np.count_nonzero(segment.mask)))
-        while left:
-            next_ones = list[Segment]()
-            while left and len(next_ones) < CONCURRENT_FITS:
-                segment = left.popleft()
+        """Fit segments in the order of their size, without those that confident poses explain."""
+        candidates = list[_Candidate]()
+        claimed = np.zeros(depth.shape, bool)
+        remaining = deque(sorted(segments, key=lambda segment: -np.count_nonzero(segment.mask)))
+        while remaining:
+            batch = list[Segment]()
+            while remaining and len(batch) < CONCURRENT_FITS:
+                segment = remaining.popleft()
                 if claimed[segment.mask].mean() <= MAX_CLAIMED_FRACTION:
-                    next_ones.append(segment)
-            for candidate in self._fit(next_ones, depth):
-                fitted.append(candidate)
+                    batch.append(segment)
+            for candidate in self._fit(batch, depth):
+                candidates.append(candidate)
                 if candidate.fitted.score >= CONFIDENT_SCORE:
                     claimed |= candidate.evidence.mask(depth.shape)
-        return fitted
+        return candidates
 
-    def _fit(self, found: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
-        """The poses of segments that are good enough."""
-        classes = [self._classes[segment.name] for segment in found]
-        poses = self._workers.map(
-            lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), found, classes
+    def _fit(self, segments: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
+        """Fit the poses of segments, and return those with a sufficient score."""
+        classes = [self._classes[segment.name] for segment in segments]
+        poses = self._executor.map(
+            lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), segments, classes
         )
         return [
             _Candidate(
@@ -264,9 +332,7 @@ class LearnedDetector:
         ]
 
     def _is_on_support(self, object_class: ObjectClass, X_TO: Pose) -> bool:
-        """Whether an object can be there: within the rim, and not below the floor."""
+        """Return whether an object is within the rim and not below the floor."""
         corners = X_TO.apply(object_class.corners)
-        return bool(
-            (np.abs(corners[:, :2]) < self._support.half_size + MAX_RIM_OVERHANG).all()
-            and corners[:, 2].min() > -2 * MAX_FLOOR_PENETRATION
-        )
+        is_within_rim = np.abs(corners[:, :2]) < self._support.half_size + MAX_RIM_OVERHANG
+        return bool(is_within_rim.all() and corners[:, 2].min() > -2 * MAX_FLOOR_PENETRATION)

@@ -1,4 +1,4 @@
-"""Poses that an object may have, from the planes and edges among the points that a depth image shows of it."""
+"""Candidate poses of a box or cylinder from the planes and edges of its depth points."""
 
 import math
 
@@ -15,30 +15,50 @@ from drake_clutter.perception.pose_score import (
 )
 
 MIN_POINTS = 12
+"""Smallest number of points of a segment from which candidates are made."""
 COARSE_DEPTH_TOLERANCE = 0.015
-SCREENING_RAYS, MAX_SCREENED_CANDIDATES = 60, 10
-"""By so few rays all candidates are told apart first; so many of them by `COARSE_RAYS`."""
+"""Depth tolerance for ranking candidates, which are not refined yet [m]."""
+SCREENING_RAYS = 60
+"""Approximate number of rays by which all candidates are ranked first."""
+MAX_SCREENED_CANDIDATES = 10
+"""Number of the best candidates that are ranked again, by `COARSE_RAYS`."""
 PLANE_TOLERANCE = 0.004
+"""Largest distance of an inlier from its plane [m]."""
 RANSAC_ITERATIONS = 120
+"""Number of random planes that are compared."""
 MIN_SECOND_PLANE_FRACTION = 0.1
+"""Smallest fraction of the points on a second plane."""
 MAX_DEPTH_BELOW_FLOOR = 0.05
-"""m below the floor, where nothing is that was measured rightly."""
+"""Points farther below the tray's floor are measurement errors [m]."""
 HORIZONTAL_PLANE_TOLERANCE = math.radians(4.0)
+"""Planes with a smaller inclination count as horizontal [rad]."""
 EXTENT_TOLERANCES = (0.012, 0.048)
-"""m, by which points may reach past the face that they are said to lie on; the second where the first leaves nothing good."""
+"""By how much points may extend beyond the face that they lie on [m].
+
+The second value is used if no candidate is good with the first one.
+"""
 
 
 @njit(cache=True, nogil=True)
 def _backproject_pixel(camera, u, v, z):  # type: ignore[no-untyped-def]
-    """p_TP, m, of what is seen at a pixel at a depth, m; infinitely deep if nothing is measured."""
+    """Return the point p_TP of a pixel [m]; z = -inf if there is no measurement."""
     if not 0.05 < z < np.inf:
         return np.inf, np.inf, -np.inf
     return backproject(camera, u, v, z)
 
 
 @njit(cache=True, nogil=True)
-def sample_segment_points(view, most):  # type: ignore[no-untyped-def]
-    """The object's measured points (N, 3) m in T, at most so many, and those at its own edges, (M, 3)."""
+def sample_segment_points(view, max_points):  # type: ignore[no-untyped-def]
+    """Sample the measured points of a segment, and of its outline.
+
+    Args:
+        view: The `SegmentView`.
+        max_points: Approximate largest number of points.
+
+    Returns:
+        Points in the tray frame [m], shape (N, 3), and all points at edges of the object that are
+        not edges of an occluder [m], shape (M, 3).
+    """
     height, width = view.depth.shape
     camera = view.camera
     row, row_end, column, column_end = view.window
@@ -50,9 +70,9 @@ def sample_segment_points(view, most):  # type: ignore[no-untyped-def]
                 and _backproject_pixel(camera, u, v, view.depth[v, u])[2] > -MAX_DEPTH_BELOW_FLOOR
             ):
                 total += 1
-    every = max(1, (total + most - 1) // most)
-    points, edges = np.empty((total // every + 1, 3)), np.empty((total + 1, 3))
-    count, found, at_edge = 0, 0, 0
+    stride = max(1, (total + max_points - 1) // max_points)
+    points, edge_points = np.empty((total // stride + 1, 3)), np.empty((total + 1, 3))
+    count, num_points, num_edge_points = 0, 0, 0
     for v in range(row, row_end):
         for u in range(column, column_end):
             z = view.depth[v, u]
@@ -61,23 +81,36 @@ def sample_segment_points(view, most):  # type: ignore[no-untyped-def]
             point = _backproject_pixel(camera, u, v, z)
             if not point[2] > -MAX_DEPTH_BELOW_FLOOR:
                 continue
-            if count % every == 0:
-                points[found, 0], points[found, 1], points[found, 2] = point
-                found += 1
+            if count % stride == 0:
+                points[num_points, 0] = point[0]
+                points[num_points, 1] = point[1]
+                points[num_points, 2] = point[2]
+                num_points += 1
             count += 1
             for dv, du in ((0, 1), (1, 0), (0, -1), (-1, 0)):
                 j, i = v + dv, u + du
-                beside = 0 <= j < height and 0 <= i < width
-                if beside and not view.mask[j, i] and not view.depth[j, i] < z - DEPTH_TOLERANCE:
-                    edges[at_edge, 0], edges[at_edge, 1], edges[at_edge, 2] = point
-                    at_edge += 1
+                in_image = 0 <= j < height and 0 <= i < width
+                if in_image and not view.mask[j, i] and not view.depth[j, i] < z - DEPTH_TOLERANCE:
+                    edge_points[num_edge_points, 0] = point[0]
+                    edge_points[num_edge_points, 1] = point[1]
+                    edge_points[num_edge_points, 2] = point[2]
+                    num_edge_points += 1
                     break
-    return points[:found], edges[:at_edge]
+    return points[:num_points], edge_points[:num_edge_points]
 
 
 @njit(cache=True, nogil=True)
 def _ransac_plane(points):  # type: ignore[no-untyped-def]
-    """Normal (3,) and a point (3,) m of that plane through three of the points (N, 3) which holds the most of them."""
+    """Return the plane through three of the points that has the most inliers.
+
+    The random numbers are those of a linear congruential generator with a constant seed.
+
+    Args:
+        points: Points [m]. Shape (N, 3).
+
+    Returns:
+        Unit normal, shape (3,), and a point of the plane [m], shape (3,).
+    """
     count, state = len(points), 12345
     best, normal, point = 0, np.array((0.0, 0.0, 1.0)), points[0].copy()
     picks = np.empty(3, np.int64)
@@ -86,31 +119,19 @@ def _ransac_plane(points):  # type: ignore[no-untyped-def]
             state = (state * 1103515245 + 12345) % 2147483648
             picks[i] = (state >> 8) % count
         p, q, r = points[picks[0]], points[picks[1]], points[picks[2]]
-        ax, ay, az, bx, by, bz = (
-            q[0] - p[0],
-            q[1] - p[1],
-            q[2] - p[2],
-            r[0] - p[0],
-            r[1] - p[1],
-            r[2] - p[2],
-        )
+        ax, ay, az = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        bx, by, bz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
         x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         length = math.sqrt(x * x + y * y + z * z)
         if length < 1e-6:
             continue
         x, y, z = x / length, y / length, z / length
-        on = 0
+        num_inliers = 0
         for k in range(count):
-            on += (
-                abs(
-                    x * (points[k, 0] - p[0])
-                    + y * (points[k, 1] - p[1])
-                    + z * (points[k, 2] - p[2])
-                )
-                < PLANE_TOLERANCE
-            )
-        if on > best:
-            best = on
+            dx, dy, dz = points[k, 0] - p[0], points[k, 1] - p[1], points[k, 2] - p[2]
+            num_inliers += abs(x * dx + y * dy + z * dz) < PLANE_TOLERANCE
+        if num_inliers > best:
+            best = num_inliers
             normal[0], normal[1], normal[2] = x, y, z
             point[:] = p
     return normal, point
@@ -118,43 +139,69 @@ def _ransac_plane(points):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _plane_inliers(points, n, p):  # type: ignore[no-untyped-def]
-    """Which of the points (N, 3) are on a plane, how many, their mean (3,), and their scatter (3, 3) about it."""
-    member, mean, scatter = np.zeros(len(points), np.bool_), np.zeros(3), np.zeros((3, 3))
+    """Find the points on a plane.
+
+    Args:
+        points: Points [m]. Shape (N, 3).
+        n: Unit normal. Shape (3,).
+        p: A point of the plane [m]. Shape (3,).
+
+    Returns:
+        Whether each point is an inlier, shape (N,); the number of inliers; their mean [m], shape
+        (3,); and their scatter matrix about the mean [m^2], shape (3, 3).
+    """
+    is_inlier, mean, scatter = np.zeros(len(points), np.bool_), np.zeros(3), np.zeros((3, 3))
     total = 0
     for k in range(len(points)):
         q = points[k]
-        if (
-            abs((q[0] - p[0]) * n[0] + (q[1] - p[1]) * n[1] + (q[2] - p[2]) * n[2])
-            < PLANE_TOLERANCE
-        ):
-            member[k] = True
+        distance = (q[0] - p[0]) * n[0] + (q[1] - p[1]) * n[1] + (q[2] - p[2]) * n[2]
+        if abs(distance) < PLANE_TOLERANCE:
+            is_inlier[k] = True
             total += 1
             for i in range(3):
                 mean[i] += q[i]
     for i in range(3):
         mean[i] /= max(total, 1)
     for k in range(len(points)):
-        if member[k]:
+        if is_inlier[k]:
             for i in range(3):
                 for j in range(3):
                     scatter[i, j] += (points[k, i] - mean[i]) * (points[k, j] - mean[j])
-    return member, total, mean, scatter
+    return is_inlier, total, mean, scatter
 
 
 def _fit_plane(points: Floats, p_TC: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Normal (3,) towards the camera, a point (3,) m, and the points (N,) bool on the plane that holds the most of them."""
+    """Fit the plane with the most inliers.
+
+    Args:
+        points: Points [m]. Shape (N, 3).
+        p_TC: Position of the camera [m]. Shape (3,).
+
+    Returns:
+        Unit normal towards the camera, shape (3,); a point of the plane [m], shape (3,); and
+        whether each point is an inlier, shape (N,).
+    """
     n, p = _ransac_plane(points)
     for _ in range(2):
-        member, total, mean, scatter = _plane_inliers(points, n, p)
+        is_inlier, total, mean, scatter = _plane_inliers(points, n, p)
         if total < 3:
             break
         n, p = np.linalg.eigh(scatter)[1][:, 0].copy(), mean
-    return (n if n @ p_TC >= n @ p else -n), p, member
+    return (n if n @ p_TC >= n @ p else -n), p, is_inlier
 
 
 @njit(cache=True)
 def _trimmed_extent(points, p, axis):  # type: ignore[no-untyped-def]
-    """Least and greatest m along an axis from p, without the outermost two in a hundred."""
+    """Return the extent of points along an axis without the outermost 1 % on each side.
+
+    Args:
+        points: Points [m]. Shape (N, 3).
+        p: Origin of the axis [m]. Shape (3,).
+        axis: Unit vector. Shape (3,).
+
+    Returns:
+        Smallest and largest coordinate [m].
+    """
     along = np.empty(len(points))
     for k in range(len(points)):
         along[k] = (
@@ -163,13 +210,13 @@ def _trimmed_extent(points, p, axis):  # type: ignore[no-untyped-def]
             + (points[k, 2] - p[2]) * axis[2]
         )
     along.sort()
-    cut = len(points) // 100
-    return along[cut], along[len(points) - 1 - cut]
+    num_trimmed = len(points) // 100
+    return along[num_trimmed], along[len(points) - 1 - num_trimmed]
 
 
 @njit(cache=True, nogil=True)
 def _cross_product(a, b):  # type: ignore[no-untyped-def]
-    """The cross product of two vectors (3,): NumPy's own is slow for so few."""
+    """Return the cross product of two vectors; NumPy's own is slow for a single one."""
     return np.array(
         (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     )
@@ -177,7 +224,7 @@ def _cross_product(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _plane_axes(n):  # type: ignore[no-untyped-def]
-    """Two axes (3,) in the plane of a normal (3,), that make a right-handed frame with it."""
+    """Return two unit vectors that form a right-handed frame with a plane's normal."""
     x_axis = _cross_product(
         np.array((0.0, 1.0, 0.0)) if abs(n[1]) < 0.9 else np.array((1.0, 0.0, 0.0)), n
     )
@@ -187,7 +234,15 @@ def _plane_axes(n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _hough_edge_angle(x, y):  # type: ignore[no-untyped-def]
-    """The angle, rad within a quarter turn, at which points x, y (N,) m fall on the fewest lines (a Hough transform)."""
+    """Return the direction of a rectangle's edges by a Hough transform.
+
+    Args:
+        x: First coordinates of edge points in the plane [m]. Shape (N,).
+        y: Second coordinates of edge points in the plane [m]. Shape (N,).
+
+    Returns:
+        Angle in [0, pi/2) at which the points concentrate on the fewest lines [rad].
+    """
     best, best_angle = -1.0, 0.0
     for k in range(60):
         angle = k * (math.pi / 120)
@@ -204,7 +259,15 @@ def _hough_edge_angle(x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _min_area_rectangle_angle(x, y):  # type: ignore[no-untyped-def]
-    """The angle, rad within a quarter turn, of the smallest rectangle about points x, y (N,) m."""
+    """Return the direction of the smallest rectangle that contains points.
+
+    Args:
+        x: First coordinates of the points in the plane [m]. Shape (N,).
+        y: Second coordinates of the points in the plane [m]. Shape (N,).
+
+    Returns:
+        Angle in [0, pi/2) [rad].
+    """
     best, best_angle = np.inf, 0.0
     for k in range(45):
         angle = k * (math.pi / 90)
@@ -212,21 +275,29 @@ def _min_area_rectangle_angle(x, y):  # type: ignore[no-untyped-def]
         low, high, left, right = np.inf, -np.inf, np.inf, -np.inf
         for i in range(len(x)):
             along, across = c * x[i] + s * y[i], c * y[i] - s * x[i]
-            low, high, left, right = (
-                min(low, along),
-                max(high, along),
-                min(left, across),
-                max(right, across),
-            )
+            low, high = min(low, along), max(high, along)
+            left, right = min(left, across), max(right, across)
         if (high - low) * (right - left) < best:
             best, best_angle = (high - low) * (right - left), angle
     return best_angle
 
 
 @njit(cache=True)
-def _side_centers(low, high, size, guess, slack):  # type: ignore[no-untyped-def]
-    """Where the middle of a side may be, m (n,), of which the points reach from low to high; none if they reach too far."""
-    if high - low > size + slack:
+def _side_centers(low, high, size, guess, tolerance):  # type: ignore[no-untyped-def]
+    """Return where the center of an object's side may be along an axis.
+
+    Args:
+        low: Smallest coordinate of the side's points [m].
+        high: Largest coordinate of the side's points [m].
+        size: Length of the side [m].
+        guess: Rough coordinate of the center [m].
+        tolerance: By how much the points may extend beyond the side [m].
+
+    Returns:
+        Coordinates [m]: one if the whole side is visible; three if it is partly occluded (aligned
+        with either end, and closest to the guess); none if the points extend too far. Shape (n,).
+    """
+    if high - low > size + tolerance:
         return np.empty(0)
     if high - low > size - EXTENT_TOLERANCES[0] / 2:
         return np.array([(low + high) / 2])
@@ -236,10 +307,27 @@ def _side_centers(low, high, size, guess, slack):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _add_face_candidates(half, axes, points, p, n, sides, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
-    """Adds the poses with one of the axes along a plane's normal, its face on the plane's points, to R and p_TO; their number.
+def _add_face_candidates(  # type: ignore[no-untyped-def]
+    half, axes, points, p, n, sides, guess, tolerance, R, p_TO, count
+):
+    """Add the poses at which a face of the object lies on a plane.
 
-    `sides`: (k, 2, 3) directions in the plane that the face's sides may have, right-handed with the normal.
+    Args:
+        half: Half sizes of the object [m]. Shape (3,).
+        axes: Indices of the object's axes that may be along the normal.
+        points: Inliers of the plane [m]. Shape (N, 3).
+        p: A point of the plane [m]. Shape (3,).
+        n: Unit normal of the plane. Shape (3,).
+        sides: Directions that the face's sides may have, right-handed with the normal. Shape
+            (k, 2, 3).
+        guess: Rough center of the object [m]. Shape (3,).
+        tolerance: One of `EXTENT_TOLERANCES` [m].
+        R: Output: orientations of the candidates. Shape (n, 3, 3).
+        p_TO: Output: positions of the candidates [m]. Shape (n, 3).
+        count: Number of candidates already in the outputs.
+
+    Returns:
+        New number of candidates.
     """
     for k in range(len(sides)):
         first, second = sides[k, 0], sides[k, 1]
@@ -248,43 +336,56 @@ def _add_face_candidates(half, axes, points, p, n, sides, guess, slack, R, p_TO,
         for a in axes:
             for swapped in range(2):
                 b, c = ((a + 1) % 3, (a + 2) % 3) if swapped == 0 else ((a + 2) % 3, (a + 1) % 3)
-                off = guess - p
-                for u in _side_centers(low, high, 2 * half[b], (off * first).sum(), slack):
-                    for v in _side_centers(left, right, 2 * half[c], (off * second).sum(), slack):
+                offset = guess - p
+                for u in _side_centers(low, high, 2 * half[b], (offset * first).sum(), tolerance):
+                    for v in _side_centers(
+                        left, right, 2 * half[c], (offset * second).sum(), tolerance
+                    ):
                         if count == len(R):
                             return count
-                        R[count, :, a], R[count, :, b], R[count, :, c] = (
-                            n,
-                            first,
-                            second if swapped == 0 else -second,
-                        )
+                        R[count, :, a] = n
+                        R[count, :, b] = first
+                        R[count, :, c] = second if swapped == 0 else -second
                         p_TO[count] = p + u * first + v * second - half[a] * n
                         count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _add_lying_cylinder_candidates(half, points, axis, guess, slack, R, p_TO, count):  # type: ignore[no-untyped-def]
-    """Adds the poses of a cylinder whose side is seen, its axis as given (3,), to R and p_TO; returns their number."""
-    level = math.hypot(axis[0], axis[1])
-    if level < 0.2:
+def _add_lying_cylinder_candidates(  # type: ignore[no-untyped-def]
+    half, points, axis, guess, tolerance, R, p_TO, count
+):
+    """Add the poses of a cylinder whose curved side is visible.
+
+    Args:
+        half: Half sizes of the cylinder [m]. Shape (3,).
+        points: Points of the segment [m]. Shape (N, 3).
+        axis: Unit vector along the cylinder's axis. Shape (3,).
+        guess: Rough center of the cylinder [m]. Shape (3,).
+        tolerance: One of `EXTENT_TOLERANCES` [m].
+        R: Output: orientations of the candidates. Shape (n, 3, 3).
+        p_TO: Output: positions of the candidates [m]. Shape (n, 3).
+        count: Number of candidates already in the outputs.
+
+    Returns:
+        New number of candidates.
+    """
+    horizontal = math.hypot(axis[0], axis[1])
+    if horizontal < 0.2:
         return count
-    across = np.array([-axis[1] / level, axis[0] / level, 0.0])
+    across = np.array([-axis[1] / horizontal, axis[0] / horizontal, 0.0])
     up = _cross_product(axis, across)
     low, high = _trimmed_extent(points, guess, axis)
     left, right = _trimmed_extent(points, guess, across)
     top = _trimmed_extent(points, guess, up)[1]
-    along, to_the_side = (
-        _side_centers(low, high, 2 * half[2], 0.0, slack),
-        _side_centers(left, right, 2 * half[0], 0.0, slack)[-1:],
-    )
-    if slack > EXTENT_TOLERANCES[0]:  # a marker's mask may hold more of the tray than of it
-        along, to_the_side = (
-            along if len(along) else np.zeros(1),
-            to_the_side if len(to_the_side) else np.zeros(1),
-        )
-    for u in along:
-        for v in to_the_side:
+    axial_offsets = _side_centers(low, high, 2 * half[2], 0.0, tolerance)
+    lateral_offsets = _side_centers(left, right, 2 * half[0], 0.0, tolerance)[-1:]
+    if tolerance > EXTENT_TOLERANCES[0]:
+        # The mask of a thin cylinder may hold more points of the tray than of the cylinder.
+        axial_offsets = axial_offsets if len(axial_offsets) else np.zeros(1)
+        lateral_offsets = lateral_offsets if len(lateral_offsets) else np.zeros(1)
+    for u in axial_offsets:
+        for v in lateral_offsets:
             if count == len(R):
                 return count
             R[count, :, 2], R[count, :, 0], R[count, :, 1] = axis, across, up
@@ -295,7 +396,7 @@ def _add_lying_cylinder_candidates(half, points, axis, guess, slack, R, p_TO, co
 
 @njit(cache=True, nogil=True)
 def _evaluate_candidates(cylinder, half, R, p_TO, view, rays):  # type: ignore[no-untyped-def]
-    """(n,) values of poses."""
+    """Return the objective of each candidate. Shape (n,)."""
     value = np.empty(len(R))
     for k in range(len(R)):
         value[k] = pose_objective(cylinder, half, R[k], p_TO[k], view, rays, COARSE_DEPTH_TOLERANCE)
@@ -303,70 +404,72 @@ def _evaluate_candidates(cylinder, half, R, p_TO, view, rays):  # type: ignore[n
 
 
 def generate_pose_candidates(
-    cylinder: bool, half: Floats, points: Floats, edges: Floats, view: SegmentView, slack: float
+    cylinder: bool,
+    half: Floats,
+    points: Floats,
+    edge_points: Floats,
+    view: SegmentView,
+    tolerance: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """The most promising poses R (n, 3, 3), p (n, 3) m in the order of their values (n,), the best first.
+    """Return the most promising poses, best first.
 
-    Not compiled, but made of what is: as one piece that takes the compiler 40 s.
+    This function calls compiled ones but is not compiled itself, which would take 40 s.
 
     Args:
-        cylinder: or a box. half: (3,) m, half its size.
-        points, edges: see `spread_points`. view: where they are seen.
-        slack: one of `SLACKS`.
+        cylinder: Whether the object is a cylinder, not a box.
+        half: Half sizes of the object [m]. Shape (3,).
+        points: Points of the segment, see `sample_segment_points` [m]. Shape (N, 3).
+        edge_points: Points at the object's edges [m]. Shape (M, 3).
+        view: The segment in the image.
+        tolerance: One of `EXTENT_TOLERANCES` [m].
+
+    Returns:
+        Orientations R_TO, shape (n, 3, 3); positions p_TO [m], shape (n, 3); and values of the
+        objective, shape (n,).
     """
     R, p_TO, count = np.empty((160, 3, 3)), np.empty((160, 3)), 0
-    guess, given = view.p_TO_guess, (slack, R, p_TO)
+    guess = view.p_TO_guess
+    outputs = (tolerance, R, p_TO)
     p_TC = np.array(view.camera.p_TC)
-    n, p, member = _fit_plane(points, p_TC)
-    planes, rest = [(n, p, points[member])], points[~member]
+    n, p, is_inlier = _fit_plane(points, p_TC)
+    planes, rest = [(n, p, points[is_inlier])], points[~is_inlier]
     if len(rest) > max(MIN_POINTS, MIN_SECOND_PLANE_FRACTION * len(points)):
-        second_n, second_p, second_member = _fit_plane(rest, p_TC)
-        if abs(n @ second_n) < 0.2 and second_member.sum() > MIN_SECOND_PLANE_FRACTION * len(
-            points
-        ):
-            planes.append((second_n, second_p, rest[second_member]))
+        second_n, second_p, second_inlier = _fit_plane(rest, p_TC)
+        is_perpendicular = abs(n @ second_n) < 0.2
+        if is_perpendicular and second_inlier.sum() > MIN_SECOND_PLANE_FRACTION * len(points):
+            planes.append((second_n, second_p, rest[second_inlier]))
     normals = [
         np.array([0.0, 0.0, 1.0]) if n[2] > math.cos(HORIZONTAL_PLANE_TOLERANCE) else n
         for n, _, _ in planes
     ]
-    for n, (_, p, face) in zip(normals, planes, strict=True):
+    for n, (_, p, face_points) in zip(normals, planes, strict=True):
         x_axis, y_axis = _plane_axes(n)
         angles = [0.0]
         if not cylinder:
-            beside = edges[np.abs((edges - p) @ n) < 2 * PLANE_TOLERANCE]
-            angles = (
-                [_hough_edge_angle((beside - p) @ x_axis, (beside - p) @ y_axis)]
-                if len(beside) >= MIN_POINTS
-                else []
-            )
-            angles.append(_min_area_rectangle_angle((face - p) @ x_axis, (face - p) @ y_axis))
+            outline = edge_points[np.abs((edge_points - p) @ n) < 2 * PLANE_TOLERANCE]
+            angles = []
+            if len(outline) >= MIN_POINTS:
+                angles.append(_hough_edge_angle((outline - p) @ x_axis, (outline - p) @ y_axis))
+            face_x, face_y = (face_points - p) @ x_axis, (face_points - p) @ y_axis
+            angles.append(_min_area_rectangle_angle(face_x, face_y))
             angles += [
                 math.atan2(other @ y_axis, other @ x_axis) for other in normals if other is not n
             ]
         firsts = [math.cos(angle) * x_axis + math.sin(angle) * y_axis for angle in angles]
         sides = np.array([(first, _cross_product(n, first)) for first in firsts])
-        count = _add_face_candidates(
-            half,
-            np.array([2]) if cylinder else np.arange(3),
-            face,
-            p,
-            n,
-            sides,
-            guess,
-            *given,
-            count,
-        )
+        axes = np.array([2]) if cylinder else np.arange(3)
+        count = _add_face_candidates(half, axes, face_points, p, n, sides, guess, *outputs, count)
     if cylinder:
-        off, fewer = points - points.mean(axis=0), points[::2].copy()
-        main = np.linalg.eigh(off.T @ off)[1][:, 2].copy()
-        count = _add_lying_cylinder_candidates(half, fewer, main, guess, *given, count)
+        centered, fewer = points - points.mean(axis=0), points[::2].copy()
+        main = np.linalg.eigh(centered.T @ centered)[1][:, 2].copy()
+        count = _add_lying_cylinder_candidates(half, fewer, main, guess, *outputs, count)
         azimuth = math.atan2(main[1], main[0])
-        for tilt, parts in ((0.0, 12), (-0.5, 6), (0.5, 6)):
-            for a in azimuth + np.arange(parts) * (math.pi / parts):
+        for tilt, num_azimuths in ((0.0, 12), (-0.5, 6), (0.5, 6)):
+            for a in azimuth + np.arange(num_azimuths) * (math.pi / num_azimuths):
                 axis = np.array(
                     [math.cos(tilt) * math.cos(a), math.cos(tilt) * math.sin(a), math.sin(tilt)]
                 )
-                count = _add_lying_cylinder_candidates(half, fewer, axis, guess, *given, count)
+                count = _add_lying_cylinder_candidates(half, fewer, axis, guess, *outputs, count)
     rough = _evaluate_candidates(cylinder, half, R[:count], p_TO[:count], view, SCREENING_RAYS)
     best = np.argsort(-rough)[:MAX_SCREENED_CANDIDATES]
     value = _evaluate_candidates(cylinder, half, R[best], p_TO[best], view, COARSE_RAYS)

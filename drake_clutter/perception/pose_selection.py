@@ -1,7 +1,8 @@
-"""Which of many fitted poses are really there: those that together explain the image best.
+"""Selection of the pose hypotheses that together explain a depth image best.
 
-A segment that fell apart gives several poses of one object, and a wrong class may fit a part of a face as well as the right one
-fits all of it. Both explain what another pose explains better: poses are taken greedily, that with most pixels to itself first.
+One object may yield several hypotheses, because its segment was split, or because a wrong class
+fits a part of one of its faces. Such hypotheses explain pixels that a better hypothesis explains,
+too, so hypotheses are selected greedily by the number of pixels that they alone explain.
 """
 
 import math
@@ -24,28 +25,33 @@ from drake_clutter.perception.pose_score import (
 from drake_clutter.scenes.scene import Pose
 
 DEPTH_TOLERANCE = 0.008
-"""m along the optical axis, within which a pose is said to be seen."""
-_INCONCLUSIVE, _CONSISTENT, _FREE_SPACE = 0, 1, 2
+"""Largest difference of measured and rendered depth at which a pixel is consistent [m]."""
 MIN_UNCLAIMED_FRACTION = 0.5
-"""Of the pixels of a pose that agree, the share that no better pose has claimed; with fewer it is no object."""
+"""Smallest fraction of a pose's consistent pixels that no selected pose explains."""
 MAX_FREE_SPACE_FRACTION = 0.25
-"""Of the pixels that speak for or against a pose, the share that the camera may see past it."""
+"""Largest fraction of free-space violations among a pose's conclusive pixels."""
 MIN_UNCLAIMED_PIXELS = 25
-"""Pixels of its own."""
+"""Smallest number of a pose's consistent pixels that no selected pose explains."""
 OBJECT_COST = 200
-"""Pixels that another object must explain for more objects to be the better explanation of an image."""
+"""Number of pixels that one more object must explain to be worth selecting."""
+_INCONCLUSIVE = 0
+_CONSISTENT = 1
+_FREE_SPACE = 2
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What of the image a pose explains.
+    """Comparison of an object at a pose, rendered, with a measured depth image.
+
+    All images are of the smallest window that contains the object's bounding box.
 
     Attributes:
-        top, left: pixel where `consistent` begins.
-        consistent: (rows, columns) bool, where the depth is as it should be.
-        rendered_depth: (rows, columns) float32 m, where it is `consistent`, how far along the optical axis the pose says it is.
-        free_space_violations: pixels where the camera sees past it.
-        unoccluded_pixels: pixels that it would cover if nothing stood before it.
+        top: First row of the window.
+        left: First column of the window.
+        consistent: Whether the measured depth agrees with the pose. Shape (rows, columns).
+        rendered_depth: Depth of the object [m]; 0 where it is not. Shape (rows, columns).
+        free_space_violations: Number of pixels at which the camera sees through the object.
+        unoccluded_pixels: Number of pixels that the object covers if nothing occludes it.
     """
 
     top: int
@@ -57,66 +63,84 @@ class PoseEvidence:
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that `seen` is of."""
-        return slice(self.top, self.top + self.consistent.shape[0]), slice(
-            self.left, self.left + self.consistent.shape[1]
-        )
+        """Rows and columns of the window in the image."""
+        rows = slice(self.top, self.top + self.consistent.shape[0])
+        columns = slice(self.left, self.left + self.consistent.shape[1])
+        return rows, columns
 
     def mask(self, image_shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """Where in the whole image, of a shape, it is `seen`."""
-        found = np.zeros(image_shape, bool)
-        found[self.window] = self.consistent
-        return found
+        """Return the consistent pixels as a mask of the whole image."""
+        mask = np.zeros(image_shape, bool)
+        mask[self.window] = self.consistent
+        return mask
 
 
 @njit(cache=True, error_model="numpy")
-def _compare_with_depth(cylinder, half, R, p, depth, camera):  # type: ignore[no-untyped-def]
-    """What the pixels say of a pose.
+def _compare_with_depth(cylinder, half, R_TO, p_TO, depth, camera):  # type: ignore[no-untyped-def]
+    """Compare an object at a pose with a depth image.
+
+    Args:
+        cylinder: Whether the object is a cylinder, not a box.
+        half: Half sizes of the object [m]. Shape (3,).
+        R_TO: Orientation. Shape (3, 3).
+        p_TO: Position [m]. Shape (3,).
+        depth: Measured depth [m]. Shape (H, W), float32.
+        camera: The `Pinhole`.
 
     Returns:
-        First row and column of a rectangle that holds it; (rows, columns) int8 what its pixels say,
-        and float32 how far away the pose is there, m; how many pixels it covers.
+        First row and first column of a window that contains the object; the result of each of its
+        pixels, int8; the rendered depth of each of its pixels [m], float32; and the number of
+        pixels that the object covers.
     """
-    R, p = pose_to_camera(camera, R, p)
+    R, p = pose_to_camera(camera, R_TO, p_TO)
     top, bottom, left, right = image_bounds(half, R, p, depth.shape, camera)
-    said, far = (
-        np.zeros((bottom - top, right - left), np.int8),
-        np.zeros((bottom - top, right - left), np.float32),
-    )
-    e, h, alone = camera_position_in_object(R, p), (half[0], half[1], half[2]), 0
-    distances = np.empty(right - left)
+    result = np.zeros((bottom - top, right - left), np.int8)
+    rendered = np.zeros((bottom - top, right - left), np.float32)
+    origin = camera_position_in_object(R, p)
+    half_sizes = (half[0], half[1], half[2])
+    num_covered = 0
+    row = np.empty(right - left)
     for v in range(top, bottom):
         ray, step = ray_row(R, v, camera)
-        cast_ray_row(cylinder, h, e, ray, step, left - camera.u0, 1, distances)
+        cast_ray_row(cylinder, half_sizes, origin, ray, step, left - camera.u0, 1, row)
         for u in range(left, right):
-            away = distances[u - left]
-            if away == np.inf:
+            expected = row[u - left]
+            if expected == np.inf:
                 continue
-            alone += 1
-            far[v - top, u - left] = away
-            seen = depth[v, u]
-            if not 0.05 < seen < 50.0:
+            num_covered += 1
+            rendered[v - top, u - left] = expected
+            measured = depth[v, u]
+            if not 0.05 < measured < 50.0:
                 continue
-            if seen > away + DEPTH_TOLERANCE:
-                said[v - top, u - left] = _FREE_SPACE
-            elif seen > away - DEPTH_TOLERANCE:
-                said[v - top, u - left] = _CONSISTENT
-    return top, left, said, far, alone
+            if measured > expected + DEPTH_TOLERANCE:
+                result[v - top, u - left] = _FREE_SPACE
+            elif measured > expected - DEPTH_TOLERANCE:
+                result[v - top, u - left] = _CONSISTENT
+    return top, left, result, rendered, num_covered
 
 
 def evaluate_pose(
     object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera
 ) -> PoseEvidence:
-    """What of a depth image (height, width) m, 0 or infinite where nothing is measured, a pose explains."""
-    half, R, p = (
+    """Compare an object at a pose with a depth image.
+
+    Args:
+        object_class: A box or a cylinder.
+        X_TO: Pose of the object in the tray frame.
+        depth: Measured depth [m]; 0 or infinite where there is no measurement. Shape (H, W).
+        camera: Camera of the depth image.
+    """
+    top, left, result, rendered, num_covered = _compare_with_depth(
+        object_class.shape is Shape.CYLINDER,
         np.asarray(object_class.size) / 2,
         np.ascontiguousarray(X_TO.rotation),
         np.asarray(X_TO.p, float),
+        np.ascontiguousarray(depth, np.float32),
+        camera.pinhole,
     )
-    depth, cylinder = np.ascontiguousarray(depth, np.float32), object_class.shape is Shape.CYLINDER
-    top, left, said, away, alone = _compare_with_depth(cylinder, half, R, p, depth, camera.pinhole)
+    num_violations = int(np.count_nonzero(result == _FREE_SPACE))
     return PoseEvidence(
-        top, left, said == _CONSISTENT, away, int(np.count_nonzero(said == _FREE_SPACE)), int(alone)
+        top, left, result == _CONSISTENT, rendered, num_violations, int(num_covered)
     )
 
 
@@ -127,65 +151,85 @@ def select_consistent_poses(
     min_visible_fraction: float,
     conflict: Callable[[int, int], bool] = lambda a, b: False,
 ) -> list[int]:
-    """The numbers of those that are taken for objects, the surest first.
+    """Select the poses that explain the most pixels with the fewest objects.
 
-    Greedily, and again with each of those that were left out as the first; of all these, what explains most with fewest.
+    The greedy selection is repeated with each unselected pose as its first one, and the best
+    result counts.
 
     Args:
-        evidence: of poses.
-        scores: 0 to 1, how well each fits the segment that it was fitted to: a pixel of a pose that does counts for more.
-        image_shape: of the image.
-        min_visible_fraction: of the pixels that an object would cover alone, that must be seen.
-        conflict: whether two, by their numbers, cannot both be there.
+        evidence: Evidence for each pose.
+        scores: How well each pose fits its own segment, from 0 to 1; the weight of its pixels.
+        image_shape: Shape of the depth image.
+        min_visible_fraction: Smallest fraction of an object's unoccluded pixels that must be
+            consistent.
+        conflict: Whether the poses of two indices exclude each other.
+
+    Returns:
+        Indices of the selected poses in the order of their selection.
     """
     plausible = [k for k, e in enumerate(evidence) if _is_plausible(e, min_visible_fraction)]
-    found, most = _select_greedily(evidence, scores, image_shape, plausible, conflict, None)
-    for first in [k for k in plausible if k not in found]:
-        other, explained = _select_greedily(
+    selected, most = _select_greedily(evidence, scores, image_shape, plausible, conflict, None)
+    for first in [k for k in plausible if k not in selected]:
+        alternative, explained = _select_greedily(
             evidence, scores, image_shape, plausible, conflict, first
         )
         if explained > most:
-            found, most = other, explained
-    return found
+            selected, most = alternative, explained
+    return selected
 
 
 def _select_greedily(
-    explanations: Sequence[PoseEvidence],
+    evidence: Sequence[PoseEvidence],
     scores: Sequence[float],
-    shape: tuple[int, int],
-    left: Sequence[int],
-    clash: Callable[[int, int], bool],
+    image_shape: tuple[int, int],
+    plausible: Sequence[int],
+    conflict: Callable[[int, int], bool],
     first: int | None,
 ) -> tuple[list[int], int]:
-    """Of those that are left, one after the other; and what they explain: pixels, less those where the camera sees past them."""
-    claimed = np.zeros(shape, bool)
-    found, explained = list[int](), 0
-    # What a pose has to itself only becomes less: the first whose number is still right is the best.
-    own = dict.fromkeys(left, math.inf)
-    while own:
-        best = first if first in own else max(own, key=lambda k: (own[k], -k))
-        e = explanations[best]
-        mine = int(np.count_nonzero(e.consistent & ~claimed[e.window])) - e.free_space_violations
-        if mine < max(
-            MIN_UNCLAIMED_PIXELS, MIN_UNCLAIMED_FRACTION * np.count_nonzero(e.consistent)
-        ):
-            del own[best]
+    """Select poses one after the other.
+
+    Args:
+        evidence: See `select_consistent_poses`.
+        scores: See `select_consistent_poses`.
+        image_shape: See `select_consistent_poses`.
+        plausible: Indices of the poses to select from.
+        conflict: See `select_consistent_poses`.
+        first: Index of the pose that is selected first, or None for the best one.
+
+    Returns:
+        Indices of the selected poses, and the number of pixels that they explain less free-space
+        violations and the cost of each object.
+    """
+    claimed = np.zeros(image_shape, bool)
+    selected = list[int]()
+    explained = 0
+    # Upper bound of the score that each pose can still add. The number of unclaimed pixels only
+    # decreases, so a pose whose bound is exact and largest is the best one.
+    bounds = dict.fromkeys(plausible, math.inf)
+    while bounds:
+        best = first if first in bounds else max(bounds, key=lambda k: (bounds[k], -k))
+        e = evidence[best]
+        num_unclaimed = int(np.count_nonzero(e.consistent & ~claimed[e.window]))
+        gain = num_unclaimed - e.free_space_violations
+        min_gain = MIN_UNCLAIMED_FRACTION * np.count_nonzero(e.consistent)
+        if gain < max(MIN_UNCLAIMED_PIXELS, min_gain):
+            del bounds[best]
             continue
-        if best != first and scores[best] * mine < own[best]:
-            own[best] = scores[best] * mine
+        if best != first and scores[best] * gain < bounds[best]:
+            bounds[best] = scores[best] * gain
             continue
-        del own[best]
-        if any(clash(best, other) for other in found):
+        del bounds[best]
+        if any(conflict(best, other) for other in selected):
             continue
         claimed[e.window] |= e.consistent
-        found.append(best)
-        explained += mine - OBJECT_COST
-    return found, explained
+        selected.append(best)
+        explained += gain - OBJECT_COST
+    return selected, explained
 
 
 def _is_plausible(e: PoseEvidence, min_visible_fraction: float) -> bool:
-    consistent = int(np.count_nonzero(e.consistent))
-    violations = e.free_space_violations
-    return consistent >= max(
-        1.0, min_visible_fraction * e.unoccluded_pixels
-    ) and violations <= MAX_FREE_SPACE_FRACTION * (consistent + violations)
+    num_consistent = int(np.count_nonzero(e.consistent))
+    num_conclusive = num_consistent + e.free_space_violations
+    enough = max(1.0, min_visible_fraction * e.unoccluded_pixels)
+    is_visible = num_consistent >= enough
+    return is_visible and e.free_space_violations <= MAX_FREE_SPACE_FRACTION * num_conclusive

@@ -1,4 +1,4 @@
-"""The perfect detector without rendering: it casts the camera's rays at the true objects, which is what training needs."""
+"""Perfect detector that casts rays at the true objects instead of rendering, for training."""
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.perception.label_detector import PerceptionResult
@@ -7,12 +7,12 @@ from drake_clutter.stability.ray_caster import RayCaster
 
 
 class RayDetector:
-    """Detects what `LabelDetector` does (a `Detector`), of convex objects, without a renderer."""
+    """Return the detections of `LabelDetector` for convex objects without a renderer."""
 
     def __init__(self, camera: Camera) -> None:
         self._rays = RayCaster(camera)
 
     def perceive(self, scene: Scene) -> PerceptionResult:
-        """What the camera shows of a scene."""
-        observation, shares = self._rays.observe(scene)
-        return PerceptionResult(observation, shares)
+        """Return the observation of a scene and the visible fraction of each object."""
+        observation, visible_fractions = self._rays.observe(scene)
+        return PerceptionResult(observation, visible_fractions)

@@ -1,8 +1,10 @@
-"""A network that tells, from depth or from depth and colour, what stands where (SPEC section 4, "Sensing").
+"""Instance segmentation by a network that classifies pixels and votes for object centers.
 
-For every second pixel each way it says of which class the object there is, and where the middle of that object is. What votes
-for the same place is one object (as in Qi et al. 2019, "Deep Hough voting for 3D object detection in point clouds"): unlike the
-middles of masks in the image, the middles of two objects never coincide, also when one lies across the other.
+The network works on depth, or on depth and color. For every second pixel in both directions it
+predicts the class of the object and the position of the object's center. Votes for the same center
+belong to one object, as in Qi et al. 2019, "Deep Hough voting for 3D object detection in point
+clouds". In contrast to centers of masks in the image, the centers of two objects never coincide,
+even if one lies across the other.
 """
 
 import math
@@ -27,31 +29,36 @@ from drake_clutter.learning.checkpoint import load_checkpoint
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 CHECKPOINT_KIND = "detector"
-"""Kind of its checkpoints."""
+"""Value of `kind` in the metadata of checkpoints."""
 RENAMED_METADATA = {"looks_at_color": "use_color"}
 """Current keys of a checkpoint's metadata by earlier ones."""
 RENAMED_MODULES = {"into": "stem", "middle": "bottleneck", "narrow": "lateral"}
 """Current names of the network's modules by earlier ones."""
 OUTPUT_STRIDE = 2
-"""Pixels, each way, for one answer."""
+"""Image pixels per output cell of the network, in both directions."""
 WINDOW_MULTIPLE = 16
+"""The side of a window is a multiple of the network's total stride [px]."""
 MAX_SCENE_HEIGHT = 0.5
-"""m, that objects reach: at the tray's edge they must be in the window."""
+"""Height up to which everything above the support is in the window [m]."""
 CHANNELS = (24, 48, 96, 128)
-HEIGHT_UNIT, VOTE_UNIT = 0.25, 0.05
-"""m, in which the network is given heights, and answers with votes."""
+"""Number of channels at each resolution of the network."""
+HEIGHT_UNIT = 0.25
+"""Height of the network's input 1 [m]."""
+VOTE_UNIT = 0.05
+"""Vote of the network's output 1 [m]."""
 HAS_FAST_BFLOAT16 = bool(torch.cpu.get_capabilities().get("amx_bf16"))
-"""Whether the processor multiplies matrices of such numbers by itself: then the network takes a third of the time."""
+"""Whether the CPU multiplies bfloat16 matrices in hardware, which is three times as fast."""
 PIXEL_SIZE = 0.0025
-"""m, about, from pixel to pixel: for slopes."""
+"""Approximate distance of neighboring pixels on the tray, for slopes [m]."""
 
 
 @dataclass(frozen=True)
 class ImageWindow:
-    """The square part of the image that holds the tray.
+    """Square part of an image that contains the support.
 
     Attributes:
-        rows, columns: of the image.
+        rows: Rows of the image.
+        columns: Columns of the image.
     """
 
     rows: slice
@@ -59,33 +66,37 @@ class ImageWindow:
 
     @staticmethod
     def around_support(camera: Camera, support: Support) -> "ImageWindow":
-        """Of a camera that looks at a support."""
+        """Return the window of a camera that looks at a support."""
         size = np.array([camera.width, camera.height])
-        middle, wanted = camera.support_bounds(support, MAX_SCENE_HEIGHT) or (
+        center, required_side = camera.support_bounds(support, MAX_SCENE_HEIGHT) or (
             np.array(camera.principal_point),
             math.inf,
         )
         side = min(size) // WINDOW_MULTIPLE * WINDOW_MULTIPLE
-        if wanted < side:
-            side = WINDOW_MULTIPLE * math.ceil(wanted / WINDOW_MULTIPLE)
-        left, top = np.clip(
-            np.floor(middle + 1 - side / 2 + 1e-6).astype(int), 0, size - side
-        ).tolist()
+        if required_side < side:
+            side = WINDOW_MULTIPLE * math.ceil(required_side / WINDOW_MULTIPLE)
+        corner = np.floor(center + 1 - side / 2 + 1e-6).astype(int)
+        left, top = np.clip(corner, 0, size - side).tolist()
         return ImageWindow(slice(top, top + side), slice(left, left + side))
 
     @property
     def side(self) -> int:
-        """Pixels."""
+        """Length of a side [px]."""
         return int(self.rows.stop - self.rows.start)
 
 
 def backproject_window(
     depth: NDArray[np.float32], camera: Camera, window: ImageWindow
 ) -> NDArray[np.float32]:
-    """(side, side, 3) p_TP, m, of what the pixels of a window show; NaN where nothing is measured.
+    """Return the points of a window's pixels in the tray frame.
 
     Args:
-        depth: (height, width) m along the camera's axis; 0 or infinite where nothing is measured.
+        depth: Depth image [m]; 0 or infinite where there is no measurement. Shape (H, W).
+        camera: Camera of the image.
+        window: Part of the image.
+
+    Returns:
+        p_TP of each pixel [m]; NaN where there is no measurement. Shape (side, side, 3).
     """
     z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[window.rows, window.columns]
     row, column = np.mgrid[window.rows, window.columns].astype(np.float32)
@@ -93,23 +104,39 @@ def backproject_window(
 
 
 def downsample(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Of (side, side, ...) what belongs to the network's answers."""
+    """Return the pixels of a window at the network's cells.
+
+    Args:
+        array: Shape (side, side, ...).
+
+    Returns:
+        Shape (side / 2, side / 2, ...).
+    """
     return array[::OUTPUT_STRIDE, ::OUTPUT_STRIDE]
 
 
 def upsample(
     mask: NDArray[np.bool_], window: ImageWindow, image_shape: tuple[int, int]
 ) -> NDArray[np.bool_]:
-    """A mask of the network's answers as one of the image, of a shape."""
-    found = np.zeros(image_shape, bool)
-    found[window.rows, window.columns] = mask.repeat(OUTPUT_STRIDE, axis=0).repeat(
-        OUTPUT_STRIDE, axis=1
-    )
-    return found
+    """Return a mask of the network's cells as a mask of the image.
+
+    Args:
+        mask: Mask of cells. Shape (side / 2, side / 2).
+        window: Part of the image that the cells cover.
+        image_shape: Height and width of the image.
+    """
+    image_mask = np.zeros(image_shape, bool)
+    window_mask = mask.repeat(OUTPUT_STRIDE, axis=0).repeat(OUTPUT_STRIDE, axis=1)
+    image_mask[window.rows, window.columns] = window_mask
+    return image_mask
 
 
 def fill_holes(image: NDArray[np.floating]) -> NDArray[np.floating]:
-    """An image (height, width), where it is not finite the value of the nearest pixel that is."""
+    """Replace values that are not finite by that of the nearest finite pixel.
+
+    Args:
+        image: Shape (H, W).
+    """
     holes = ~np.isfinite(image)
     if not holes.any() or holes.all():
         return image
@@ -118,21 +145,26 @@ def fill_holes(image: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def make_network_input(
-    points_T: NDArray[np.floating], color: NDArray[np.number] | None
+    p_TP: NDArray[np.floating], color: NDArray[np.number] | None
 ) -> NDArray[np.float32]:
-    """(channels, side, side) what the network is given: heights, where they are known, slopes, and colour if it looks at that.
+    """Return the input channels of the network.
 
-    Slopes are given because a few millimetres, which tell a lid from a wall, are nothing beside a stack's height.
+    The channels are height, whether it was measured, two slopes, and optionally color. The slopes
+    make steps of a few millimeters visible, which are tiny compared to the height of a stack.
 
     Args:
-        points_T: see `points`.
-        color: (side, side, 3), of the window.
+        p_TP: Points of a window, see `backproject_window` [m]. Shape (side, side, 3).
+        color: Color of the window; None: without. Shape (side, side, 3).
+
+    Returns:
+        Shape (channels, side, side).
     """
-    height = points_T[..., 2]
-    known = np.isfinite(height)
+    height = p_TP[..., 2]
+    is_measured = np.isfinite(height)
     filled = np.clip(np.nan_to_num(fill_holes(height)), -0.1, 0.9)
     slopes = np.gradient(gaussian_filter(filled, 1.0))
-    channels = [filled / HEIGHT_UNIT, known, *(np.arctan(slope / PIXEL_SIZE) for slope in slopes)]
+    angles = [np.arctan(slope / PIXEL_SIZE) for slope in slopes]
+    channels = [filled / HEIGHT_UNIT, is_measured, *angles]
     if color is not None:
         channels += [color[..., k] / 127.5 - 1.0 for k in range(3)]
     return np.stack(channels).astype(np.float32)
@@ -150,21 +182,22 @@ def _conv_block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 class SegmentationNetwork(nn.Module):
-    """A U-Net (Ronneberger et al. 2015) whose halves are joined by addition.
+    """U-Net (Ronneberger et al. 2015) with additive skip connections.
 
     Attributes:
-        classes: names of what it knows.
-        use_color: whether it is given colour beside depth.
+        classes: Names of the classes that it distinguishes.
+        use_color: Whether its input has color channels.
     """
 
     def __init__(self, classes: Sequence[str], use_color: bool) -> None:
         super().__init__()
-        self.classes, self.use_color = tuple(classes), use_color
-        channels = OUTPUT_STRIDE**2 * (7 if use_color else 4)
-        self.stem = nn.Sequential(
-            nn.PixelUnshuffle(OUTPUT_STRIDE), _conv_block(channels, CHANNELS[0])
-        )
+        self.classes = tuple(classes)
+        self.use_color = use_color
+        in_channels = OUTPUT_STRIDE**2 * (7 if use_color else 4)
         steps = list(pairwise(CHANNELS))
+        self.stem = nn.Sequential(
+            nn.PixelUnshuffle(OUTPUT_STRIDE), _conv_block(in_channels, CHANNELS[0])
+        )
         self.down = nn.ModuleList(
             nn.Sequential(_conv_block(a, b, 2), _conv_block(b, b)) for a, b in steps
         )
@@ -174,60 +207,68 @@ class SegmentationNetwork(nn.Module):
         self.out = nn.Conv2d(CHANNELS[0], 1 + len(classes) + 3, 1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (B, 1 + classes, side / 2, side / 2), the first of no object, and votes (B, 3, ...), m, from the pixel's point.
+        """Return class logits and votes of each cell.
 
         Args:
-            image: (B, channels, side, side), see `network_input`.
+            image: Input channels, see `make_network_input`. Shape (B, channels, side, side).
+
+        Returns:
+            Logits, of no object and of each class, shape (B, 1 + classes, side / 2, side / 2), and
+            votes, the offsets of the object's center from the cell's point [m], shape
+            (B, 3, side / 2, side / 2).
         """
         with torch.autocast(
             image.device.type, torch.bfloat16, enabled=image.is_cuda or HAS_FAST_BFLOAT16
         ):
             x = self.stem(image)
-            kept = []
+            skipped = []
             for down in self.down:
-                kept.append(x)
+                skipped.append(x)
                 x = down(x)
             x = self.bottleneck(x)
             for lateral, up in zip(self.lateral, self.up, strict=True):
-                x = up(nn.functional.interpolate(lateral(x), scale_factor=2.0) + kept.pop())
-            found = self.out(x).float()
-        return found[:, :-3], found[:, -3:] * VOTE_UNIT
+                x = up(nn.functional.interpolate(lateral(x), scale_factor=2.0) + skipped.pop())
+            output = self.out(x).float()
+        return output[:, :-3], output[:, -3:] * VOTE_UNIT
 
     def warm_start(self, pretrained: "SegmentationNetwork") -> None:
-        """Takes over what another has learned: answers as it does of the classes that both know, whatever the colours are."""
-        first = "stem.1.0.weight"
-        kept = {
+        """Take over the weights of another network.
+
+        The outputs for classes that both networks have are those of the other network, whatever
+        the color is.
+        """
+        first_layer = "stem.1.0.weight"
+        shared = {
             name: value
             for name, value in pretrained.state_dict().items()
-            if not name.startswith((first, "out."))
+            if not name.startswith((first_layer, "out."))
         }
-        self.load_state_dict(kept, strict=False)
-        mine, theirs = (
-            self.get_parameter(first),
-            pretrained.get_parameter(first),
-        )  # channels of depth come first
-        both = min(mine.shape[1], theirs.shape[1])
-        rows, other_rows = self._output_rows(), pretrained._output_rows()
+        self.load_state_dict(shared, strict=False)
+        first = self.get_parameter(first_layer)
+        pretrained_first = pretrained.get_parameter(first_layer)
+        # The channels of depth come first.
+        num_shared_channels = min(first.shape[1], pretrained_first.shape[1])
+        rows, pretrained_rows = self._output_rows(), pretrained._output_rows()
         with torch.no_grad():
-            mine.zero_()
-            mine[:, :both] = theirs[:, :both]
-            for name in rows.keys() & other_rows.keys():
-                for own, others in zip(
+            first.zero_()
+            first[:, :num_shared_channels] = pretrained_first[:, :num_shared_channels]
+            for name in rows.keys() & pretrained_rows.keys():
+                for parameter, pretrained_parameter in zip(
                     self.out.parameters(), pretrained.out.parameters(), strict=True
                 ):
-                    own[rows[name]] = others[other_rows[name]]
+                    parameter[rows[name]] = pretrained_parameter[pretrained_rows[name]]
 
     def _output_rows(self) -> dict[str | int, int]:
-        """Which of the last layer's answers is about what: no object, each class, and the votes' x, y, z."""
+        """Return the output channel of no object (""), of each class and of each vote axis."""
         names: tuple[str | int, ...] = ("", *self.classes, 0, 1, 2)
         return {name: row for row, name in enumerate(names)}
 
     @staticmethod
     def load(path: Path) -> "SegmentationNetwork":
-        """From a checkpoint of training/train_detector.py, ready to be asked.
+        """Return the network of a checkpoint of `training/train_detector.py` in evaluation mode.
 
         Raises:
-            InputError: it cannot be read, or is none of a detector.
+            InputError: The file cannot be read or is not a detector's checkpoint.
         """
         checkpoint = load_checkpoint(path)
         metadata = {RENAMED_METADATA.get(key, key): v for key, v in checkpoint.metadata.items()}
@@ -243,68 +284,93 @@ class SegmentationNetwork(nn.Module):
 
 
 def class_weights(class_maps: Sequence[NDArray[np.int64]], num_classes: int) -> Tensor:
-    """(1 + classes,) of the cross entropy: one over the root of a class's share of the pixels, and one on the mean of pixels.
+    """Return the class weights of the cross entropy.
 
-    With equal weights nothing is learned for long but the tray, nine tenths of an image, and then the largest boxes.
+    A weight is inversely proportional to the square root of the class's share of the cells, and the
+    mean weight over all cells is 1. With equal weights the network would learn the tray first,
+    which covers nine tenths of an image, and small objects very late.
 
     Args:
-        class_maps: of images, see `loss`.
-        num_classes: how many there are, beside that of no object.
+        class_maps: Class maps of images, see `segmentation_loss`.
+        num_classes: Number of classes without that of no object.
+
+    Returns:
+        Shape (1 + num_classes,).
     """
-    shown = np.concatenate([kind[kind >= 0] for kind in class_maps])
-    share = np.maximum(np.bincount(shown, minlength=1 + num_classes) / max(1, len(shown)), 1e-4)
-    return torch.from_numpy(share**-0.5 / (share**0.5).sum()).float()
+    known = np.concatenate([class_map[class_map >= 0] for class_map in class_maps])
+    counts = np.bincount(known, minlength=1 + num_classes)
+    fractions = np.maximum(counts / max(1, len(known)), 1e-4)
+    return torch.from_numpy(fractions**-0.5 / (fractions**0.5).sum()).float()
 
 
 def segmentation_loss(
     logits: Tensor, votes: Tensor, class_map: Tensor, center_offsets: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Cross entropy of the classes, and the mean error of the votes, m.
+    """Return the cross entropy of the classes and the mean L1 error of the votes [m].
 
     Args:
-        logits, votes: see `SegmentationNetwork.forward`.
-        class_map: (B, h, w) 0 where there is no object, -1 where it is not known.
-        center_offsets: (B, 3, h, w) m, from the pixel's point to the object's middle; NaN where it is not known.
-        weights: (1 + classes,) of the classes.
+        logits: See `SegmentationNetwork.forward`.
+        votes: See `SegmentationNetwork.forward` [m].
+        class_map: True class of each cell plus 1; 0: no object, -1: unknown. Shape (B, h, w).
+        center_offsets: True offset of the object's center from the cell's point [m]; NaN: unknown.
+            Shape (B, 3, h, w).
+        weights: Class weights. Shape (1 + classes,).
     """
-    of_classes = nn.functional.cross_entropy(logits, class_map, weights, ignore_index=-1)
-    known = torch.isfinite(center_offsets).all(dim=1) & (class_map > 0)
-    error = (votes - torch.nan_to_num(center_offsets)).abs().sum(dim=1)[known]
-    return of_classes, error.mean() if len(error) else votes.sum() * 0
+    cross_entropy = nn.functional.cross_entropy(logits, class_map, weights, ignore_index=-1)
+    has_vote = torch.isfinite(center_offsets).all(dim=1) & (class_map > 0)
+    error = (votes - torch.nan_to_num(center_offsets)).abs().sum(dim=1)[has_vote]
+    return cross_entropy, error.mean() if len(error) else votes.sum() * 0
 
 
 @njit(cache=True)
-def _densest_vote(votes, free, cell):  # type: ignore[no-untyped-def]
-    """Of the votes that are free, or of every so many if they are many, that with most others near it; -1 if there is none."""
-    left = np.flatnonzero(free)
-    left = left[:: max(1, len(left) // 300)]
-    best, found = 0, -1
-    for n in range(len(left)):
-        i, count = left[n], 0
-        for j in left:
-            x, y, z = (
-                votes[i, 0] - votes[j, 0],
-                votes[i, 1] - votes[j, 1],
-                votes[i, 2] - votes[j, 2],
-            )
-            count += x * x + y * y + z * z < cell * cell
-        if count > best:
-            best, found = count, int(i)
-    return found
+def _densest_vote(votes, is_free, radius):  # type: ignore[no-untyped-def]
+    """Return the index of the free vote with the most free votes around it.
+
+    Of many free votes, only about 300 at regular intervals are considered.
+
+    Args:
+        votes: Votes [m]. Shape (n, 3).
+        is_free: Whether each vote is not assigned yet. Shape (n,).
+        radius: Radius of the neighborhood [m].
+
+    Returns:
+        The index; -1 if no vote is free.
+    """
+    free = np.flatnonzero(is_free)
+    free = free[:: max(1, len(free) // 300)]
+    most, densest = 0, -1
+    for n in range(len(free)):
+        i, count = free[n], 0
+        for j in free:
+            x = votes[i, 0] - votes[j, 0]
+            y = votes[i, 1] - votes[j, 1]
+            z = votes[i, 2] - votes[j, 2]
+            count += x * x + y * y + z * z < radius * radius
+        if count > most:
+            most, densest = count, int(i)
+    return densest
 
 
 @njit(cache=True)
 def cluster_votes(votes, radius, min_votes):  # type: ignore[no-untyped-def]
-    """(n,) for each of (n, 3) votes the number of the object that it is for; -1 for none.
+    """Assign votes to objects.
 
-    Again and again the place with most votes is taken, moved to their mean, and given all votes within `radius`, m, of it; one
-    with fewer than `min_votes` votes is no object.
+    The densest neighborhood becomes a cluster, which moves to the mean of its votes (mean shift)
+    and takes all votes within the radius. This is repeated for the remaining votes.
+
+    Args:
+        votes: Votes for the center of an object [m]. Shape (n, 3).
+        radius: Radius of a cluster [m].
+        min_votes: Smallest number of votes of an object.
+
+    Returns:
+        Number of each vote's object; negative: none. Shape (n,).
     """
     number = np.full(len(votes), -1)
-    free = np.ones(len(votes), np.bool_)
-    found = 0
+    is_free = np.ones(len(votes), np.bool_)
+    num_objects = 0
     while True:
-        first = _densest_vote(votes, free, radius)
+        first = _densest_vote(votes, is_free, radius)
         if first < 0:
             return number
         x, y, z = votes[first]
@@ -312,36 +378,34 @@ def cluster_votes(votes, radius, min_votes):  # type: ignore[no-untyped-def]
             total, sx, sy, sz = 0, 0.0, 0.0, 0.0
             for j in range(len(votes)):
                 a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
-                if free[j] and a * a + b * b + c * c < radius * radius:
-                    total, sx, sy, sz = (
-                        total + 1,
-                        sx + votes[j, 0],
-                        sy + votes[j, 1],
-                        sz + votes[j, 2],
-                    )
+                if is_free[j] and a * a + b * b + c * c < radius * radius:
+                    total += 1
+                    sx += votes[j, 0]
+                    sy += votes[j, 1]
+                    sz += votes[j, 2]
             if total > 0:
                 x, y, z = sx / total, sy / total, sz / total
         total = 0
         for j in range(len(votes)):
             a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
-            if free[j] and (j == first or a * a + b * b + c * c < radius * radius):
-                free[j] = False
-                number[j] = found
+            if is_free[j] and (j == first or a * a + b * b + c * c < radius * radius):
+                is_free[j] = False
+                number[j] = num_objects
                 total += 1
         if total < min_votes:
-            number[number == found] = -2  # no object: it is not asked again
+            number[number == num_objects] = -2  # These votes are not considered again.
         else:
-            found += 1
+            num_objects += 1
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Pixels that belong together.
+    """Pixels of one object.
 
     Attributes:
-        name: of the class.
-        mask: (height, width) bool.
-        p_TO: (3,) m, where the middle of the object is said to be.
+        name: Name of its class.
+        mask: Pixels of the object. Shape (H, W).
+        p_TO: Estimated position of the object's center [m]. Shape (3,).
     """
 
     name: str
@@ -358,28 +422,30 @@ def extract_segments(
     image_shape: tuple[int, int],
     min_votes: int,
 ) -> list[Segment]:
-    """Objects from the network's answers.
+    """Return the segments of objects in the network's output.
 
     Args:
-        class_map: (h, w) 0 for no object, else number of the class + 1.
-        votes_T: (h, w, 3) m, where the object's middle is; NaN where no depth is measured.
-        radii: m, by class, within which votes are for the same object. names: of the classes.
-        window: that was looked at. shape: of the image.
-        min_votes: votes for an object.
+        class_map: Class of each cell plus 1; 0: no object. Shape (h, w).
+        votes_T: Predicted position of the object's center [m]; NaN where no depth was measured.
+            Shape (h, w, 3).
+        radii: Radius of each class's clusters of votes [m].
+        names: Name of each class.
+        window: Part of the image that the cells cover.
+        image_shape: Height and width of the image.
+        min_votes: Smallest number of votes of an object.
     """
-    found = []
-    known = np.isfinite(votes_T).all(axis=2)
+    segments = []
+    is_measured = np.isfinite(votes_T).all(axis=2)
     for k, (name, radius) in enumerate(zip(names, radii, strict=True), start=1):
-        rows, columns = np.nonzero((class_map == k) & known)
+        rows, columns = np.nonzero((class_map == k) & is_measured)
         if len(rows) < min_votes:
             continue
         votes = votes_T[rows, columns].astype(np.float64)
         number = cluster_votes(votes, radius, min_votes)
-        for each in range(number.max() + 1):
-            mine = number == each
-            small = np.zeros(class_map.shape, bool)
-            small[rows[mine], columns[mine]] = True
-            found.append(
-                Segment(name, upsample(small, window, image_shape), np.median(votes[mine], axis=0))
-            )
-    return found
+        for cluster in range(number.max() + 1):
+            is_member = number == cluster
+            cells = np.zeros(class_map.shape, bool)
+            cells[rows[is_member], columns[is_member]] = True
+            p_TO = np.median(votes[is_member], axis=0)
+            segments.append(Segment(name, upsample(cells, window, image_shape), p_TO))
+    return segments

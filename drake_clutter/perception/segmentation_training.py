@@ -34,21 +34,25 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
 
 WARM_UP_FRACTION = 0.1
-"""Share of the steps in which the learning rate rises."""
+"""Fraction of the steps in which the learning rate rises."""
 MAX_IMAGES_COUNTED = 200
-"""Images, at most, whose pixels are counted for the weights of the classes."""
+"""Largest number of images from which the class weights are computed."""
+MAX_GRADIENT_NORM = 5.0
+"""Norm to which gradients are clipped."""
 
 
 @config_class
 @renamed_fields(batch="batch_size")
 class SegmentationConfig:
-    """How the network learns.
+    """Hyperparameters of the training.
 
     Attributes:
-        steps: batches in all. batch_size: images of each.
-        learning_rate: at its highest; it rises over the first tenth, and falls to nothing along a cosine.
-        weight_decay: see AdamW.
-        vote_weight: of a vote's error, per m, against the classes' cross entropy.
+        steps: Number of batches.
+        batch_size: Number of images in a batch.
+        learning_rate: Largest learning rate. It rises linearly over the first tenth of the steps,
+            then falls to 0 along a cosine.
+        weight_decay: Weight decay of AdamW.
+        vote_weight: Weight of the votes' error relative to the cross entropy [1/m].
     """
 
     steps: Annotated[int, InRange(1)] = 5000
@@ -59,7 +63,14 @@ class SegmentationConfig:
 
 
 class TrainingExample(NamedTuple):
-    """Arrays of one image, or tensors of a batch: what the network is given, and what it should answer, see `loss`."""
+    """Arrays of one image, or of a batch with a leading dimension B.
+
+    Attributes:
+        image: Input of the network, see `make_network_input`. Shape (channels, side, side).
+        class_map: True class of each cell plus 1; 0: no object. Shape (h, w).
+        center_offsets: True offset of the object's center from the cell's point [m]; NaN where
+            there is no object or no measurement. Shape (3, h, w).
+    """
 
     image: NDArray[np.float32]
     class_map: NDArray[np.int64]
@@ -74,51 +85,57 @@ def make_example(
     rng: np.random.Generator | None,
     use_color: bool,
 ) -> TrainingExample:
-    """What is learned from an image: with the depth camera's noise, turned by quarters and mirrored at random.
+    """Return the network's input and targets for an image.
+
+    Augmentations are depth noise, quarter turns, mirroring, and random light.
 
     Args:
-        image: as rendered.
-        classes: that the network knows.
-        camera, window: what is looked at.
-        rng: of the noise and the turns; None: neither.
-        use_color: whether colour is given.
+        image: Rendered image.
+        classes: Names of the network's classes.
+        camera: Camera of the image.
+        window: Part of the image that the network sees.
+        rng: Random generator of the augmentations; None: no augmentations.
+        use_color: Whether the input has color channels.
     """
     depth = image.depth if rng is None else add_depth_noise(image.depth, rng)
-    p_TP, color, label = (
-        backproject_window(depth, camera, window),
-        image.color[window.rows, window.columns],
-        image.label,
-    )
-    label, middle = (
-        label[window.rows, window.columns],
-        np.array([pose.translation for pose in image.X_TO]).reshape(-1, 3),
-    )
+    p_TP = backproject_window(depth, camera, window)
+    color = image.color[window.rows, window.columns]
+    label = image.label[window.rows, window.columns]
+    p_TO = np.array([pose.translation for pose in image.X_TO]).reshape(-1, 3)
     if rng is not None:
-        turns, step = int(rng.integers(4)), int(rng.choice([-1, 1]))
-        p_TP, label = np.rot90(p_TP, turns)[:, ::step], np.rot90(label, turns)[:, ::step]
-        R = np.diag([step, 1.0, 1.0]) @ np.linalg.matrix_power(
-            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], turns
-        )
-        p_TP, middle = (p_TP @ R.T).astype(np.float32), middle @ R.T
+        quarter_turns = int(rng.integers(4))
+        column_step = int(rng.choice([-1, 1]))
+        p_TP = np.rot90(p_TP, quarter_turns)[:, ::column_step]
+        label = np.rot90(label, quarter_turns)[:, ::column_step]
+        quarter_turn = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+        mirror = np.diag([column_step, 1.0, 1.0])
+        R = mirror @ np.linalg.matrix_power(quarter_turn, quarter_turns)
+        p_TP = (p_TP @ R.T).astype(np.float32)
+        p_TO = p_TO @ R.T
         light = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.4)
-        color = np.clip(np.rot90(color, turns)[:, ::step] * light, 0, 255).astype(np.uint8)
-    kind = np.array([0] + [classes.index(name) + 1 for name in image.classes])[
-        downsample(label) + 1
-    ]
-    to_middle = np.vstack([np.full(3, np.nan), middle])[downsample(label) + 1] - downsample(p_TP)
-    given = make_network_input(p_TP, color if use_color else None)
+        lit = np.rot90(color, quarter_turns)[:, ::column_step] * light
+        color = np.clip(lit, 0, 255).astype(np.uint8)
+    instance = downsample(label) + 1
+    class_map = np.array([0] + [classes.index(name) + 1 for name in image.classes])[instance]
+    center_offsets = np.vstack([np.full(3, np.nan), p_TO])[instance] - downsample(p_TP)
+    network_input = make_network_input(p_TP, color if use_color else None)
     return TrainingExample(
-        given,
-        np.ascontiguousarray(kind),
-        np.ascontiguousarray(np.moveaxis(to_middle, 2, 0), np.float32),
+        network_input,
+        np.ascontiguousarray(class_map),
+        np.ascontiguousarray(np.moveaxis(center_offsets, 2, 0), np.float32),
     )
 
 
 class SegmentationLearner:
-    """Network and optimiser of one training, batch by batch; what a step learns from depends on nothing but seed and step.
+    """Network and optimizer of a training.
+
+    What is learned in a step depends only on the seed and on the step, so an interrupted training
+    continues with the same results.
 
     Attributes:
-        step: batches so far. network: what learns. losses: of the latest step.
+        step: Number of batches so far.
+        network: The network that is trained.
+        losses: Losses of the latest batch.
     """
 
     def __init__(
@@ -132,84 +149,100 @@ class SegmentationLearner:
         seed: int,
         device: torch.device,
     ) -> None:
-        """Begins a training with `num_images` images, each of which `read_image` reads."""
-        self.step, self.losses = 0, dict[str, float]()
-        self._read, self._count, self._config, self._camera, self._seed = (
-            read_image,
-            num_images,
-            config,
-            camera,
-            seed,
-        )
-        self._window, self._device = ImageWindow.around_support(camera, support), device
+        """Start a training.
+
+        Args:
+            network: The network to train.
+            read_image: Returns the image of an index.
+            num_images: Number of images.
+            config: Hyperparameters.
+            camera: Camera of the images.
+            support: What the objects stand on.
+            seed: Seed of the batches and augmentations.
+            device: Device of the network.
+        """
+        self.step = 0
+        self.losses = dict[str, float]()
+        self._read_image = read_image
+        self._num_images = num_images
+        self._config = config
+        self._camera = camera
+        self._seed = seed
+        self._window = ImageWindow.around_support(camera, support)
+        self._device = device
         self.network = network.to(device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(
             network.parameters(), config.learning_rate, weight_decay=config.weight_decay
         )
-        counted = [
+        class_maps = [
             make_example(
                 read_image(k), network.classes, camera, self._window, None, False
             ).class_map
             for k in range(min(num_images, MAX_IMAGES_COUNTED))
         ]
-        self._weights = class_weights(counted, len(network.classes)).to(device)
-        self._readers = ThreadPoolExecutor(1)
-        self._ahead = {0: self._readers.submit(self._batch, 0)}
+        self._class_weights = class_weights(class_maps, len(network.classes)).to(device)
+        self._loader = ThreadPoolExecutor(1)
+        self._prefetched = {0: self._loader.submit(self._make_batch, 0)}
 
     @property
     def learning_rate(self) -> float:
-        """Of the present step."""
-        done = self.step / self._config.steps
-        share = (
-            done / WARM_UP_FRACTION
-            if done < WARM_UP_FRACTION
-            else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP_FRACTION) / (1 - WARM_UP_FRACTION))
-        )
-        return self._config.learning_rate * share
+        """Learning rate of the current step."""
+        progress = self.step / self._config.steps
+        if progress < WARM_UP_FRACTION:
+            factor = progress / WARM_UP_FRACTION
+        else:
+            phase = math.pi * (progress - WARM_UP_FRACTION) / (1 - WARM_UP_FRACTION)
+            factor = 0.5 + 0.5 * math.cos(phase)
+        return self._config.learning_rate * factor
 
-    def _batch(self, step: int) -> TrainingExample:
+    def _make_batch(self, step: int) -> TrainingExample:
         rng = item_rng(self._seed, step)
-        numbers = rng.integers(self._count, size=self._config.batch_size)
+        indices = rng.integers(self._num_images, size=self._config.batch_size)
         network = self.network
         examples = [
             make_example(
-                self._read(int(k)),
+                self._read_image(int(k)),
                 network.classes,
                 self._camera,
                 self._window,
                 rng,
                 network.use_color,
             )
-            for k in numbers
+            for k in indices
         ]
         return TrainingExample(*(np.stack(arrays) for arrays in zip(*examples, strict=True)))
 
     def train_iteration(self) -> None:
-        """One batch."""
-        given = self._ahead.pop(self.step, None)
-        batch = given.result() if given else self._batch(self.step)
-        self._ahead[self.step + 1] = self._readers.submit(self._batch, self.step + 1)
+        """Learn from one batch while a thread prepares the next one."""
+        prefetched = self._prefetched.pop(self.step, None)
+        batch = prefetched.result() if prefetched else self._make_batch(self.step)
+        next_step = self.step + 1
+        self._prefetched[next_step] = self._loader.submit(self._make_batch, next_step)
         self.network.train()
-        image, kind, to_middle = (torch.from_numpy(array).to(self._device) for array in batch)
+        image, class_map, center_offsets = (
+            torch.from_numpy(array).to(self._device) for array in batch
+        )
         logits, votes = self.network(image.to(memory_format=torch.channels_last))
-        of_classes, of_votes = segmentation_loss(logits, votes, kind, to_middle, self._weights)
-        total: Tensor = of_classes + self._config.vote_weight * of_votes
+        class_loss, vote_loss = segmentation_loss(
+            logits, votes, class_map, center_offsets, self._class_weights
+        )
+        loss: Tensor = class_loss + self._config.vote_weight * vote_loss
         for group in self._optimizer.param_groups:
             group["lr"] = self.learning_rate
         self._optimizer.zero_grad()
-        total.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT_NORM)
         self._optimizer.step()
         self.step += 1
-        self.losses = {"classes": of_classes.item(), "votes_mm": 1000 * of_votes.item()}
+        self.losses = {"classes": class_loss.item(), "votes_mm": 1000 * vote_loss.item()}
 
     def save(self, path: Path) -> None:
-        """Writes all that the training needs to go on as if it had never been interrupted."""
+        """Write the state from which `load` continues the training."""
         save_tensors(path, learner_tensors(self.network, self._optimizer), {"step": self.step})
 
     def load(self, path: Path) -> None:
-        """Goes on where `save` was called, in a training of the same config and seed."""
+        """Continue a training of the same config and seed where `save` was called."""
         tensors, state = load_tensors(path)
         restore_learner(self.network, self._optimizer, tensors)
         self.step = state["step"]
