@@ -1,1 +1,1 @@
-"""The closed loop as systems: perception, the exploring agent, planning, and the diagram that joins them to the station."""
+"""Closed-loop systems: perception, policy, planner, and the diagram that connects them."""

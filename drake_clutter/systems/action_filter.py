@@ -1,4 +1,4 @@
-"""Moves in view that are not worth trying, of an explorer that knows objects from images."""
+"""Filter of moves that are infeasible for a policy that knows objects from images only."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -14,19 +14,23 @@ from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.tasks.belief import Belief, legal_moves
 
 PickableFn = Callable[[Sequence[SceneObject]], Collection[str]]
-"""From K_t, the names of objects that carry nothing known, and that can be held."""
+"""Returns the names of objects that can be grasped and support no other known object.
+
+Args: the objects of a belief.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class InfeasibleMoveFilter:
-    """Finds the moves of what cannot be picked, and those without a free place (an `ActionFilter`).
+    """Find the moves whose object cannot be picked or has no free placement (an `ActionFilter`).
 
-    Also those of what may carry something that was not recognized, as long as others are left.
+    Moves of objects that may support something undetected are infeasible, too, unless there are no
+    other feasible moves.
 
     Attributes:
-        pickable: Says what can be picked.
-        empty_depth: Depth of the cell without objects [m]. Shape (height, width).
-        config: Of the task.
+        pickable: Returns the names of pickable objects.
+        empty_depth: Depth image of the cell without objects [m]. Shape (H, W).
+        config: Config of the exploration task.
     """
 
     pickable: PickableFn
@@ -34,14 +38,15 @@ class InfeasibleMoveFilter:
     config: ExplorationConfig
 
     def __call__(self, belief: Belief, observation: Observation) -> Sequence[Move]:
-        """See `ActionFilter`."""
-        moves, pickable = legal_moves(observation), self.pickable(belief.objects)
-        free = [
+        """Return the infeasible moves; see `ActionFilter`."""
+        moves = legal_moves(observation)
+        pickable = self.pickable(belief.objects)
+        possible = [
             move
             for move in moves
             if move.pick in pickable
             and find_free_placements(observation, move, self.config) is not None
         ]
         risky = objects_below_unidentified_points(belief.objects, observation, self.empty_depth)
-        worth_trying = {move for move in free if move.pick not in risky} or set(free)
-        return [move for move in moves if move not in worth_trying]
+        feasible = {move for move in possible if move.pick not in risky} or set(possible)
+        return [move for move in moves if move not in feasible]

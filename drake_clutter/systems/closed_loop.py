@@ -1,6 +1,7 @@
-"""Closed-loop exploration: station, camera, perception, policy, planner, executor in one Diagram.
+"""Closed-loop exploration as one Drake Diagram.
 
-Outcomes are evaluated outside the diagram, from the true poses.
+The diagram contains the station, camera, perception, policy, planner and executor. Outcomes are
+evaluated outside of it, from the true poses.
 """
 
 import time
@@ -43,20 +44,23 @@ from drake_clutter.tasks.belief import Belief, Policy
 from drake_clutter.tasks.exploration_task import MoveAttempt
 
 OBSERVATION_TO_PLAN_LATENCY = 1.15
-"""From an observation to the plan [s]: 0.15 for perception, 1 for planning."""
+"""Simulated time from an observation to its plan [s]: 0.15 for perception, 1 for planning."""
 GUARDED_PLANNER_CONFIG = PlannerConfig(max_guarded_descent=0.08, descent_start_offset=0.007)
-"""For objects known from images: of a box in a pile they show the top, and with a wrong class its
-height is wrong; what it is to stand on may be a little higher, too."""
+"""Planner config for poses from images, with a guarded descent before the release.
+
+Images show only the top of a box in a pile, so its height is wrong if its class is. The detected
+height of the support is inaccurate, too.
+"""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long an episode took.
+    """Duration of an episode.
 
     Attributes:
-        simulated: Simulated [s].
-        wall: On the computer [s].
-        planning: Of `wall`, for all plans [s].
+        simulated: Simulated time [s].
+        wall: Wall-clock time [s].
+        planning: Wall-clock time of all planning, part of `wall` [s].
     """
 
     simulated: float
@@ -65,14 +69,14 @@ class Timing:
 
 
 class ClosedLoop:
-    """One scene and everything that searches it (a `Backend`).
+    """Closed-loop simulation of the exploration of one scene (a `Backend`).
 
     Attributes:
-        scene: The true objects, as they were when the policy last looked.
-        perception: What a perfect detector sees of them.
-        simulation: Of the diagram.
-        policy_system: Chooses the moves.
-        planner_system: Plans them.
+        scene: True objects at the time of the policy's latest observation.
+        perception: Ground-truth perception of that scene.
+        simulation: Simulation of the diagram.
+        policy_system: System that chooses the moves.
+        planner_system: System that plans the moves.
     """
 
     def __init__(
@@ -87,35 +91,42 @@ class ClosedLoop:
         """Build the diagram around a scene at rest.
 
         Args:
-            scene: The objects.
-            perceive: The detector; None: the perfect one.
-            seed: Of all chances.
-            world: The config.
-            record_motion: Whether outcomes have motions.
+            scene: Objects at rest.
+            perceive: Detector; None: ground truth.
+            seed: Seed of all random numbers.
+            world: Config of the cell, the simulation and the task.
+            record_motion: Whether outcomes include the motion of the arm and the objects.
         """
-        self.scene, self._record, self._perceive = scene, record_motion, perceive
+        self.scene = scene
+        self._record_motion = record_motion
+        self._perceive = perceive
         world = replace(world, cell=world.cell.with_support(scene.support))
         self._world = world if perceive is None else with_min_release_height(world)
         self._detector = LabelDetector(world.cell.camera)
         self.perception = self._detector.perceive(scene)
-        ways = PlannerConfig() if perceive is None else GUARDED_PLANNER_CONFIG
-        self._planner, empty = PickPlacePlanner(world.cell, ways), render_empty_depth(world.cell)
+        planner_config = PlannerConfig() if perceive is None else GUARDED_PLANNER_CONFIG
+        self._planner = PickPlacePlanner(world.cell, planner_config)
+        empty_depth = render_empty_depth(world.cell)
         self.policy_system = PolicySystem(
             config=self.config,
             seed=seed,
             tracker=None if perceive is None else associate_detections,
-            action_filter=InfeasibleMoveFilter(self._pickable, empty, self.config),
+            action_filter=InfeasibleMoveFilter(self._pickable, empty_depth, self.config),
         )
         self.planner_system = PlannerSystem(
-            planner=self._planner, empty_depth=empty, latency=OBSERVATION_TO_PLAN_LATENCY
+            planner=self._planner,
+            empty_depth=empty_depth,
+            latency=OBSERVATION_TO_PLAN_LATENCY,
         )
         self.simulation = StationSimulation(
             world.cell, scene, visuals=True, add_systems=self._add_systems
         )
         self.simulation.diagram.set_name("closed_loop")
-        self._planning, self._start_time = 0.0, time.perf_counter()
+        self._planning_time = 0.0
+        self._start_time = time.perf_counter()
 
     def _pickable(self, known: Sequence[SceneObject]) -> set[str]:
+        """Return the names of objects that the arm can pick; see `PickableFn`."""
         return {o.name for o in known if self._planner.can_pick(o, known)}
 
     def _add_systems(
@@ -142,7 +153,7 @@ class ClosedLoop:
 
     @property
     def config(self) -> ExplorationConfig:
-        """The task's config."""
+        """Config of the task."""
         return self._world.exploration
 
     @property
@@ -157,56 +168,60 @@ class ClosedLoop:
 
     @property
     def belief(self) -> Belief:
-        """What the policy knows now."""
+        """Current belief of the policy."""
         return self._state.belief
 
     @property
     def timing(self) -> Timing:
-        """How long the episode has taken so far."""
+        """Duration of the episode so far."""
         wall = time.perf_counter() - self._start_time
-        return Timing(self.simulation.root.get_time(), wall, self._planning)
+        return Timing(self.simulation.root.get_time(), wall, self._planning_time)
 
     def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
-        """See `Backend.rollout`."""
+        """Run a policy, and yield each attempt after the following observation."""
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
-        motion, state = list[MotionSample](), self._state
+        motion = list[MotionSample]()
+        state = self._state
         while state.phase is not PolicyPhase.DONE:
             is_moving = self.simulation.is_executing
             self.simulation.step()
-            if self._record and is_moving:
+            if self._record_motion and is_moving:
                 motion.append(self.simulation.sample())
-            before, state = state, self._state
-            done = state.phase is PolicyPhase.DONE or state.request.number != before.request.number
-            if done and before.request.number:
-                yield self._attempt(before, tuple(motion))
+            previous, state = state, self._state
+            is_done = state.phase is PolicyPhase.DONE
+            has_observed = is_done or state.request.number != previous.request.number
+            if has_observed and previous.request.number:
+                yield self._attempt(previous, tuple(motion))
                 motion.clear()
 
     def _attempt(self, state: PolicyState, motion: tuple[MotionSample, ...]) -> MoveAttempt:
-        """Return how a move went, once the policy has looked again.
+        """Return the attempt that ended before the policy's latest observation.
 
         Args:
-            state: Of the policy, before it looked.
-            motion: Of the move.
+            state: State of the policy before that observation.
+            motion: Motion of the attempt.
         """
-        before, decision, plan = self.scene, state.decision, self._response.plan
+        before = self.scene
+        decision = state.decision
+        plan = self._response.plan
         assert decision is not None
         assert plan is not None
-        self._planning += plan.planning_time
+        self._planning_time += plan.planning_time
         if self._perceive is not None:
             observation = state.request.observation
             assert observation is not None
             known = state.request.objects
             decision = to_ground_truth_names(decision, known, observation, before.objects)
         if isinstance(plan, PlanningFailure):
-            no_spot = plan.reason is PlanningFailureReason.NO_FREE_SPOT
-            result = MoveResult.NO_FREE_PLACEMENT if no_spot else MoveResult.NOT_PLANNED
-            outcome = Outcome(result, before, detail="" if no_spot else str(plan))
+            is_full = plan.reason is PlanningFailureReason.NO_FREE_SPOT
+            result = MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED
+            outcome = Outcome(result, before, detail="" if is_full else str(plan))
             return MoveAttempt(decision, outcome, self.perception)
         picked, outcome = self._outcome(plan)
         assert decision.move is not None
         decision = replace(decision, move=replace(decision.move, pick=picked))
-        # The simulation goes on from where things are in it.
+        # The true poses of the simulation are the next move's initial ones.
         self.scene = self.simulation.scene
         self.perception = self._detector.perceive(self.scene)
         return MoveAttempt(
@@ -214,14 +229,17 @@ class ClosedLoop:
         )
 
     def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:
-        """Return the name of what was picked, and what the move has led to."""
-        before, after, grasp = self.scene, self.simulation.scene, self.simulation.gripper.status
-        # What hung on the cup may not be what the policy took it for.
+        """Return the name of the object that was picked, and the outcome of its move."""
+        before = self.scene
+        after = self.simulation.scene
+        grasp = self.simulation.gripper.status
+        # The object on the cup may not be the one that the policy intended to pick.
         picked = grasp.last_held or nearest_object(before.objects, plan.X_TO_pick).name
-        # Seen a little off, or as what its symmetry makes alike, it is put down as far off.
-        lowered = self.simulation.executor_state.lowered_distance
+        # The detected pose may differ from the true one by an error or by a symmetry, and the
+        # object is placed with the same difference.
+        lowered_distance = self.simulation.executor_state.lowered_distance
         X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
-        X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered))
+        X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered_distance))
         came_off = not grasp.has_held or grasp.lost_object
         outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))

@@ -1,4 +1,4 @@
-"""A backend without an arm whose observations come from rendered images."""
+"""Backend without an arm whose observations come from rendered images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,10 +27,10 @@ from drake_clutter.tasks.episode import SteppedBackend
 
 
 class ImageBackend(SteppedBackend):
-    """What a detector sees in rendered images is picked, appears at its place, and Drake settles.
+    """Detect objects in rendered images, teleport the picked one, and let Drake settle the scene.
 
-    The policy knows objects by names of its own. What is picked is the true object nearest to
-    where one was seen, and it lands as far off as it was seen.
+    Detections have names of their own. The object that is picked is the true one nearest to the
+    detection, and its placement has the detection's pose error.
     """
 
     def __init__(
@@ -41,16 +41,17 @@ class ImageBackend(SteppedBackend):
         seed: int,
         world: ClutterConfig,
     ) -> None:
-        """Start on a scene at rest, and observe it.
+        """Start an episode on a scene at rest, and observe the scene.
 
         Args:
-            scene: The objects, at rest.
-            perceive: The detector.
-            seed: Of all chances.
-            world: The config.
+            scene: Objects at rest.
+            perceive: Detector.
+            seed: Seed of all random numbers.
+            world: Config of the cell, the simulation and the task.
         """
         world = with_min_release_height(world)
-        self._perceive, self._seed = perceive, seed
+        self._perceive = perceive
+        self._seed = seed
         self._camera = CameraRenderer(world.cell.camera)
         empty_depth = self._camera.render(replace(scene, objects=())).depth
         super().__init__(
@@ -65,21 +66,21 @@ class ImageBackend(SteppedBackend):
 
     @property
     def policy_rng(self) -> np.random.Generator:
-        """See `SteppedBackend.policy_rng`."""
+        """Random generator of the next move; see `SteppedBackend.policy_rng`."""
         return item_rng(self._seed, len(self.belief.history) + 1)
 
     @property
     def world_rng(self) -> np.random.Generator:
-        """See `SteppedBackend.world_rng`."""
+        """Random generator of the next outcome; see `SteppedBackend.world_rng`."""
         return item_rng(self._seed, len(self.belief.history) + 1, 1)
 
     def observe(self) -> Observation:
-        """See `SteppedBackend.observe`."""
+        """Return the detections in a rendered image of the scene."""
         images = self._camera.render(self.scene)
         return self._perceive(images.depth, images.color, ())
 
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """See `SteppedBackend.execute`."""
+        """Carry out a command with the true object nearest to its pick pose."""
         picked = nearest_object(self.scene.objects, command.X_TO_pick)
         X_TO_place = transport_pose(command.X_TO_pick, command.X_TO_place, picked.X_TO)
         move = replace(command.move, pick=picked.name)
@@ -87,11 +88,11 @@ class ImageBackend(SteppedBackend):
         return replace(outcome, X_TO_released=command.X_TO_place)
 
     def observable_result(self, outcome: Outcome) -> MoveResult:
-        """Return that the object was placed: what became of it shows when it is seen again."""
+        """Return `PLACED`: the policy learns of the outcome from the next observation only."""
         return MoveResult.PLACED
 
     def to_ground_truth(self, decision: Decision) -> Decision:
-        """See `SteppedBackend.to_ground_truth`."""
+        """Return a decision in the names of the true objects."""
         return to_ground_truth_names(
             decision, self.belief.objects, self.observation, self.scene.objects
         )

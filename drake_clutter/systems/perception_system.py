@@ -1,4 +1,4 @@
-"""From rendered images to what an explorer may know."""
+"""Drake system that turns camera images into observations, and the detectors that it calls."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -25,24 +25,35 @@ from drake_clutter.station.messages import empty_observation
 PerceptionFn = Callable[
     [NDArray[np.float32], NDArray[np.uint8], Sequence[RigidTransform]], Observation
 ]
-"""From depth (height, width) m, colour (height, width, 3) and, for a perfect detector, the poses of all bodies, which a learned
-one leaves alone."""
+"""Returns the observation in a pair of images.
+
+Args: depth image [m], shape (H, W); color image, shape (H, W, 3); and the poses of all bodies,
+which only the ground-truth detector uses.
+"""
 DetectorFn = Callable[[NDArray[np.float32], NDArray[np.uint8]], Observation]
-"""Depth and colour alone, as `LearnedDetector.detect`."""
+"""Returns the observation in a pair of images, for example `LearnedDetector.detect`.
 
+Args: depth image [m], shape (H, W), and color image, shape (H, W, 3).
+"""
 
+ARM_DEPTH_DIFFERENCE = 0.01
+"""Pixels that are closer to the camera by more than this show the arm [m]."""
 MIN_RELEASE_HEIGHT = 0.003
-"""m; what is seen of a support is a millimetre or two off, and an arm that goes on down pushes stacks over."""
+"""Smallest release height for poses from images [m].
+
+The detected height of a support is wrong by one or two millimeters, and an arm that moves down too
+far pushes stacks over.
+"""
 
 
 def with_min_release_height(world: ClutterConfig) -> ClutterConfig:
-    """The world of an agent that knows its objects from images: it lets go a little higher."""
-    higher = max(world.exploration.release_height, MIN_RELEASE_HEIGHT)
-    return replace(world, exploration=replace(world.exploration, release_height=higher))
+    """Return a config whose release height is sufficient for poses from images."""
+    release_height = max(world.exploration.release_height, MIN_RELEASE_HEIGHT)
+    return replace(world, exploration=replace(world.exploration, release_height=release_height))
 
 
 class PerceptionSystem(LeafSystem):
-    """Detect what is in view, whenever the output is evaluated.
+    """Detect the objects in the camera's images when the output is evaluated.
 
     .. pydrake_system::
 
@@ -55,23 +66,24 @@ class PerceptionSystem(LeafSystem):
         - observation
 
     Input ports:
-        depth_image: `ImageDepth32F`.
+        depth_image: `ImageDepth32F` [m].
         color_image: `ImageRgba8U`.
-        body_poses: Of a plant.
+        body_poses: Poses of all bodies of the plant, list of `RigidTransform`.
 
     Output ports:
-        observation: `Observation`, computed once for a state of the inputs.
+        observation: `Observation`, abstract; cached until an input changes.
     """
 
     def __init__(self, *, perceive: PerceptionFn, camera: Camera) -> None:
         """Make a system.
 
         Args:
-            perceive: The detector.
-            camera: Whose images it gets.
+            perceive: Detector.
+            camera: Camera of the images.
         """
         super().__init__()
-        self._perceive, size = perceive, (camera.width, camera.height)
+        self._perceive = perceive
+        size = (camera.width, camera.height)
         self._depth = self.DeclareAbstractInputPort(
             "depth_image", AbstractValue.Make(ImageDepth32F(*size))
         )
@@ -89,23 +101,31 @@ class PerceptionSystem(LeafSystem):
     def AddToBuilder(
         builder: DiagramBuilder, *, perceive: PerceptionFn, camera: Camera
     ) -> "PerceptionSystem":
-        """Add a system to a diagram; arguments as of the constructor."""
-        made = PerceptionSystem(perceive=perceive, camera=camera)
-        system: PerceptionSystem = builder.AddNamedSystem("perception_system", made)
+        """Add a system to a diagram; see the constructor for the arguments."""
+        system = PerceptionSystem(perceive=perceive, camera=camera)
+        builder.AddNamedSystem("perception_system", system)
         return system
 
     def _calc_observation(self, context: Context, output: AbstractValue) -> None:
-        depth, color = (port.Eval(context).data for port in (self._depth, self._color))
-        depth, color = depth[..., 0].copy(), color[..., :3].copy()
+        depth = self._depth.Eval(context).data[..., 0].copy()
+        color = self._color.Eval(context).data[..., :3].copy()
         output.set_value(self._perceive(depth, color, self._poses.Eval(context)))
 
 
 class LearnedPerception:
-    """A detector in the loop that is given images as a depth camera takes them."""
+    """Learned detector that sees images with a depth camera's noise (a `PerceptionFn`)."""
 
     def __init__(self, detect: DetectorFn, *, noise: DepthNoise | None, seed: int) -> None:
-        """`noise`: what the rendered depth gets, by a seed."""
-        self._detect, self._noise, self._seed = detect, noise, seed
+        """Make a detector.
+
+        Args:
+            detect: Detector of objects in noisy images.
+            noise: Noise of the depth camera; None: no noise.
+            seed: Seed of the noise.
+        """
+        self._detect = detect
+        self._noise = noise
+        self._seed = seed
 
     def __call__(
         self,
@@ -113,21 +133,31 @@ class LearnedPerception:
         color: NDArray[np.uint8],
         body_poses: Sequence[RigidTransform],
     ) -> Observation:
-        """See `Perceive`; the same image gets the same noise."""
+        """Return the observation; the same image always gets the same noise."""
         if self._noise:
-            depth = add_depth_noise(
-                depth, item_rng(self._seed, zlib.crc32(depth.tobytes())), self._noise
-            )
+            rng = item_rng(self._seed, zlib.crc32(depth.tobytes()))
+            depth = add_depth_noise(depth, rng, self._noise)
         return self._detect(depth, color)
 
 
 class LabelPerception:
-    """The perfect detector in the loop: classes, poses and masks are the truth, depth is what the camera in the cell renders."""
+    """Ground-truth detector of classes, poses and masks (a `PerceptionFn`).
+
+    The depth image is that of the camera in the simulated cell. Pixels in which the arm occludes an
+    object are removed from its mask.
+    """
 
     def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
-        """For the objects of a scene."""
-        self._scene, self._detector = scene, LabelDetector(world.cell.camera)
-        self._numbers = {
+        """Make a detector.
+
+        Args:
+            scene: Scene whose objects are detected.
+            station: Station that simulates the scene.
+            world: Config with the cell.
+        """
+        self._scene = scene
+        self._detector = LabelDetector(world.cell.camera)
+        self._body_indices = {
             o.name: int(station.scene_plant.bodies[o.name].index()) for o in scene.objects
         }
 
@@ -137,13 +167,13 @@ class LabelPerception:
         color: NDArray[np.uint8],
         body_poses: Sequence[RigidTransform],
     ) -> Observation:
-        """See `Perceive`."""
+        """Return the observation of the objects at the poses of their bodies."""
         poses = {
-            name: pose_from_transform(body_poses[number]) for name, number in self._numbers.items()
+            name: pose_from_transform(body_poses[index])
+            for name, index in self._body_indices.items()
         }
-        told = self._detector.perceive(self._scene.with_poses(poses)).observation
-        unobstructed = depth > told.depth - 0.01  # the arm may be in the way
-        in_view = (replace(d, mask=d.mask & unobstructed) for d in told.detections)
-        return Observation(
-            depth, tuple(d for d in in_view if d.mask.any()), told.camera, told.support
-        )
+        without_arm = self._detector.perceive(self._scene.with_poses(poses)).observation
+        is_unobstructed = depth > without_arm.depth - ARM_DEPTH_DIFFERENCE
+        masked = (replace(d, mask=d.mask & is_unobstructed) for d in without_arm.detections)
+        detections = tuple(d for d in masked if d.mask.any())
+        return replace(without_arm, depth=depth, detections=detections)

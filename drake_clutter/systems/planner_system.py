@@ -1,4 +1,4 @@
-"""Planning in the loop: from a move that is asked for to a plan, or to why there is none."""
+"""Drake system that plans the moves which the policy requests."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,11 @@ from drake_clutter.scenes.occlusion import occluded_boxes
 from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
 
 REQUEST_POLL_PERIOD = 0.05
-"""Between two looks for a new request [s]."""
+"""Period at which the system checks for a new request [s]."""
 
 
 class PlannerSystem(LeafSystem):
-    """Plan one request after the other.
+    """Plan one requested move after the other.
 
     .. pydrake_system::
 
@@ -31,11 +31,11 @@ class PlannerSystem(LeafSystem):
         - plan
 
     Input ports:
-        request: `PlanRequest`.
+        request: `PlanRequest`, abstract.
 
     Output ports:
-        response: The latest `PlanResponse`.
-        plan: `PlannedMove`, of the latest response; with number 0 if that has no plan.
+        response: Latest `PlanResponse`, abstract.
+        plan: `PlannedMove` of the latest response, abstract; its number is 0 if there is no plan.
     """
 
     def __init__(
@@ -44,29 +44,33 @@ class PlannerSystem(LeafSystem):
         """Make a system.
 
         Args:
-            planner: Plans among objects, and clear of space that has not been seen.
-            empty_depth: Depth of the cell without objects [m]. Shape (height, width).
-            latency: From a request to its response [s], whatever the computer takes.
+            planner: Planner of pick-and-place moves.
+            empty_depth: Depth image of the cell without objects [m], from which occluded space
+                follows. Shape (H, W).
+            latency: Simulated time from a request to its response [s], independent of the
+                computation time.
         """
         super().__init__()
-        self._planner, self._empty_depth, self._latency = planner, empty_depth, latency
+        self._planner = planner
+        self._empty_depth = empty_depth
+        self._latency = latency
         self._request = self.DeclareAbstractInputPort("request", AbstractValue.Make(PlanRequest()))
         self._response = self.DeclareAbstractState(AbstractValue.Make(PlanResponse()))
-        # Number of the latest request, and when it came [s].
+        # Number of the latest request and its arrival time [s].
         self._received = self.DeclareDiscreteState([0.0, 0.0])
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             REQUEST_POLL_PERIOD, REQUEST_POLL_PERIOD / 2, self._update
         )
-        of = {self.all_state_ticket()}
+        state_only = {self.all_state_ticket()}
         self.DeclareAbstractOutputPort(
-            "response", lambda: AbstractValue.Make(PlanResponse()), self._calc_response, of
+            "response", lambda: AbstractValue.Make(PlanResponse()), self._calc_response, state_only
         )
         self.DeclareAbstractOutputPort(
-            "plan", lambda: AbstractValue.Make(PlannedMove()), self._calc_plan, of
+            "plan", lambda: AbstractValue.Make(PlannedMove()), self._calc_plan, state_only
         )
 
     def response(self, context: Context) -> PlanResponse:
-        """Return the latest response, from the system's context."""
+        """Return the latest response in the system's context."""
         response: PlanResponse = context.get_abstract_state(self._response).get_value()
         return response
 
@@ -74,11 +78,12 @@ class PlannerSystem(LeafSystem):
         request: PlanRequest = self._request.Eval(context)
         if request.number in (0, self.response(context).number):
             return EventStatus.DidNothing()
-        number, since = context.get_discrete_state(self._received).value()
+        number, arrival_time = context.get_discrete_state(self._received).value()
         if request.number != number:
-            since = context.get_time()
-            state.get_mutable_discrete_state(self._received).set_value([request.number, since])
-        if context.get_time() >= since + self._latency - 1e-9:
+            arrival_time = context.get_time()
+            received = state.get_mutable_discrete_state(self._received)
+            received.set_value([request.number, arrival_time])
+        if context.get_time() >= arrival_time + self._latency - 1e-9:
             response = PlanResponse(request.number, self._plan(request))
             state.get_mutable_abstract_state(int(self._response)).set_value(response)
         return EventStatus.Succeeded()
@@ -88,15 +93,16 @@ class PlannerSystem(LeafSystem):
         assert request.observation is not None
         if request.command is None:
             return PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, request.move.place)
-        unseen = occluded_boxes(request.objects, request.observation, self._empty_depth)
-        pick, X_TO_place = request.move.pick, request.command.X_TO_place
-        return self._planner.plan(request.objects, pick, X_TO_place, unseen)
+        occluded = occluded_boxes(request.objects, request.observation, self._empty_depth)
+        X_TO_place = request.command.X_TO_place
+        return self._planner.plan(request.objects, request.move.pick, X_TO_place, occluded)
 
     def _calc_response(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self.response(context))
 
     def _calc_plan(self, context: Context, output: AbstractValue) -> None:
-        response, found = self.response(context), PlannedMove()
+        response = self.response(context)
         if isinstance(response.plan, PickPlacePlan):
-            found = PlannedMove(response.number, response.plan)
-        output.set_value(found)
+            output.set_value(PlannedMove(response.number, response.plan))
+        else:
+            output.set_value(PlannedMove())

@@ -1,4 +1,4 @@
-"""The exploring agent in the loop: it looks, chooses a move, waits for its end, looks again."""
+"""Drake system that observes the scene, chooses a move, and waits until it is carried out."""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -23,27 +23,27 @@ from drake_clutter.tasks.belief import (
 )
 
 UPDATE_PERIOD = 0.05
-"""Between two looks at the responses [s]."""
+"""Period at which the state is updated [s]."""
 
 
 class PolicyPhase(Enum):
-    """What the agent is doing."""
+    """Phase of a `PolicySystem`."""
 
-    OBSERVING = "waits for things to come to rest, then looks"
-    WAITING = "waits for a plan, or for its end"
-    DONE = "has no move left"
+    OBSERVING = "waits for objects to come to rest, then observes the scene"
+    WAITING = "waits for a plan, or for its execution"
+    DONE = "has no further move"
 
 
 @dataclass(frozen=True)
 class PolicyState:
-    """What the agent is doing, and what it knows.
+    """State of a `PolicySystem`.
 
     Attributes:
-        phase: What it is doing.
-        observation_time: When it looks next [s].
-        belief: What it knows.
-        request: The latest.
-        decision: Of which the request's move is part.
+        phase: Current phase.
+        observation_time: Time of the next observation [s].
+        belief: Current belief.
+        request: Latest request.
+        decision: Decision from which the request follows.
     """
 
     phase: PolicyPhase = PolicyPhase.OBSERVING
@@ -53,12 +53,12 @@ class PolicyState:
     decision: Decision | None = None
 
     def __deepcopy__(self, memo: object) -> "PolicyState":
-        """Return itself: it never changes, and Drake copies abstract values at every update."""
+        """Return itself: it is immutable, and Drake copies abstract values at every update."""
         return self
 
 
 class PolicySystem(LeafSystem):
-    """Choose moves until none is left.
+    """Choose moves until the policy has no further one.
 
     .. pydrake_system::
 
@@ -72,17 +72,17 @@ class PolicySystem(LeafSystem):
         - state
 
     Input ports:
-        observation: `Observation`.
-        response: `PlanResponse`.
-        finished: Number of the plan that has ended, and how far below its planned pose the object
-            was let go [m]. Shape (2,).
+        observation: `Observation`, abstract; evaluated when the scene is observed.
+        response: `PlanResponse`, abstract.
+        finished: Number of the latest finished plan, and by how much the object was released below
+            its planned pose [m]. Shape (2,).
 
     Output ports:
-        request: The latest `PlanRequest`.
-        state: `PolicyState`.
+        request: Latest `PlanRequest`, abstract.
+        state: `PolicyState`, abstract.
 
     Attributes:
-        policy: Chooses the moves; set before a simulation.
+        policy: Policy that chooses the moves; set before the simulation.
     """
 
     def __init__(
@@ -95,19 +95,23 @@ class PolicySystem(LeafSystem):
         action_filter: ActionFilter | None = None,
         post_motion_wait: float = 0.5,
     ) -> None:
-        """Begin an episode.
+        """Make a system.
 
         Args:
-            config: Of the task.
-            seed: Of the policy's chances, and of those of the placement.
-            policy: Chooses the moves; None: it is set later.
-            tracker: Gives detections names that last; None: they have them.
-            action_filter: Adds to the invalid moves; None: every legal move may be tried.
-            post_motion_wait: For which it lets things come to rest before it looks [s].
+            config: Config of the task.
+            seed: Seed of the policy and of the placement.
+            policy: Policy that chooses the moves; None: the attribute is set later.
+            tracker: Associates detections with known objects; None: their names are persistent.
+            action_filter: Returns infeasible moves; None: every legal move is feasible.
+            post_motion_wait: Time for objects to come to rest after a move [s].
         """
         super().__init__()
-        self.policy, self._config, self._seed, self._rest = policy, config, seed, post_motion_wait
-        self._tracker, self._action_filter = tracker, action_filter
+        self.policy = policy
+        self._config = config
+        self._seed = seed
+        self._post_motion_wait = post_motion_wait
+        self._tracker = tracker
+        self._action_filter = action_filter
         self._observation = self.DeclareAbstractInputPort(
             "observation", AbstractValue.Make(empty_observation())
         )
@@ -117,12 +121,12 @@ class PolicySystem(LeafSystem):
         self._finished = self.DeclareVectorInputPort("finished", 2)
         self._state = self.DeclareAbstractState(AbstractValue.Make(PolicyState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(UPDATE_PERIOD, 0.0, self._update)
-        of = {self.all_state_ticket()}
+        state_only = {self.all_state_ticket()}
         self.DeclareAbstractOutputPort(
-            "request", lambda: AbstractValue.Make(PlanRequest()), self._calc_request, of
+            "request", lambda: AbstractValue.Make(PlanRequest()), self._calc_request, state_only
         )
         self.DeclareAbstractOutputPort(
-            "state", lambda: AbstractValue.Make(PolicyState()), self._calc_state, of
+            "state", lambda: AbstractValue.Make(PolicyState()), self._calc_state, state_only
         )
 
     def state(self, context: Context) -> PolicyState:
@@ -138,6 +142,7 @@ class PolicySystem(LeafSystem):
         return EventStatus.Succeeded()
 
     def _next_state(self, context: Context, now: PolicyState) -> PolicyState:
+        """Return the next state, or the given one if nothing has changed."""
         time = context.get_time()
         if now.phase is PolicyPhase.OBSERVING and time >= now.observation_time:
             return self.after_observation(now, self._observation.Eval(context))
@@ -150,18 +155,24 @@ class PolicySystem(LeafSystem):
         if not isinstance(response.plan, PickPlacePlan):
             belief = now.belief.record(move, MoveResult.NOT_PLANNED)
             return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
-        finished, lowered = self._finished.Eval(context)
+        finished, lowered_distance = self._finished.Eval(context)
         if finished != now.request.number:
             return now
-        X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered))
+        X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered_distance))
         belief = now.belief.record(move, MoveResult.PLACED, X_TO)
+        observation_time = time + self._post_motion_wait
         return replace(
-            now, phase=PolicyPhase.OBSERVING, observation_time=time + self._rest, belief=belief
+            now, phase=PolicyPhase.OBSERVING, observation_time=observation_time, belief=belief
         )
 
     def after_observation(self, now: PolicyState, observation: Observation) -> PolicyState:
-        """Return the state after a look: with a request for a move, or done."""
-        assert self.policy is not None, "the policy is set before a simulation"
+        """Return the state after an observation: with a request, or done.
+
+        Args:
+            now: State before the observation.
+            observation: What the detector sees.
+        """
+        assert self.policy is not None, "set the policy before the simulation"
         belief, observation = update_belief(now.belief, observation, self._tracker)
         number = len(belief.history) + 1
         rng = item_rng(self._seed, number)

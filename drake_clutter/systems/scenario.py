@@ -1,4 +1,4 @@
-"""Scenarios: everything that decides an episode of the closed loop, in one typed file."""
+"""Configuration of one closed-loop episode, and the detector and policy that it names."""
 
 from dataclasses import field
 from pathlib import Path
@@ -19,18 +19,21 @@ from drake_clutter.validation import InRange, config_class, renamed_fields
 @config_class
 @renamed_fields(catalogue="catalog")
 class Scenario:
-    """An episode of the closed loop.
+    """Configuration of one closed-loop episode.
 
     Attributes:
-        scene: a scene file; "": one that the generator makes.
-        catalog: a folder with object classes of one's own, or "".
-        generator, objects, nodes: as for `drake-clutter generate`.
-        agent: who chooses the moves: student, student-14, largest-clear, ..., or the file of a checkpoint.
-        perception: what sees: labels, the perfect detector; depth or depth-color, trained ones; or the file of a checkpoint.
-            A trained one recognises classes of `objects`.
-        max_moves: after which it ends.
-        seed: of everything that is left to chance.
-        world: config.
+        scene: Scene file; empty: the generator makes a scene.
+        catalog: Folder with the user's own object classes, or empty.
+        generator: Name of a generator, or file of a checkpoint.
+        objects: Object set of the generator and of the learned detector.
+        nodes: Number of nodes of the generated scene graph.
+        agent: Explorer that chooses the moves: student, student-14, largest-clear, ..., or file of
+            a checkpoint.
+        perception: Detector: labels (ground truth), depth or depth-color (learned), or file of a
+            checkpoint.
+        max_moves: Number of moves after which the episode ends.
+        seed: Seed of all random numbers.
+        world: Config of the cell, the simulation and the task.
     """
 
     scene: str = ""
@@ -49,29 +52,35 @@ PRETRAINED_DETECTORS = {
     "depth": "training/checkpoints/detector_depth.safetensors",
     "depth-color": "training/checkpoints/detector_color.safetensors",
 }
-"""The shipped detectors, by name."""
+"""Checkpoints of the shipped detectors, by name."""
 
 
 def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None:
-    """What a scenario sees with; None: the perfect detector.
+    """Return the learned detector that a scenario names.
+
+    Args:
+        scenario: The scenario.
+        support: What the objects of the scene stand on.
+
+    Returns:
+        The detector; None for ground-truth labels.
 
     Raises:
-        InputError: no such detector.
+        InputError: There is no such detector.
     """
     if scenario.perception == "labels":
         return None
-    if scenario.perception not in PRETRAINED_DETECTORS and not scenario.perception.endswith(
-        ".safetensors"
-    ):
+    is_checkpoint = scenario.perception.endswith(".safetensors")
+    if scenario.perception not in PRETRAINED_DETECTORS and not is_checkpoint:
         allowed = f"labels, {', '.join(PRETRAINED_DETECTORS)}, or a .safetensors file"
         raise InputError(f"perception: {scenario.perception}; allowed are {allowed}")
     path = checkpoint_path(scenario.perception, PRETRAINED_DETECTORS)
-    from drake_clutter.perception.learned_detector import LearnedDetector  # takes PyTorch
+    # These imports need PyTorch.
+    from drake_clutter.perception.learned_detector import LearnedDetector
     from drake_clutter.perception.segmentation import SegmentationNetwork
 
-    classes = load_catalog(Path(scenario.catalog) if scenario.catalog else None).object_set(
-        scenario.objects
-    )
+    catalog = load_catalog(Path(scenario.catalog) if scenario.catalog else None)
+    classes = catalog.object_set(scenario.objects)
     camera = scenario.world.cell.camera
     detector = LearnedDetector(SegmentationNetwork.load(path), classes, camera, support)
     noise = DepthNoise(focal_length=camera.focal_length) if camera.depth_noise else None
@@ -79,18 +88,23 @@ def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None
 
 
 def make_policy(name: str, config: ClutterConfig) -> Policy:
-    """Return an explorer that knows no more than the camera shows.
+    """Return the policy of an explorer that uses only observations.
+
+    Args:
+        name: Name of an explorer, or file of a checkpoint.
+        config: Config of the world.
 
     Raises:
-        InputError: no such explorer, or one that knows more than the camera shows.
+        InputError: There is no such explorer, or it uses the true state of the scene.
     """
     if name in BASELINE_POLICIES:
         return BASELINE_POLICIES[name]
-    explorers = None if name == ORACLE else make_policy_factory(name, config)
-    if explorers is not None:
-        from drake_clutter.agents.learned_explorer import LearnedExplorerFactory  # takes PyTorch
+    factory = None if name == ORACLE else make_policy_factory(name, config)
+    if factory is not None:
+        # This import needs PyTorch.
+        from drake_clutter.agents.learned_explorer import LearnedExplorerFactory
 
-        if isinstance(explorers, LearnedExplorerFactory) and not explorers.privileged:
-            return explorers()
+        if isinstance(factory, LearnedExplorerFactory) and not factory.privileged:
+            return factory()
     allowed = f"a student, or one of {', '.join(BASELINE_POLICIES)}"
     raise InputError(f"agent: {name} knows more than the camera shows; allowed is {allowed}")

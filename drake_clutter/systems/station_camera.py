@@ -1,4 +1,4 @@
-"""The camera of the simulated station."""
+"""RGB-D camera of the simulated station."""
 
 from functools import lru_cache
 
@@ -19,12 +19,12 @@ from drake_clutter.station.station_simulation import TIME_STEP
 
 
 def add_overhead_camera(builder: DiagramBuilder, station: ClutterStation) -> RgbdSensor:
-    """Add the cell's camera to a diagram, connected to a station that has visuals."""
-    seen = station.camera_scene_graph
-    assert seen is not None
-    seen.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(RENDER_ENGINE_PARAMS))
-    eye = RenderCameras.from_camera(station.cell.camera)
-    sensor = RgbdSensor(seen.world_frame_id(), eye.X_TC, eye.color, eye.depth)
+    """Add the cell's camera to a diagram, and connect it to a station that has visuals."""
+    scene_graph = station.camera_scene_graph
+    assert scene_graph is not None
+    scene_graph.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(RENDER_ENGINE_PARAMS))
+    cameras = RenderCameras.from_camera(station.cell.camera)
+    sensor = RgbdSensor(scene_graph.world_frame_id(), cameras.X_TC, cameras.color, cameras.depth)
     builder.AddNamedSystem("overhead_camera", sensor)
     builder.Connect(station.GetOutputPort("query"), sensor.GetInputPort("geometry_query"))
     return sensor
@@ -32,7 +32,7 @@ def add_overhead_camera(builder: DiagramBuilder, station: ClutterStation) -> Rgb
 
 @lru_cache(maxsize=8)
 def render_empty_depth(cell: WorkCell) -> NDArray[np.float32]:
-    """Return the depth image of a cell without objects, the arm at home [m]. Shape (h, w)."""
+    """Return the depth image of a cell without objects, its arm at home [m]. Shape (H, W)."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ClutterStation(cell, [], time_step=TIME_STEP, visuals=True))
     sensor = add_overhead_camera(builder, station)

@@ -1,4 +1,7 @@
-"""Which object of an image is which of those known: the same object seen again is the same object, and a lost one is noticed."""
+"""Data association of detections with known objects.
+
+Detections get the names of known objects, and known objects that are gone are reported.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,28 +19,27 @@ from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.tasks.belief import Decision
 
 GATING_DISTANCE = 0.04
-"""m; an object that is seen so near to where one of its class is known to be is that one."""
+"""Largest distance of a detection from the known object that it is associated with [m]."""
 MAX_SEE_THROUGH_FRACTION = 0.3
-"""Of the pixels in which a known object should be seen, the share in which the camera sees past it if it is no longer there."""
+"""Fraction of free-space violations among an object's conclusive pixels from which it is gone."""
 REASSIGNED_FRACTION = 0.5
-"""Of the pixels in which it seems to be in view, the share that is recognised as something else if it never was there."""
-
+"""Fraction of an object's pixels that belong to other detections from which it is replaced."""
 DUPLICATE_OVERLAP = 0.9
-"""Of the pixels of a detection, the share in known objects that were not recognised, if it explains nothing that they do not."""
+"""Fraction of a detection's pixels that missed objects explain from which it is a duplicate."""
 EVIDENCE_RATIO = 1.1
-"""What a known object explains, over what a detection does that takes most of its pixels from it, if that is no better."""
+"""How many times the pixels of a detection a missed object must explain to replace it."""
 MAX_PENETRATION = 0.015
-"""m; what is known but out of view, and is deeper in something that is seen, cannot be there."""
+"""Largest penetration of detections by an object out of view, which otherwise is lost [m]."""
 SUPPORT_FRACTION = 0.97
-"""Of the pixels that speak for or against a known object, the share that speaks for it if it is still where it was."""
+"""Fraction of a missed object's conclusive pixels that must be consistent with its pose."""
 
 
 class AssociationResult(NamedTuple):
-    """An image, told in the names of what is known.
+    """Detections associated with known objects.
 
     Attributes:
-        observation: its detections bear the names of the known objects that they are, or new ones.
-        lost: names of known objects that are no longer where they were, or never were, and are not in view elsewhere.
+        observation: The observation. Its detections have the names of known objects, or new ones.
+        lost: Names of known objects that are not at their poses and not detected elsewhere.
     """
 
     observation: Observation
@@ -47,107 +49,118 @@ class AssociationResult(NamedTuple):
 def associate_detections(
     known: Sequence[SceneObject], observation: Observation
 ) -> AssociationResult:
-    """Gives the detections of an image names that last.
+    """Associate the detections of an image with known objects (a `Tracker`).
 
-    Objects of a class are matched with the least sum of distances. What is far from all that is known of its class is an object
-    that has been moved, if one is gone from its place, and else one that has never been seen.
+    Detections and objects of a class are assigned by the smallest sum of distances. A detection
+    beyond the gating distance is an object that was moved, if one is no longer at its pose, and a
+    new object otherwise.
 
     Args:
-        known: K_t, each object where it was seen last, or where a move was to put it.
-        observation: whose detections' names mean nothing.
+        known: Objects seen so far (K_t), each at its last known pose.
+        observation: The observation, with names of detections that are arbitrary.
     """
     observation = _restore_missed_objects(known, observation)
     named: dict[str, Detection] = {}
     lost = list[str]()
     classes = [o.object_class for o in known] + [d.object_class for d in observation.detections]
     for object_class in dict.fromkeys(classes):
-        of_class = [o for o in known if o.object_class is object_class]
-        seen = [d for d in observation.detections if d.object_class is object_class]
-        pairs = _assign(of_class, seen, GATING_DISTANCE)
-        left = [o for k, o in enumerate(of_class) if k not in pairs and _is_gone(o, observation)]
-        unnamed = [d for k, d in enumerate(seen) if k not in pairs.values()]
-        named |= {of_class[k].name: seen[d] for k, d in pairs.items()}
-        moved = _assign(left, unnamed, np.inf)
-        named |= {left[k].name: unnamed[d] for k, d in moved.items()}
-        lost += [o.name for k, o in enumerate(left) if k not in moved]
-        taken = {o.name for o in of_class}
-        free = (
-            name for number in count(1) if (name := f"{object_class.name}_{number}") not in taken
-        )
-        named |= {
-            next(free): detection for k, detection in enumerate(unnamed) if k not in moved.values()
-        }
-    detections = tuple(replace(detection, name=name) for name, detection in named.items())
-    there = [SceneObject(d.name, d.object_class, d.X_TO) for d in detections]
-    unseen = (o for o in known if o.name not in named and o.name not in lost)
+        objects = [o for o in known if o.object_class is object_class]
+        detections = [d for d in observation.detections if d.object_class is object_class]
+        pairs = _assign(objects, detections, GATING_DISTANCE)
+        named |= {objects[k].name: detections[d] for k, d in pairs.items()}
+        gone = [o for k, o in enumerate(objects) if k not in pairs and _is_gone(o, observation)]
+        unassigned = [d for k, d in enumerate(detections) if k not in pairs.values()]
+        moved = _assign(gone, unassigned, np.inf)
+        named |= {gone[k].name: unassigned[d] for k, d in moved.items()}
+        lost += [o.name for k, o in enumerate(gone) if k not in moved]
+        used_names = {o.name for o in objects}
+        numbered_names = (f"{object_class.name}_{number}" for number in count(1))
+        new_names = (name for name in numbered_names if name not in used_names)
+        new = [d for k, d in enumerate(unassigned) if k not in moved.values()]
+        named |= {next(new_names): detection for detection in new}
+    renamed = tuple(replace(detection, name=name) for name, detection in named.items())
+    visible = [SceneObject(d.name, d.object_class, d.X_TO) for d in renamed]
+    out_of_view = (o for o in known if o.name not in named and o.name not in lost)
     lost += [
         o.name
-        for o in unseen
-        if any(penetration_depth(o, other) > MAX_PENETRATION for other in there)
+        for o in out_of_view
+        if any(penetration_depth(o, other) > MAX_PENETRATION for other in visible)
     ]
-    return AssociationResult(replace(observation, detections=detections), tuple(lost))
+    return AssociationResult(replace(observation, detections=renamed), tuple(lost))
 
 
 def _restore_missed_objects(known: Sequence[SceneObject], observation: Observation) -> Observation:
-    """An image with the known objects that are still where they were, also those that were not recognised in it.
+    """Add known objects that the detector missed although the depth image confirms their poses.
 
-    A detector in doubt may say one thing now and another then: two boxes side by side may be two that lie across them. What is
-    known stands as long as the depth is as it should be there, and no detection is sure of something else or explains more.
+    An uncertain detector may change its interpretation from image to image, for example of two
+    boxes side by side as two boxes across them. The known interpretation is kept, and conflicting
+    detections are removed, unless a detection is confident or explains more pixels.
     """
-    recognised_now, familiar = set[str](), set[str]()
+    detected_objects = set[str]()
+    associated_detections = set[str]()
     for object_class in {o.object_class for o in known}:
-        of_class = [o for o in known if o.object_class is object_class]
-        seen = [d for d in observation.detections if d.object_class is object_class]
-        for k, d in _assign(of_class, seen, GATING_DISTANCE).items():
-            recognised_now.add(of_class[k].name)
-            familiar.add(seen[d].name)
+        objects = [o for o in known if o.object_class is object_class]
+        detections = [d for d in observation.detections if d.object_class is object_class]
+        for k, d in _assign(objects, detections, GATING_DISTANCE).items():
+            detected_objects.add(objects[k].name)
+            associated_detections.add(detections[d].name)
     shape = observation.depth.shape
-    still = dict[str, Detection]()
+    missed = dict[str, Detection]()
     for o in known:
-        if o.name in recognised_now:
+        if o.name in detected_objects:
             continue
         e = evaluate_pose(o.object_class, o.X_TO, observation.depth, observation.camera)
-        for_it = np.count_nonzero(e.consistent)
-        if for_it >= max(
-            1, observation.camera.visibility_threshold * e.unoccluded_pixels
-        ) and for_it >= SUPPORT_FRACTION * (for_it + e.free_space_violations):
-            still[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
-    explained = np.any([np.zeros(shape, bool), *(d.mask for d in still.values())], axis=0)
+        num_consistent = np.count_nonzero(e.consistent)
+        num_conclusive = num_consistent + e.free_space_violations
+        min_consistent = max(1, observation.camera.visibility_threshold * e.unoccluded_pixels)
+        if num_consistent >= min_consistent and num_consistent >= SUPPORT_FRACTION * num_conclusive:
+            missed[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
+    explained = np.any([np.zeros(shape, bool), *(d.mask for d in missed.values())], axis=0)
 
-    def no_better(detection: Detection) -> bool:
+    def is_redundant(detection: Detection) -> bool:
+        """Return whether missed objects explain the pixels of a detection as well."""
         size = np.count_nonzero(detection.mask)
-        within = (
+        overlaps = (
             np.count_nonzero(d.mask & detection.mask)
-            for d in still.values()
+            for d in missed.values()
             if np.count_nonzero(d.mask) > EVIDENCE_RATIO * size
         )
         return bool(size) and (
             explained[detection.mask].mean() >= DUPLICATE_OVERLAP
-            or any(n > REASSIGNED_FRACTION * size for n in within)
+            or any(overlap > REASSIGNED_FRACTION * size for overlap in overlaps)
         )
 
     kept = [
         d
         for d in observation.detections
-        if d.name in familiar or d.is_confident or not no_better(d)
+        if d.name in associated_detections or d.is_confident or not is_redundant(d)
     ]
-    taken = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
-    steady = (d for d in still.values() if taken[d.mask].mean() <= REASSIGNED_FRACTION)
-    return replace(
-        observation, detections=(*kept, *(replace(d, mask=d.mask & ~taken) for d in steady))
+    claimed = np.any([np.zeros(shape, bool), *(d.mask for d in kept)], axis=0)
+    restored = tuple(
+        replace(d, mask=d.mask & ~claimed)
+        for d in missed.values()
+        if claimed[d.mask].mean() <= REASSIGNED_FRACTION
     )
+    return replace(observation, detections=(*kept, *restored))
 
 
 def match_to_ground_truth(
     known: Sequence[SceneObject], objects: Sequence[SceneObject]
 ) -> tuple[str, ...]:
-    """The names of those objects that are among the known: each is one of its class, not far from where it is known to be."""
-    found = set[str]()
+    """Return the names of the true objects that are known.
+
+    Args:
+        known: Objects of a belief.
+        objects: True objects. One is known if it is assigned to a known object of its class within
+            the gating distance.
+    """
+    matched = set[str]()
     for name in {o.object_class.name for o in known}:
-        there = [o for o in objects if o.object_class.name == name]
-        pairs = _assign([o for o in known if o.object_class.name == name], there, GATING_DISTANCE)
-        found |= {there[k].name for k in pairs.values()}
-    return tuple(o.name for o in objects if o.name in found)
+        known_of_class = [o for o in known if o.object_class.name == name]
+        true_of_class = [o for o in objects if o.object_class.name == name]
+        pairs = _assign(known_of_class, true_of_class, GATING_DISTANCE)
+        matched |= {true_of_class[k].name for k in pairs.values()}
+    return tuple(o.name for o in objects if o.name in matched)
 
 
 def to_ground_truth_names(
@@ -156,47 +169,64 @@ def to_ground_truth_names(
     observation: Observation,
     objects: Sequence[SceneObject],
 ) -> Decision:
-    """Return a decision in the names of what is really there.
+    """Return a decision in the names of the true objects.
 
     Args:
-        decision: In the names of K_t; its move is not None.
-        known: K_t when it was made; each object is the true one nearest to its place.
-        observation: When it was made; it is kept in the decision.
-        objects: The true ones.
+        decision: Decision with a move, in the names of the belief.
+        known: Objects of the belief (K_t) at the decision. Each is taken for the nearest true
+            object.
+        observation: Observation at the decision, which becomes part of the result.
+        objects: True objects.
     """
     assert decision.move is not None
     name = {TRAY: TRAY} | {o.name: nearest_object(objects, o.X_TO).name for o in known}
     return Decision(
         Move(name[decision.move.pick], name[decision.move.place]),
-        {name[pick]: chance for pick, chance in decision.pick_probabilities.items()},
+        {name[pick]: probability for pick, probability in decision.pick_probabilities.items()},
         tuple(name[known] for known in decision.considered),
         observation,
     )
 
 
 def _assign(
-    known: Sequence[SceneObject], seen: Sequence[SceneObject | Detection], within: float
+    known: Sequence[SceneObject],
+    observed: Sequence[SceneObject | Detection],
+    max_distance: float,
 ) -> dict[int, int]:
-    """Indices of the seen by those of the known, no further apart than `within`, m."""
-    if not known or not seen:
+    """Assign observed objects to known ones by the smallest sum of distances.
+
+    Args:
+        known: Known objects of a class.
+        observed: Observed objects of the class.
+        max_distance: Largest distance of a pair [m].
+
+    Returns:
+        Index of the observed object by that of the known one.
+    """
+    if not known or not observed:
         return {}
-    apart = np.array([[np.linalg.norm(o.X_TO.p - d.X_TO.p) for d in seen] for o in known])
-    cost = np.minimum(apart, min(within, 10.0))  # further away is no match, however far
+    distance = np.array([[np.linalg.norm(o.X_TO.p - d.X_TO.p) for d in observed] for o in known])
+    # Beyond the largest distance all pairs cost the same, because none of them counts.
+    cost = np.minimum(distance, min(max_distance, 10.0))
     rows, columns = linear_sum_assignment(cost)
-    return {int(k): int(d) for k, d in zip(rows, columns, strict=True) if apart[k, d] <= within}
+    return {
+        int(k): int(d) for k, d in zip(rows, columns, strict=True) if distance[k, d] <= max_distance
+    }
 
 
 def _is_gone(known: SceneObject, observation: Observation) -> bool:
-    """Whether an object that was not recognised is not where it was: the camera sees past it, or sees something else there."""
+    """Return whether an undetected object is no longer at its pose.
+
+    It is gone if the camera sees through it, or if other detections explain its pixels.
+    """
     e = evaluate_pose(known.object_class, known.X_TO, observation.depth, observation.camera)
-    as_expected = np.count_nonzero(e.consistent)
-    if e.free_space_violations > MAX_SEE_THROUGH_FRACTION * (e.free_space_violations + as_expected):
+    num_consistent = np.count_nonzero(e.consistent)
+    num_conclusive = e.free_space_violations + num_consistent
+    if e.free_space_violations > MAX_SEE_THROUGH_FRACTION * num_conclusive:
         return True
-    others = np.zeros(observation.depth.shape, bool)
+    detected = np.zeros(observation.depth.shape, bool)
     for detection in observation.detections:
-        others |= detection.mask
-    taken = np.count_nonzero(e.consistent & others[e.window])
-    return bool(
-        taken > REASSIGNED_FRACTION * as_expected
-        and as_expected >= observation.camera.visibility_threshold * e.unoccluded_pixels
-    )
+        detected |= detection.mask
+    num_reassigned = np.count_nonzero(e.consistent & detected[e.window])
+    is_visible = num_consistent >= observation.camera.visibility_threshold * e.unoccluded_pixels
+    return bool(num_reassigned > REASSIGNED_FRACTION * num_consistent and is_visible)
