@@ -1,4 +1,4 @@
-"""Writing files and folders so that an interrupted or failed run leaves nothing half-written."""
+"""Atomic writing of files, output folders, and errors in user input."""
 
 import hashlib
 import json
@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any
 
 MAX_MESSAGE_LENGTH = 300
-"""Characters after the name of the file; a longer message is cut."""
+"""Largest number of characters of a message after the name of its file; the rest is cut."""
 
 
 class InputError(ValueError):
-    """A file, option or value that a user gave and that cannot be used; the message says what is allowed."""
+    """Unusable file, option or value from the user. The message states what is allowed."""
 
 
 def input_error(source: str, message: str) -> InputError:
-    """Return the error for a misuse, in one line of bounded length.
+    """Return an error with a one-line message of bounded length.
 
     Args:
-        source: The file or option.
+        source: File or option with the error.
         message: Field, value and what is allowed.
     """
     line = " ".join(message.split())
@@ -32,33 +32,35 @@ def input_error(source: str, message: str) -> InputError:
 
 
 def format_value(value: Any) -> str:
-    """Return a value for a message, at most 80 characters long."""
-    short = reprlib.Repr()
-    short.maxlevel, short.maxstring, short.maxother = 2, 40, 40
+    """Return a value as text of at most 80 characters for a message."""
+    abbreviated = reprlib.Repr()
+    abbreviated.maxlevel = 2
+    abbreviated.maxstring = 40
+    abbreviated.maxother = 40
     try:
-        text = short.repr(value)
-    except ValueError:  # an integer of too many digits
+        text = abbreviated.repr(value)
+    except ValueError:  # Python does not print integers with too many digits.
         return "a number"
     return text if len(text) <= 80 else f"{text[:76]} ..."
 
 
 @contextmanager
 def cli_error_handler() -> Iterator[None]:
-    """A user's mistake is one line and exit code 2; an interruption, exit code 130."""
+    """Print an `InputError` as one line and exit with code 2; exit with 130 if interrupted."""
     try:
         yield
     except InputError as error:
         print(f"error {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("stopped; what was finished is kept", file=sys.stderr)
+        print("interrupted; finished results are kept", file=sys.stderr)
         sys.exit(130)
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; renames it to `path` when the block ends without an error."""
-    # The random part keeps two processes apart; the suffix stays, for writers that choose a format by it.
+    """Yield a temporary path, which replaces `path` when the block ends without an error."""
+    # The random part separates processes. The suffix is kept for writers that infer the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield temporary
@@ -68,25 +70,29 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes `text` to `path` in one step."""
+    """Write a text file atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as indented JSON to `path` in one step; NaN and infinity are errors."""
+    """Write a value as indented JSON atomically; NaN and infinity are errors."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def prepare_output_directory(path: Path, *, allowed_entries: frozenset[str] = frozenset()) -> Path:
-    """Makes an output folder.
+    """Create an output folder, or check an existing one.
 
     Args:
-        path: the folder; made, with its parents, if it is not there.
-        allowed_entries: names that may already be inside, e.g. from an earlier run that is now resumed.
+        path: The folder, which is created with its parents if it does not exist.
+        allowed_entries: Names that the folder may contain, for example those of a run that is
+            resumed.
+
+    Returns:
+        The folder.
 
     Raises:
-        InputError: not a folder, not writable, or holding something else than `allowed_entries`.
+        InputError: The path is not a folder, not writable, or contains other entries.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -94,20 +100,21 @@ def prepare_output_directory(path: Path, *, allowed_entries: frozenset[str] = fr
         raise InputError(f"--out {path}: is a file; give a folder that is new or empty") from error
     except OSError as error:
         raise InputError(
-            f"--out {path}: cannot be made ({error.strerror}); give a folder that you may write"
+            f"--out {path}: cannot be created ({error.strerror}); give a writable folder"
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"--out {path}: is not writable; give a folder that you may write")
+        raise InputError(f"--out {path}: is not writable; give a writable folder")
     unexpected_entries = sorted(
         entry.name for entry in path.iterdir() if entry.name not in allowed_entries
     )
     if unexpected_entries:
         raise InputError(
-            f"--out {path}: is not empty (holds {unexpected_entries[0]}); give a folder that is new or empty"
+            f"--out {path}: is not empty (holds {unexpected_entries[0]}); "
+            "give a folder that is new or empty"
         )
     return path
 
 
 def file_sha256(path: Path) -> str:
-    """The hash of a file's bytes, in hexadecimal digits."""
+    """Return the SHA-256 hash of a file as hexadecimal digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

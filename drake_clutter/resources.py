@@ -1,4 +1,4 @@
-"""Finds the files that ship with drake_clutter, whether it is installed from a wheel or editable, and its commit."""
+"""Paths of files that are shipped with the package, and its Git commit."""
 
 import subprocess
 from pathlib import Path
@@ -8,12 +8,16 @@ _INSTALLED_DATA_DIR = _PACKAGE_DIR / "_shipped"
 
 
 def resource_path(relative_path: str) -> Path:
-    """Absolute path of a shipped file or folder, e.g. ``resource_path("models/robots/ur10.sdf")``.
+    """Return the absolute path of a shipped file or folder.
 
-    A wheel holds `models/`, `sdf_assets/` and `training/` inside the package; a checkout holds them beside it.
+    The folders `models/`, `sdf_assets/` and `training/` are inside the package in a wheel, and next
+    to it in a checkout.
+
+    Args:
+        relative_path: Path from the root of the repository, such as `models/robots/ur10.sdf`.
 
     Raises:
-        FileNotFoundError: nothing of that name is shipped.
+        FileNotFoundError: There is no such shipped file or folder.
     """
     root = _INSTALLED_DATA_DIR if _INSTALLED_DATA_DIR.is_dir() else _PACKAGE_DIR.parent
     path = root / relative_path
@@ -25,9 +29,11 @@ def resource_path(relative_path: str) -> Path:
 
 
 def git_commit() -> str:
-    """The commit that is checked out around this package, marked if files differ from it; "unknown" outside of a checkout.
+    """Return the Git commit of the checkout that contains the package.
 
-    Files of results do not count: what is measured is written into them while it is measured.
+    Returns:
+        The abbreviated commit, with the suffix "-dirty" if files were modified; "unknown" outside
+        of a checkout. Modified results do not count, because measurements write to them.
     """
     results = (":(top,exclude)training/results", ":(top,exclude)benchmarks/results")
     try:

@@ -101,5 +101,5 @@ def test_prepare_output_directory_refuses_what_may_not_be_written(tmp_path: Path
     locked.mkdir(mode=0o500)
     with pytest.raises(InputError, match="is not writable"):
         prepare_output_directory(locked)
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         prepare_output_directory(locked / "below")

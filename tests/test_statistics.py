@@ -1,7 +1,11 @@
 """Confidence intervals."""
 
+import json
+import math
+
 import pytest
 
+from drake_clutter.resources import resource_path
 from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
 
 
@@ -35,3 +39,23 @@ def test_bootstrap_ratio_interval() -> None:
     assert bootstrap_ratio_interval([1, 2, 3], [2, 4, 6]) == (0.5, 0.5)
     low, high = bootstrap_ratio_interval([1, 2, 3, 0], [2, 2, 3, 2])
     assert 0 < low < 6 / 9 < high <= 1
+
+
+@pytest.mark.parametrize(("successes", "count"), [(0, 7), (3, 7), (7, 7), (490, 1000)])
+def test_wilson_interval_is_the_closed_form(successes: int, count: int) -> None:
+    """Wilson 1927: the p for which the normal test statistic of the proportion is +-z."""
+    z = 1.959963984540054
+    center = (successes + z * z / 2) / (count + z * z)
+    spread = successes * (count - successes) / count + z * z / 4
+    half_width = z / (count + z * z) * math.sqrt(spread)
+    expected = (center - half_width, center + half_width)
+    assert wilson_interval(successes, count) == pytest.approx(expected, rel=0, abs=1e-15)
+
+
+def test_intervals_of_shipped_results_are_reproduced() -> None:
+    results = json.loads(resource_path("training/results/detector_color.json").read_text())
+    for row in results["rows"].values():
+        for recall in [row["in_view"], *row["recall_by_visible_share"].values()]:
+            successes = round(recall["recall"] * recall["objects"])
+            interval = wilson_interval(successes, recall["objects"])
+            assert interval == pytest.approx(recall["ci95"], rel=0, abs=1e-15)

@@ -1,1 +1,1 @@
-"""Maps a function over many items in several processes, here or on a cluster."""
+"""Parallel evaluation of a function in processes of this machine or of a Ray cluster."""

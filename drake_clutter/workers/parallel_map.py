@@ -1,4 +1,4 @@
-"""Maps a function over many items in several processes, here or on a cluster, with the same results for any number of them."""
+"""Parallel, ordered map whose results do not depend on the number of processes."""
 
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
@@ -17,28 +17,32 @@ def map_ordered(
     ray_address: str | None = None,
     max_items_per_process: int | None = None,
 ) -> Generator[Result, None, None]:
-    """Yields `make_worker()(item)` for every item, in the order of the items, each as soon as it is there.
+    """Yield `make_worker()(item)` for every item, in the order of the items.
 
-    Every process makes one worker, e.g. with a Diagram and a camera of its own, and uses it for all its items. So a worker's
-    result may depend on nothing but the item; what is random in it comes from a seed in the item (see `item_rng`). A large
-    sequence is read only a few items ahead. An exception in a worker is raised here; an exception and closing the generator
-    end the processes without waiting for the items at hand.
+    Each process makes one worker, which may hold expensive objects such as a Diagram, and uses it
+    for all of its items. The result of a worker must depend only on the item; random numbers come
+    from a seed in the item (see `item_rng`). Items are read only a few ahead. An exception in a
+    worker is raised here. After an exception, or when the generator is closed, the processes end
+    without finishing their current items.
 
-    On a Ray cluster a worker that dies, alone or with its machine, is replaced, and its item is done again. A worker takes one
-    CPU; those for which the cluster has no room wait for it, without holding up the others. The package is installed on every
-    machine; files that the workers read are at the same place on all.
+    On a Ray cluster, a worker that dies, alone or with its machine, is replaced, and its item is
+    repeated. A worker takes one CPU; workers for which the cluster has no room wait without
+    blocking the others. All machines need the package, and the workers' files at the same paths.
 
     Args:
-        make_worker: a factory that can be pickled: a class, a module's function, or a functools.partial of one.
-        items: the items; with more than one worker, or on a cluster, they and the results are pickled.
-        workers: number of processes; 1 works in this process, or as one process on the cluster.
-        ray_address: of the Ray cluster that the processes run on, e.g. "auto"; None: they run on this machine, without Ray.
-        max_items_per_process: After so many items, processes on this machine are replaced, also a
-            single one; None: never. pydrake never frees a Diagram that holds a system written in
+        make_worker: Picklable factory of a worker: a class, a module-level function, or a
+            functools.partial of one.
+        items: The items. With several workers or on a cluster, they and the results are pickled.
+        workers: Number of processes. With 1, the work is done in this process, or in one process of
+            the cluster.
+        ray_address: Address of the Ray cluster, such as "auto"; None: this machine without Ray.
+        max_items_per_process: Number of items after which processes on this machine are replaced,
+            also a single one; None: never. pydrake does not free a Diagram with a system written in
             Python: an episode of the closed loop keeps 340 MB.
 
     Raises:
-        BrokenProcessPool: a worker process was killed; on a cluster, an item lost its worker three times.
+        BrokenProcessPool: A worker process was killed; on a cluster, an item lost its worker three
+            times.
         InputError: Ray is not installed, or there is no cluster at the address.
     """
     if workers < 1:

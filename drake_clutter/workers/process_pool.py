@@ -1,4 +1,4 @@
-"""Maps over processes of this machine."""
+"""Ordered map over processes of this machine."""
 
 import gc
 import os
@@ -21,7 +21,7 @@ from drake_clutter.workers.process_environment import (
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# In a worker process: the factory, and from the first item on the worker that it made.
+# State of a worker process: the factory, and the worker, which is made with the first item.
 _make_worker: Callable[[], Callable[[Any], Any]] | None = None
 _worker: Callable[[Any], Any] | None = None
 
@@ -29,9 +29,10 @@ _worker: Callable[[Any], Any] | None = None
 def map_in_processes(
     make_worker: Callable[[], Callable[[Item], Result]], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
-    """See `drake_clutter.workers.parallel_map.map_ordered`."""
-    gc.collect()  # a renderer that is left for one of the pool's threads to collect can abort the process
-    # A forked copy of a process that runs threads (VTK, torch) can hang: the processes are started afresh.
+    """Map in several processes; see `drake_clutter.workers.parallel_map.map_ordered`."""
+    # If a thread of the pool collects a renderer as garbage, the process can abort.
+    gc.collect()
+    # A forked copy of a process with threads (VTK, PyTorch) can deadlock; spawned ones do not.
     pool = ProcessPoolExecutor(
         workers, get_context("spawn"), initializer=_initialize_process, initargs=(make_worker,)
     )
@@ -41,9 +42,8 @@ def map_in_processes(
     try:
         while True:
             for item in islice(remaining, workers * IN_FLIGHT_PER_WORKER - len(futures)):
-                with temporary_environment(
-                    SINGLE_THREAD_VARIABLES
-                ):  # a process starts, and copies it, when an item finds none idle
+                # The pool starts a process, which copies the environment, if none is idle.
+                with temporary_environment(SINGLE_THREAD_VARIABLES):
                     futures.append(pool.submit(_process_item, item))
             if not futures:
                 break
@@ -53,13 +53,13 @@ def map_in_processes(
             yield result
     except BrokenProcessPool as error:
         raise BrokenProcessPool(
-            f"a worker process was killed after {num_results} results; was memory short? Try fewer workers than {workers}"
+            f"a worker process was killed after {num_results} results, perhaps for lack of memory; "
+            f"try fewer workers than {workers}"
         ) from error
     finally:
-        if futures:  # left early
-            for process in list(
-                (pool._processes or {}).values()
-            ):  # from Python 3.14: pool.terminate_workers()
+        if futures:  # The caller did not read all results.
+            # From Python 3.14 on, this is pool.terminate_workers().
+            for process in list((pool._processes or {}).values()):
                 process.terminate()
         pool.shutdown(cancel_futures=True)
 
@@ -70,7 +70,7 @@ def map_in_recycled_processes(
     workers: int,
     max_items_per_process: int,
 ) -> Generator[Result, None, None]:
-    """See `drake_clutter.workers.parallel_map.map_ordered`."""
+    """Map in processes that are replaced after a number of items; see `map_ordered`."""
     remaining = iter(items)
     while batch := list(islice(remaining, workers * max_items_per_process)):
         yield from map_in_processes(make_worker, batch, workers)
@@ -79,14 +79,13 @@ def map_in_recycled_processes(
 def _initialize_process(make_worker: Callable[[], Callable[[Any], Any]]) -> None:
     global _make_worker
     _make_worker = make_worker
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches every process; the first one ends the others
+    # Ctrl-C reaches every process; the parent process ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
 def _exit_with_parent() -> None:
-    """A first process that is killed cannot end its workers: they see to it themselves."""
+    """End this process with its parent, which cannot end its workers if it is killed."""
     parent = parent_process()
     assert parent is not None
     parent.join()
@@ -94,7 +93,10 @@ def _exit_with_parent() -> None:
 
 
 def _process_item(item: Any) -> Any:
-    """Makes the worker with the first item, not in `_begin`: there an exception would only say that the pool is broken."""
+    """Process an item, and make the worker first if there is none.
+
+    An exception of the factory in the initializer would only be reported as a broken pool.
+    """
     global _worker
     if _worker is None:
         assert _make_worker is not None

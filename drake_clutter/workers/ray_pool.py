@@ -1,4 +1,4 @@
-"""Maps over the machines of a Ray cluster: the part that needs the extra `scale`."""
+"""Ordered map over the machines of a Ray cluster; needs the optional dependency `scale`."""
 
 import logging
 import os
@@ -22,30 +22,36 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MAX_WORKER_LOSSES = 3
-# Ray reads these when it is imported. Without them it tries for a quarter of an hour to reach a cluster that is not there.
+"""Number of worker processes that an item may lose before it fails."""
 SHORT_CONNECTION_TIMEOUTS = {
     "RAY_NUM_REDIS_GET_RETRIES": "1",
     "RAY_gcs_rpc_server_connect_timeout_s": "2",
     "RAY_py_gcs_connect_timeout_s": "5",
 }
+"""Environment variables that Ray reads when it is imported.
+
+Without them it tries to reach an absent cluster for a quarter of an hour.
+"""
 
 
 class _Actor:
-    """Works on a machine of the cluster. It takes and gives pickles: arrays that Ray itself passes on may not be written to."""
+    """Worker process of the cluster.
+
+    Items and results are pickled, because arrays that Ray itself transfers are read-only.
+    """
 
     def __init__(self, make_worker: bytes, folder: str) -> None:
         self._make_worker = make_worker
         self._worker: Callable[[Any], Any] | None = None
-        with suppress(
-            OSError
-        ):  # where the machines share the folder, relative paths in the items are right here, too
+        # If the machines share the folder, relative paths in the items are valid here, too.
+        with suppress(OSError):
             os.chdir(folder)
 
     def ready(self) -> None:
-        """Answers once the actor lives."""
+        """Return once the actor is running."""
 
     def work(self, item: bytes) -> bytes:
-        """Makes the worker with the first item, so that an exception in that is told like one in the work."""
+        """Process an item; the worker is made with the first one, so its errors are reported."""
         from ray import cloudpickle
 
         if self._worker is None:
@@ -56,7 +62,13 @@ class _Actor:
 
 @dataclass
 class _Job:
-    """A pickled item, what becomes of it, and how often it was lost with its actor."""
+    """A pickled item and its processing.
+
+    Attributes:
+        item: Pickled item.
+        result: Result of the item.
+        losses: Number of actors that died with the item.
+    """
 
     item: bytes
     result: Future[Any] = field(default_factory=Future)
@@ -69,7 +81,7 @@ def map_on_ray(
     workers: int,
     address: str,
 ) -> Generator[Result, None, None]:
-    """See `drake_clutter.workers.parallel_map.map_ordered`."""
+    """Map on a Ray cluster; see `drake_clutter.workers.parallel_map.map_ordered`."""
     with _ray_session(address) as ray:
         options = {
             "num_cpus": 1,
@@ -89,7 +101,7 @@ def map_on_ray(
 
 @contextmanager
 def _ray_session(address: str) -> Iterator[Any]:
-    """Ray, connected for the length of the block; a connection that the process already has is used, and kept."""
+    """Connect to Ray for the duration of the block, or keep using an existing connection."""
     try:
         with temporary_environment(SHORT_CONNECTION_TIMEOUTS):
             import ray
@@ -104,8 +116,9 @@ def _ray_session(address: str) -> Iterator[Any]:
         ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise InputError(
-            f"--ray {address}: no cluster to work with ({error}); allowed is auto, for the cluster that runs on this machine, or "
-            "HOST:PORT as `ray start --head` prints it (if the cluster asks for a token, with RAY_AUTH_MODE=token set)"
+            f"--ray {address}: no cluster to work with ({error}); allowed is auto, for the "
+            "cluster on this machine, or HOST:PORT as `ray start --head` prints it (set "
+            "RAY_AUTH_MODE=token if the cluster requires a token)"
         ) from error
     try:
         yield ray
@@ -116,15 +129,15 @@ def _ray_session(address: str) -> Iterator[Any]:
 def _map_over_actors(
     ray: Any, actors: list[Any], items: Iterable[Any]
 ) -> Generator[Any, None, None]:
-    """Gives the items to the actors. Ray starts these, notices when one dies, and starts it anew where there is room.
+    """Distribute the items among the actors, which Ray restarts when they die.
 
-    The items are not left to Ray's own retries. Those keep an item with its actor, which waits for ever if its machine is gone
-    and the others have no room; and they are used up while an actor is being restarted. Here an item that was lost with its
-    actor goes to the next actor that is ready.
+    Ray's own retries are not used. They bind an item to its actor, which never continues if its
+    machine is gone and the others have no room, and they are used up while an actor restarts. Here
+    an item that was lost with its actor goes to the next actor that is ready.
     """
     remaining = iter(items)
-    pending: deque[_Job] = deque()  # read, not yet yielded
-    unassigned: deque[_Job] = deque()  # those of them that no actor works on
+    pending: deque[_Job] = deque()  # Jobs whose results are not yielded yet.
+    unassigned: deque[_Job] = deque()  # Pending jobs that no actor is working on.
     idle: list[Any] = []
     busy: dict[Any, tuple[Any, _Job | None]] = {
         actor.ready.remote(): (actor, None) for actor in actors
@@ -139,16 +152,17 @@ def _map_over_actors(
             yield pending.popleft().result.result()
             continue
         while idle and unassigned:
-            actor, given = idle.pop(), unassigned.popleft()
-            busy[actor.work.options(max_task_retries=0).remote(given.item)] = (actor, given)
+            actor = idle.pop()
+            next_job = unassigned.popleft()
+            busy[actor.work.options(max_task_retries=0).remote(next_job.item)] = (actor, next_job)
         (done,), _ = ray.wait(list(busy))
         actor, job = busy.pop(done)
         try:
             result = ray.get(done)
-        except ray.exceptions.RayTaskError as error:  # raised by the worker
+        except ray.exceptions.RayTaskError as error:  # The worker raised an exception.
             if job is None:
                 raise
-            error.cause.__cause__ = error  # it holds the worker's traceback
+            error.cause.__cause__ = error  # It contains the worker's traceback.
             job.result.set_exception(error.cause)
             idle.append(actor)
         except ray.exceptions.RayError as error:
@@ -159,10 +173,12 @@ def _map_over_actors(
                 unassigned.appendleft(job)
             else:
                 message = (
-                    f"an item ended {MAX_WORKER_LOSSES} worker processes, the last so: {error}"
+                    f"an item ended {MAX_WORKER_LOSSES} worker processes; "
+                    f"the last error was: {error}"
                 )
                 job.result.set_exception(BrokenProcessPool(message))
-            # Where one died others may have, e.g. with their machine; they get no item before they have answered.
+            # Other actors may have died, too, for example with their machine. They get no item
+            # before they have responded.
             busy |= {other.ready.remote(): (other, None) for other in (actor, *idle)}
             idle.clear()
         else:
