@@ -4,6 +4,7 @@ MkDocs calls `on_files`. Generated pages are never written to the repository.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -36,6 +37,10 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/judge_agreement.md": results_judge_agreement.page,
     "results/calibration.md": results_calibration.page,
     "results/negative_results.md": results_negative.page,
+    **{
+        f"reference/api/{name}.md": partial(api_page.package_page, name)
+        for name in api_page.packages()
+    },
 }
 """Functions that return the Markdown of a page, by its path below `docs`."""
 
