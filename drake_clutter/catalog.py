@@ -1,8 +1,9 @@
-"""The catalog of object classes: what they measure and weigh, and where their assets lie.
+"""The catalog of object classes: sizes, masses, labels and the folders of their assets.
 
-An *asset folder* holds `catalog.yaml` and one folder per class that `drake_clutter.assets` builds from it. The shipped
-one is `sdf_assets/`; a user's own adds classes to it. An object's frame O has its origin at the geometric centre: a box's
-x, y, z are its sizes in the order of the catalog, a cylinder's axis is z, a mesh keeps its axes.
+An *asset folder* holds `catalog.yaml` and one folder for each class, which `drake_clutter.assets`
+builds from it. The shipped one is `sdf_assets/`; a user's own adds classes to it. The origin of an
+object's frame O is the geometric center. A box's x, y and z axes are its sizes in the order of the
+catalog, a cylinder's axis is z, and a mesh keeps its axes.
 """
 
 import math
@@ -44,15 +45,18 @@ class Shape(Enum):
 
 
 class RestOrientation(Enum):
-    """Which of an object's axes points up when it rests: by its extent, but a mesh's are taken to be x, y, z in this order."""
+    """Which axis of an object points up when it rests, by the object's extent along it.
 
-    FLAT = "flat"  # the shortest
-    SIDE = "side"  # the middle one
-    UPRIGHT = "upright"  # the longest
+    A mesh keeps its own axes: x counts as the shortest and z as the longest.
+    """
+
+    FLAT = "flat"  # the shortest axis
+    SIDE = "side"  # the middle axis
+    UPRIGHT = "upright"  # the longest axis
 
 
 class PairArrangement(Enum):
-    """How the two objects of a "meta" pair lie beside each other (SPEC section 2)."""
+    """How the two objects of a pair ("meta" objects in Kumar et al. 2022) stand side by side."""
 
     LYING = "lying"
     STANDING = "standing"
@@ -62,7 +66,7 @@ class LabelDesign(StrictModel):
     """How the texture of a class is drawn. Colors are sRGB hex strings.
 
     Attributes:
-        title: The words on the front, at most 24 characters; the class's name when empty.
+        title: Words on the front, at most 24 characters; the class's name when empty.
         base: Color of the body.
         accent: Color of the band and the motif.
         motif: One of `drake_clutter.assets.MOTIFS`.
@@ -86,13 +90,13 @@ class ClassEntry(StrictModel):
 
     Attributes:
         shape: Box, cylinder or mesh.
-        size_mm: Extents [mm]; a cylinder's are diameter, diameter, height; a mesh's is measured,
-            and must be left out. Shape (3,).
+        size_mm: Extents [mm]; diameter, diameter, height of a cylinder. A mesh's are measured and
+            must be left out. Shape (3,).
         mass_g: Mass [g].
         source: Where size and mass come from.
-        pairs: The arrangements in which two of it stand as a pair.
-        only_rest: How it rests in all orientations (cans stand, a marker lies); None if it varies.
-        mesh: A watertight mesh in meters, beside the catalog; for shape mesh only.
+        pairs: Arrangements in which two objects of the class stand as a pair.
+        only_rest: The one way in which it rests (cans stand, a marker lies), or None if it varies.
+        mesh: Path of a watertight mesh in meters, relative to the catalog; for shape mesh only.
         label: How its texture is drawn.
     """
 
@@ -135,8 +139,8 @@ class CatalogFile(StrictModel):
     """The schema of `catalog.yaml`.
 
     Attributes:
-        classes: By name (lower case, digits, underscores).
-        object_sets: Named lists of classes; a user's catalog may name shipped classes too.
+        classes: Classes by name (lower case, digits, underscores).
+        object_sets: Lists of classes by name. A user's catalog may list shipped classes too.
     """
 
     classes: dict[Annotated[str, AfterValidator(_check_class_name)], ClassEntry] = _EMPTY_MAPPING
@@ -145,19 +149,20 @@ class CatalogFile(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class ObjectClass:
-    """An object class, checked; compared by identity, as a catalog holds one of each.
+    """A validated object class. Classes compare by identity, as a catalog holds each once.
 
     Attributes:
-        name: the class's name.
-        shape: its collision shape.
-        size: (3,) m, the extents of its bounding box in O; a cylinder's is (diameter, diameter, height).
-        mass: kg.
-        source: where size and mass come from.
-        pairs: the pair arrangements that the grammar has a rule for.
-        only_rest: how it rests in every orientation, or None if that may change.
-        mesh: the user's mesh file, or None.
-        label: how its texture is drawn.
-        folder: where its built assets lie.
+        name: Name of the class.
+        shape: Collision shape.
+        size: Extents of the bounding box in O [m]; (diameter, diameter, height) of a cylinder.
+            Shape (3,).
+        mass: Mass [kg].
+        source: Where size and mass come from.
+        pairs: Pair arrangements for which the grammar has a rule.
+        only_rest: The one way in which it rests, or None if it varies.
+        mesh: The user's mesh file, or None.
+        label: How its texture is drawn.
+        folder: Folder of its built assets.
     """
 
     name: str
@@ -173,21 +178,21 @@ class ObjectClass:
 
     @property
     def volume(self) -> float:
-        """Volume in m^3 (a mesh's: of its bounding box, which is what a camera can tell)."""
+        """Volume [m^3]; of a mesh, the volume of its bounding box."""
         x, y, z = self.size
         return x * y * z * (math.pi / 4 if self.shape is Shape.CYLINDER else 1.0)
 
     @property
     def sdf_path(self) -> Path:
-        """The built SDF model."""
+        """Path of the built SDF model."""
         return self.folder / "model.sdf"
 
     @cached_property
     def model_path(self) -> Path:
-        """The built SDF model, with the mass of the catalog.
+        """Path of the built SDF model, whose mass equals the catalog's.
 
         Raises:
-            InputError: It is missing, or was built with another mass.
+            InputError: The model is missing, or was built with another mass.
         """
         remedy = f"run `drake-clutter assets build {self.folder.parent}`"
         if not self.sdf_path.is_file():
@@ -195,13 +200,17 @@ class ObjectClass:
         mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
         if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
             raise InputError(
-                f"{self.sdf_path}: mass: {mass}; allowed is the catalog's, {self.mass:g} kg; {remedy}"
+                f"{self.sdf_path}: mass: {mass}; "
+                f"allowed is the catalog's, {self.mass:g} kg; {remedy}"
             )
         return self.sdf_path
 
     @cached_property
     def convex_pieces(self) -> tuple[NDArray[np.float64], ...]:
-        """Corners of its convex pieces in O, each (V, 3) m; a cylinder is a prism of 32 sides inscribed in it."""
+        """Corners of the convex pieces in O, each (V, 3) [m].
+
+        A cylinder is represented by an inscribed prism of 32 sides.
+        """
         half = np.asarray(self.size) / 2
         if self.shape is Shape.BOX:
             return (
@@ -219,13 +228,14 @@ class ObjectClass:
         pieces = sorted(self.folder.glob("convex_*.obj"))
         if not pieces:
             raise InputError(
-                f"{self.folder}: class {self.name} has no assets; run `drake-clutter assets build {self.folder.parent}`"
+                f"{self.folder}: class {self.name} has no assets; "
+                f"run `drake-clutter assets build {self.folder.parent}`"
             )
         return tuple(np.asarray(trimesh.load_mesh(piece).vertices, float) for piece in pieces)
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """All corners of its convex pieces, (V, 3) m in O."""
+        """Corners of all convex pieces in O [m]. Shape (V, 3)."""
         return np.vstack(self.convex_pieces)
 
 
@@ -234,9 +244,9 @@ class Catalog:
     """Object classes and named sets of them.
 
     Attributes:
-        classes: by name.
-        object_sets: names of classes, by the set's name.
-        folders: the asset folders that it was read from.
+        classes: Classes by name.
+        object_sets: Names of classes by the name of their set.
+        folders: Asset folders from which the catalog was read.
     """
 
     classes: Mapping[str, ObjectClass]
@@ -244,10 +254,10 @@ class Catalog:
     folders: tuple[Path, ...]
 
     def object_set(self, name: str) -> tuple[ObjectClass, ...]:
-        """The classes of a named set.
+        """Return the classes of a named set.
 
         Raises:
-            InputError: no such set.
+            InputError: There is no such set.
         """
         if name not in self.object_sets:
             raise InputError(
@@ -270,7 +280,8 @@ def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
     x, y, z = (float(extent) for extent in mesh.extents)
     if not 0.003 <= min(x, y, z) <= max(x, y, z) <= 1.0:
         raise InputError(
-            f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; allowed are 0.003 to 1 m a side (units are metres)"
+            f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; "
+            "allowed are 0.003 to 1 m a side (units are meters)"
         )
     return x, y, z
 
@@ -306,13 +317,14 @@ def catalog_path(folder: Path) -> Path:
 
 @lru_cache
 def load_catalog(folder: Path | None = None) -> Catalog:
-    """The shipped catalog, with the classes and sets of a user's asset folder added.
+    """Return the shipped catalog, with the classes and sets of a user's asset folder added.
 
     Args:
-        folder: a user's asset folder; None for the shipped one alone.
+        folder: A user's asset folder, or None for the shipped one alone.
 
     Raises:
-        InputError: the catalog is missing or broken; the message names file, field and what is allowed.
+        InputError: A catalog is missing or invalid. The message names file, field and what is
+            allowed.
     """
     shipped = resource_path("sdf_assets")
     folders = (

@@ -1,4 +1,4 @@
-"""Every number that the simulated world leaves open, in one place; `docs/calibration.md` argues the defaults."""
+"""Configuration of the simulated world. `docs/` discusses the default values."""
 
 from collections.abc import Sequence
 from dataclasses import field
@@ -21,14 +21,16 @@ from drake_clutter.validation import (
 @config_class
 @renamed_fields(placement_tries="placement_attempts")
 class LayoutConfig:
-    """How a graph becomes poses on the support.
+    """How a terminal graph becomes poses on the support.
 
     Attributes:
-        stack_gap: Least distance between the footprints of two stacks, and of a stack and the rim [m].
-        max_stack_height: A higher stack is a typed failure [m].
-        lying_gap: Between the two objects of a lying pair [m].
-        standing_gap: Between the two objects of a standing pair [m].
-        placement_attempts: Draws of a stack's place before the layout starts anew, and of new starts.
+        stack_gap: Smallest distance between the footprints of two stacks, and between a stack and
+            the rim [m].
+        max_stack_height: A graph with a higher stack is rejected [m].
+        lying_gap: Distance between the two objects of a lying pair [m].
+        standing_gap: Distance between the two objects of a standing pair [m].
+        placement_attempts: Positions sampled for each stack before the layout restarts, and number
+            of restarts.
     """
 
     stack_gap: NonNegative = 0.010
@@ -48,24 +50,28 @@ class LayoutConfig:
     still_displacement="chatter_displacement",
 )
 class SettleConfig:
-    """How Drake settles a scene and what counts as stable.
+    """How Drake settles a scene, and the limits within which it counts as stable.
 
     Contact properties belong to the assets: see `drake_clutter.assets.contact_properties`.
 
     Attributes:
-        time_step: Of the simulation [s].
+        time_step: Time step of the simulation [s].
         jitter: Radius of the disc from which each object's random xy offset is drawn [m].
-        max_displacement: A stable object's origin moves less [m].
-        max_tilt_deg: A stable object turns less (a body of revolution: its axis) [deg].
-        max_time: Simulated at most [s].
-        max_rest_displacement: What went further in the last 0.5 s is not at rest [m]. Contact chatter and a marker that rocks on
-            the facets of its contact mesh stay below it.
-        early_stop_speed: A stack is calm while every object is below this speed [m/s], and the next two limits.
-        early_stop_displacement: Since the start [m].
-        early_stop_tilt_deg: Since the start [deg].
-        early_stop_samples: Calm samples in a row, 0.05 s apart, that end the simulation early.
-        chatter_displacement: Half a second in which no object was further than this from where it is [m], or turned by
-            early_stop_tilt_deg, ends it too: light objects under heavy ones chatter, and are never calm.
+        max_displacement: An object whose origin moves this far has fallen [m].
+        max_tilt_deg: An object that turns this far has fallen; of a body of revolution, only the
+            tilt of the axis counts [deg].
+        max_time: Longest simulated time [s].
+        max_rest_displacement: An object that moved farther than this in the last 0.5 s of
+            `max_time` is not at rest [m]. Contact chatter and the rocking of a cylinder on the
+            facets of its contact mesh stay below the default.
+        early_stop_speed: A sample counts as calm when every object is slower than this [m/s] and
+            within the next two limits.
+        early_stop_displacement: Largest displacement since the start in a calm sample [m].
+        early_stop_tilt_deg: Largest rotation since the start in a calm sample [deg].
+        early_stop_samples: Consecutive calm samples, 0.05 s apart, that end the simulation.
+        chatter_displacement: The simulation also ends when no object was farther than this from
+            its present position for 0.5 s [m], or rotated by more than `early_stop_tilt_deg`.
+            Light objects under heavy ones chatter without moving and exceed `early_stop_speed`.
     """
 
     time_step: Annotated[float, InRange(1e-4, 0.02)] = 0.002
@@ -86,11 +92,12 @@ class ExplorationConfig:
     """The exploration task.
 
     Attributes:
-        max_moves: Moves after which an episode ends.
-        detection_reward: Per newly detected object.
-        collapse_penalty: Added when a move makes the scene collapse, which ends the episode.
-        clearance: Kept between a placed object's footprint and anything else that the camera sees in the way [m].
-        release_height: Above its support, at which a placed object is let go [m].
+        max_moves: Moves after which an episode is truncated.
+        detection_reward: Reward for each newly detected object.
+        collapse_penalty: Reward for a move that makes the scene collapse, which ends the episode.
+        clearance: Distance kept between a placed object's footprint and anything else that the
+            camera sees [m].
+        release_height: Height above its support at which an object is released [m].
     """
 
     max_moves: Annotated[int, InRange(1)] = 10
@@ -106,7 +113,7 @@ class ClutterConfig:
 
     Attributes:
         layout: How a graph becomes poses.
-        settle: What counts as stable.
+        settle: How scenes settle and what counts as stable.
         exploration: The exploration task.
         cell: Robot, gripper, support, cameras and fixtures.
     """
@@ -118,12 +125,12 @@ class ClutterConfig:
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> ClutterConfig:
-    """Return the simulated world, see `load_config_as`."""
+    """Return the simulated world; see `load_config_as`."""
     return load_config_as(ClutterConfig(), path, settings, upgrade_config)
 
 
 def upgrade_config(given: Any) -> Any:
-    """Return a document with the camera, tray and arm of version 0.1 in its cell."""
+    """Return a config document with the camera, tray and arm of version 0.1 in its cell."""
     if not isinstance(given, dict):
         return given
     upgraded = {
@@ -148,14 +155,17 @@ def upgrade_config(given: Any) -> Any:
 
 
 def _merge_over(base: Any, given: Any) -> Any:
-    """Return what moved from elsewhere with what is given over it."""
+    """Return `base` with the entries of `given` over its own."""
     if not isinstance(given, dict) or not isinstance(base, dict):
         return given
     return {**base, **{key: _merge_over(base.get(key), value) for key, value in given.items()}}
 
 
 def upgrade_record_head(given: Any) -> Any:
-    """Return a document that holds configs of version 0.1, with complete cells instead of their cameras and arms."""
+    """Return the header of a results file of version 0.1 in the form of this version.
+
+    Configs in it get the current names of fields, and complete cells instead of cameras and arms.
+    """
     return _complete_configs(upgrade_config(given))
 
 
@@ -181,7 +191,10 @@ def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
 
 
 def upgrade_cell(old: Any) -> Any:
-    """Return a cell's document with the arm of version 0.1 (base, home, suction, payload) as its robot and gripper."""
+    """Return the document of a cell with the arm of version 0.1 as its robot and gripper.
+
+    Version 0.1 has the fields `base`, `home`, `suction` and `payload`.
+    """
     if not isinstance(old, dict):
         return old
     robot = {key: old[key] for key in ("home", "payload") if key in old}

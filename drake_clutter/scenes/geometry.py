@@ -1,4 +1,4 @@
-"""Geometry of convex pieces: how deep two objects penetrate, which touch, which rest on one; and of motions."""
+"""Penetration and contact of convex objects, and rigid motions."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -12,27 +12,35 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 MAX_PENETRATION = 0.001
-"""m; a scene whose objects penetrate deeper is refused. Settled objects rest within about 0.01 mm of each other."""
+"""Deepest penetration of two objects in a valid scene file [m].
+
+Settled objects overlap by about 0.01 mm.
+"""
 
 _PARALLEL = 1e-9
+"""Cross products of unit edges shorter than this give no separating axis."""
 
 
 class _Polytope:
-    """Corners (V, 3), face normals (F, 3) and edge directions (E, 3) of a convex piece; directions without repeats."""
+    """A convex piece, reduced to what the separating-axis test needs.
+
+    Attributes:
+        corners: Corners [m]. Shape (V, 3).
+        normals: Directions of the face normals, without repeats. Shape (F, 3).
+        edges: Directions of the edges, without repeats. Shape (E, 3).
+    """
 
     def __init__(self, corners: NDArray[np.float64]) -> None:
         hull = ConvexHull(corners)
         self.corners = corners[hull.vertices]
         self.normals = _distinct_directions(hull.equations[:, :3])
-        # An edge of the hull joins two triangles of different planes; the others only cut a face.
+        # An edge joins two triangles of different planes; the other edges only divide a face.
         edges = []
-        for triangle, neighbours in enumerate(hull.neighbors):
-            for opposite, neighbour in enumerate(neighbours):
-                bends = (
-                    np.abs(hull.equations[triangle, :3] - hull.equations[neighbour, :3]).max()
-                    > 1e-6
-                )
-                if neighbour > triangle and bends:
+        for triangle, neighbors in enumerate(hull.neighbors):
+            for opposite, neighbor in enumerate(neighbors):
+                normals = hull.equations[[triangle, neighbor], :3]
+                bends = np.abs(normals[0] - normals[1]).max() > 1e-6
+                if neighbor > triangle and bends:
                     start, end = np.delete(hull.simplices[triangle], opposite)
                     edges.append(corners[end] - corners[start])
         self.edges = _distinct_directions(np.asarray(edges))
@@ -58,23 +66,31 @@ def _pieces(object_class: ObjectClass) -> tuple[_Polytope, ...]:
 def _piece_penetration(
     a: _Polytope, b: _Polytope, first: SceneObject, second: SceneObject
 ) -> float:
-    """Separating-axis test: the least overlap over all face normals and pairs of edges; negative is a gap."""
-    R_a, R_b = first.X_TO.rotation, second.X_TO.rotation
-    edges_a, edges_b = a.edges @ R_a.T, b.edges @ R_b.T
+    """Return the penetration depth of two pieces by the separating-axis test [m].
+
+    It is the smallest overlap along all face normals and cross products of edges (Gottschalk et al.
+    1996); a negative value is a gap.
+    """
+    R_a = first.X_TO.rotation
+    R_b = second.X_TO.rotation
+    edges_a = a.edges @ R_a.T
+    edges_b = b.edges @ R_b.T
     crosses = np.cross(edges_a[:, None], edges_b[None]).reshape(-1, 3)
     lengths = np.linalg.norm(crosses, axis=1)
     crosses = crosses[lengths > _PARALLEL] / lengths[lengths > _PARALLEL, None]
     axes = np.vstack([a.normals @ R_a.T, b.normals @ R_b.T, crosses])
-    spread_a, spread_b = first.X_TO.apply(a.corners) @ axes.T, second.X_TO.apply(b.corners) @ axes.T
-    overlap = np.minimum(spread_a.max(0) - spread_b.min(0), spread_b.max(0) - spread_a.min(0))
+    extent_a = first.X_TO.apply(a.corners) @ axes.T
+    extent_b = second.X_TO.apply(b.corners) @ axes.T
+    overlap = np.minimum(extent_a.max(0) - extent_b.min(0), extent_b.max(0) - extent_a.min(0))
     return float(overlap.min())
 
 
 def penetration_depth(first: SceneObject, second: SceneObject) -> float:
-    """How deep two objects penetrate, m: the least translation that parts them; negative or zero when they do not.
+    """Return the smallest translation that separates two objects [m].
 
-    A cylinder is judged as the 32-sided prism inscribed in it, so the depth of a curved contact reads up to 0.5 % of the
-    radius too small.
+    It is zero or negative for objects that do not penetrate each other. A cylinder is represented
+    by an inscribed prism of 32 sides, so the depth of a curved contact is too small by up to 0.5 %
+    of the radius.
     """
     lower_a, upper_a = first.bounds_T
     lower_b, upper_b = second.bounds_T
@@ -89,7 +105,10 @@ def penetration_depth(first: SceneObject, second: SceneObject) -> float:
 
 
 def max_penetration(objects: Sequence[SceneObject]) -> tuple[float, str, str]:
-    """The deepest penetration of any two objects, m, and their names; (-inf, "", "") for fewer than two objects."""
+    """Return the deepest penetration of any two objects [m], and their names.
+
+    For fewer than two objects it is (-inf, "", "").
+    """
     deepest = (-np.inf, "", "")
     for first, second in combinations(objects, 2):
         deepest = max(
@@ -103,7 +122,12 @@ def max_penetration(objects: Sequence[SceneObject]) -> tuple[float, str, str]:
 def group_touching_objects(
     objects: Sequence[SceneObject], margin: float
 ) -> list[list[SceneObject]]:
-    """The objects in groups that cannot touch each other: their axis-aligned boxes are more than `margin` (m) apart."""
+    """Return the objects in groups that cannot touch each other.
+
+    Args:
+        objects: Objects of a scene.
+        margin: Objects whose axis-aligned boxes are at most this far apart share a group [m].
+    """
     adjacency = nx.Graph()
     adjacency.add_nodes_from(range(len(objects)))
     for i, j in combinations(range(len(objects)), 2):
@@ -114,7 +138,13 @@ def group_touching_objects(
 
 
 def transport_pose(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
-    """Where an object O is after a motion that took a frame A, fixed to it, from one pose to another."""
+    """Return the pose of an object O that moves rigidly with a frame A.
+
+    Args:
+        X_TA: Pose of A before the motion.
+        X_TA_new: Pose of A after the motion.
+        X_TO: Pose of the object before the motion.
+    """
     R = X_TA_new.rotation @ X_TA.rotation.T
     return Pose.from_rotation(R @ X_TO.rotation, X_TA_new.p + R @ (np.asarray(X_TO.p) - X_TA.p))
 
@@ -122,7 +152,15 @@ def transport_pose(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
 def objects_resting_on(
     picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004
 ) -> tuple[str, ...]:
-    """The names of the objects that stand or lean on the picked one: they touch it and reach over it."""
+    """Return the names of the objects that stand or lean on an object.
+
+    Their bounding boxes begin where the object's ends, and overlap it seen from above.
+
+    Args:
+        picked: The object that may carry others.
+        objects: Objects of the scene.
+        margin: Tolerance of the height, and smallest overlap that counts [m].
+    """
     names = []
     for other in objects:
         if other is picked:

@@ -1,4 +1,4 @@
-"""What crosses the three seams: verdicts, moves and outcomes, observations; and the protocols of the parts that are exchanged."""
+"""Data types and protocols shared by judges, executors, detectors and policies."""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +16,10 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene
 
 
 class InstabilityReason(Enum):
-    """Why a scene is not stable."""
+    """Why a scene is not stable.
+
+    A simulation reports the first four, the static judge the last three.
+    """
 
     TOPPLED = "toppled"
     SLID = "slid"
@@ -29,15 +32,13 @@ class InstabilityReason(Enum):
 
 @dataclass(frozen=True)
 class Instability:
-    """The object that did not stay, and how.
+    """The object that did not stay in place, and how it failed.
 
     Attributes:
-        reason: toppled (turned past the limit), slid (moved past it, sideways or down, not turned), left the tray,
-            or still moving at the end; of a judge that simulates no motion: no contact forces hold it, they do only on a line
-            on which it rolls, or nothing is under it.
-        object: its name.
-        displacement: m, of its origin; 0 if no motion was simulated.
-        tilt: rad, see `tilt_between`; likewise.
+        reason: How the object failed.
+        object: Name of the object.
+        displacement: Displacement of its origin [m]; 0 if no motion was simulated.
+        tilt: Rotation, see `tilt_between` [rad]; 0 if no motion was simulated.
     """
 
     reason: InstabilityReason
@@ -48,18 +49,22 @@ class Instability:
     def __str__(self) -> str:
         if not self.displacement and not self.tilt:
             return f"{self.object} {self.reason.value}"
-        return f"{self.object} {self.reason.value} ({1000 * self.displacement:.0f} mm, {math.degrees(self.tilt):.0f} deg)"
+        amount = f"{1000 * self.displacement:.0f} mm, {math.degrees(self.tilt):.0f} deg"
+        return f"{self.object} {self.reason.value} ({amount})"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a judge says of a scene.
+    """A judge's result for a scene.
 
     Attributes:
-        instability: None for a stable scene.
-        settled: X_TO of every object after settling, by name. Of an unstable scene: as far as it was followed.
-        visible_fractions: of its unoccluded pixels, what the camera sees of each object, 0 to 1, by name; empty if unstable.
-        hidden: the objects whose visible share is below the config's threshold, in the scene's order; empty if unstable.
+        instability: The failed object, or None for a stable scene.
+        settled: X_TO of every object at the end, by name. A fall is followed only until it is
+            detected.
+        visible_fractions: Fraction of each object's unoccluded pixels that the camera sees, by
+            name; empty for an unstable scene.
+        hidden: Objects whose visible fraction is below the camera's threshold, in the order of
+            the scene; empty for an unstable scene.
     """
 
     instability: Instability | None
@@ -69,12 +74,12 @@ class Verdict:
 
     @property
     def stable(self) -> bool:
-        """Whether nothing moved or turned past the limits, left the tray, or was still moving."""
+        """Whether no object moved or rotated past the limits, left the support or kept moving."""
         return self.instability is None
 
 
 class InconclusiveReason(Enum):
-    """What is beyond a judge's model of a scene."""
+    """What a judge's model of a scene does not cover."""
 
     LEANING = "leans"
     NOT_CONVEX = "is not convex"
@@ -88,11 +93,11 @@ class InconclusiveReason(Enum):
 
 @dataclass(frozen=True)
 class InconclusiveVerdict:
-    """A judge's answer to a scene that its model does not cover; `DrakeJudge` judges all.
+    """A judge's result for a scene that its model does not cover. `DrakeJudge` covers every scene.
 
     Attributes:
-        reason: what is beyond the model.
-        object: the name of the first object of which it is true.
+        reason: What the model does not cover.
+        object: Name of the first object to which the reason applies.
     """
 
     reason: InconclusiveReason
@@ -103,19 +108,24 @@ class InconclusiveVerdict:
 
 
 class SceneJudge(Protocol):
-    """Says whether a scene is stable and what it hides."""
+    """Decides whether a scene is stable and which objects it hides."""
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | InconclusiveVerdict:
-        """The verdict; `rng` draws the random offsets that no exact balance survives."""
+        """Return the verdict.
+
+        Args:
+            scene: The scene to judge.
+            rng: Draws small random offsets of the objects, which remove unstable equilibria.
+        """
 
 
 @dataclass(frozen=True)
 class Move:
-    """Pick one object, put it on another or on the tray.
+    """Pick one object and place it on another one or on the tray.
 
     Attributes:
-        pick: the object's name.
-        place: the name of the object to put it on, or `TRAY`.
+        pick: Name of the object to pick.
+        place: Name of the object to place it on, or `TRAY`.
     """
 
     pick: str
@@ -127,7 +137,7 @@ class Move:
 
 @dataclass(frozen=True)
 class PickPlaceCommand:
-    """A move with its poses, ready to be carried out.
+    """A move with its poses, ready to be executed.
 
     Attributes:
         move: What to pick, and on what to place it.
@@ -158,11 +168,13 @@ class MoveResult(Enum):
 
 @dataclass(frozen=True)
 class ArmState:
-    """An arm at a time.
+    """State of an arm at one time.
 
     Attributes:
-        q, v, torque: rad, rad/s, and N m of the motors, by joint.
-        suction: whether the vacuum is switched on.
+        q: Joint positions [rad]. Shape (n,).
+        v: Joint velocities [rad/s]. Shape (n,).
+        torque: Torques of the motors [N m]. Shape (n,).
+        suction: Whether the vacuum is switched on.
     """
 
     q: tuple[float, ...]
@@ -173,12 +185,12 @@ class ArmState:
 
 @dataclass(frozen=True)
 class MotionSample:
-    """Where the objects were at a time.
+    """Poses of the objects at one time of a motion.
 
     Attributes:
-        time: s since the move began.
-        poses: X_TO by name.
-        arm: that carries them; None if they move by themselves.
+        time: Time since the move began [s].
+        poses: X_TO of the objects, by name.
+        arm: State of the arm that moves them, or None.
     """
 
     time: float
@@ -188,16 +200,16 @@ class MotionSample:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a move led to.
+    """Result of an executed command.
 
     Attributes:
-        result: placed, collapsed, dropped on the way, or why it could not be carried out.
-        scene: the scene afterwards; the scene before, if the move could not be carried out.
-        instability: what did not stay, when it collapsed.
-        motion: for pictures: from when the picked object was let go, or of a robot's whole move.
-        X_TO_released: X_TO where the picked object was let go.
-        inconclusive: what is beyond the executor's model, when that is the result.
-        detail: in words, why no plan was found, or how well it was carried out.
+        result: How the move ended.
+        scene: The scene after the move; the scene before it if nothing was moved.
+        instability: The failed object of a collapsed scene.
+        motion: Recorded motion: a robot's whole move, or from the release of the picked object.
+        inconclusive: What the executor's model does not cover, if that is the result.
+        detail: Reason why no plan was found, or a remark on the execution.
+        X_TO_released: Pose at which the picked object was released.
     """
 
     result: MoveResult
@@ -211,14 +223,15 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Detection:
-    """An object that the detector reports.
+    """An object reported by a detector.
 
     Attributes:
-        name: the same object keeps its name from image to image.
-        object_class: its class.
-        X_TO: its pose in the tray frame.
-        mask: (height, width) bool, its pixels.
-        is_confident: whether all that was looked at says so; without that, what was known before may be right.
+        name: Name of the object, which stays the same from image to image.
+        object_class: Class of the object.
+        X_TO: Pose in the support's frame.
+        mask: Pixels of the object. Shape (height, width), bool.
+        is_confident: Whether all evidence supports the detection. Without confidence, an earlier
+            estimate of the object may be better.
     """
 
     name: str
@@ -230,15 +243,15 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the camera has shown at one time; it holds nothing that is hidden.
+    """One image of the camera with its detections. It holds nothing that is hidden.
 
-    Observations are equal only to themselves, so that what follows from one can be cached.
+    Observations compare by identity, so that results derived from one can be cached.
 
     Attributes:
-        depth: (height, width) m along the camera's axis, inf where nothing is seen.
-        detections: V_t, the objects that can be detected now.
-        camera: what has seen it.
-        support: what the objects stand on.
+        depth: Depth along the camera's axis, inf where nothing is seen [m]. Shape (height, width).
+        detections: V_t, the objects that are detected in the image.
+        camera: The camera that took the image.
+        support: The support that the objects stand on.
     """
 
     depth: NDArray[np.float32]
@@ -247,21 +260,20 @@ class Observation:
     support: Support
 
     def __getitem__(self, name: str) -> Detection:
-        """The detection of a name.
+        """Return the detection of a name.
 
         Raises:
-            KeyError: the object is not in view.
+            KeyError: No detection has this name.
         """
         for detection in self.detections:
             if detection.name == name:
                 return detection
-        raise KeyError(
-            f"object {name!r} is not in view; in view are {', '.join(d.name for d in self.detections)}"
-        )
+        visible = ", ".join(detection.name for detection in self.detections)
+        raise KeyError(f"object {name!r} is not in view; in view are {visible}")
 
 
 class MoveExecutor(Protocol):
-    """Carries out commands in a scene at rest."""
+    """Executes commands in a scene at rest."""
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
         """Return the outcome of a command.

@@ -1,4 +1,4 @@
-"""From a terminal graph to poses: objects in their resting poses, pairs with their gap, stacks side by side on the tray."""
+"""From a terminal graph to poses: resting orientations, pairs, and stacks side by side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ class LayoutFailure:
     """A graph that cannot be laid out.
 
     Attributes:
-        reason: why.
-        required: m^2, area of the stacks' footprints, or m, height of the highest stack.
-        available: m^2, area of the tray, or m, the height allowed.
+        reason: Why it cannot be laid out.
+        required: Area of the stacks' footprints [m^2], or height of the highest stack [m].
+        available: Area of the support [m^2], or largest allowed height [m].
     """
 
     reason: LayoutFailureReason
@@ -44,11 +44,12 @@ class LayoutFailure:
 
 
 class _RestingPose(NamedTuple):
-    """An object class at rest; lengths in m, axes those of T, origin the object's.
+    """An object class in a resting orientation, in the axes of T about the object's origin.
 
     Attributes:
-        quaternion: (4,) of R_TO.
-        lower, upper: (3,) of its box along the axes.
+        quaternion: Quaternion (w, x, y, z) of R_TO.
+        lower: Lower corner of the axis-aligned bounding box [m]. Shape (3,).
+        upper: Upper corner of the axis-aligned bounding box [m]. Shape (3,).
     """
 
     quaternion: tuple[float, float, float, float]
@@ -64,12 +65,13 @@ def _resting_pose(object_class: ObjectClass, orientation: Orientation) -> _Resti
 
 
 class Stack:
-    """What stands on one single or one pair, laid out over the tray's centre.
+    """One object or pair on the support with everything above it, centered on the support.
 
     Attributes:
-        nodes: of its objects in the graph, each below what it carries.
-        p_T: (n, 3) m, their origins.
-        lower, upper: (3,) m, its box along the axes.
+        nodes: Graph nodes of its objects, each before the objects that it carries.
+        p_T: Origins of the objects [m]. Shape (n, 3).
+        lower: Lower corner of the axis-aligned bounding box [m]. Shape (3,).
+        upper: Upper corner of the axis-aligned bounding box [m]. Shape (3,).
     """
 
     def __init__(
@@ -79,13 +81,25 @@ class Stack:
         bottom: Sequence[int],
         config: LayoutConfig,
     ) -> None:
-        """Lays out a stack whose attributes are all terminal; `bottom`: the single or the pair that stands on the tray."""
+        """Lay out a stack.
+
+        Args:
+            graph: A terminal graph.
+            classes: Object classes by name.
+            bottom: Node of the object, or nodes of the pair, on the support.
+            config: Gaps between the objects of a pair.
+        """
         self.nodes: list[int] = []
-        self._graph, self._classes, self._resting = graph, classes, list[_RestingPose]()
+        self._graph = graph
+        self._classes = classes
+        self._resting = list[_RestingPose]()
         origins: list[list[float]] = []
-        floor, level, parent = 0.0, list(bottom), ClutterGraph.TRAY_NODE
+        floor = 0.0
+        level = list(bottom)
+        parent = ClutterGraph.TRAY_NODE
         while level:
-            orientation = graph.edge_kind(parent, level[0])  # a pair's two are alike
+            # Both objects of a pair have the same orientation.
+            orientation = graph.edge_kind(parent, level[0])
             assert isinstance(orientation, Orientation), "layout needs a terminal graph"
             resting = _resting_pose(classes[graph.kind(level[0])], orientation)
             offset = 0.0
@@ -120,7 +134,7 @@ class Stack:
         )
 
     def objects(self, x: float = 0.0, y: float = 0.0) -> list[SceneObject]:
-        """The stack's objects, the stack moved by x and y (m)."""
+        """Return the objects of the stack, moved by x and y [m]."""
         objects = []
         for node, resting, (px, py, pz) in zip(
             self.nodes, self._resting, (self.p_T + np.array([x, y, 0.0])).tolist(), strict=True
@@ -143,7 +157,17 @@ def _sample_positions(
     config: LayoutConfig,
     rng: np.random.Generator,
 ) -> NDArray[np.float64] | None:
-    """(S, 2) m, centres of S rectangles on the support's floor, gap kept; None if no draw fits. Large ones are drawn first."""
+    """Sample positions of rectangles on the support that keep the gap, large rectangles first.
+
+    Args:
+        half_sizes: Half sizes of S rectangles [m]. Shape (S, 2).
+        support: The support.
+        config: Gap and number of attempts.
+        rng: Random generator.
+
+    Returns:
+        Centers of the rectangles [m], shape (S, 2), or None if no attempt succeeded.
+    """
     reach = support.half_size - config.stack_gap - half_sizes
     if (reach < 0).any():
         return None
@@ -172,18 +196,19 @@ def lay_out(
     rng: np.random.Generator,
     seed: int | None = None,
 ) -> Scene | LayoutFailure:
-    """A scene from a terminal graph.
+    """Return a scene for a terminal graph, or the reason why there is none.
 
-    A child stands centred on its parent's top; a pair's two objects stand beside each other along the tray's y, their gap
-    over the parent's centre; a dummy is the pair's centre and top. Stacks keep their orientation and are put uniformly at
-    random where their axis-aligned footprints keep the config's gap.
+    A child stands centered on its parent's top. The two objects of a pair stand side by side along
+    the tray's y axis, with their gap over the parent's center; a dummy node represents the pair's
+    center and top. Stacks keep their orientation and get uniformly random positions at which their
+    axis-aligned footprints keep the gap.
 
     Args:
-        derivation: a terminal graph and its rules.
-        classes: by name.
-        config: gaps, and the support.
-        rng: draws the stacks' places.
-        seed: noted in the scene.
+        derivation: A terminal graph and its rules.
+        classes: Object classes by name.
+        config: Gaps and support.
+        rng: Draws the positions of the stacks.
+        seed: Seed to record in the scene.
     """
     graph = derivation.graph
     stacks = [Stack(graph, classes, bottom, config.layout) for bottom in graph.stack_bases()]

@@ -1,4 +1,8 @@
-"""Space into which the camera has not seen: for a planner that knows only K_t, it is full."""
+"""Conservative occlusion volumes for planning under partial observability.
+
+They are boxes over the space behind or below known objects, and over depth points that belong to no
+known object. A planner that knows only the observed objects must treat them as solid.
+"""
 
 import math
 from collections.abc import Sequence
@@ -15,30 +19,44 @@ from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.scene import SceneObject
 
 _MIN_HIDDEN_HEIGHT = 0.012
-"""m; nothing lies hidden under less, and what is no higher above the tray is noise."""
+"""Smallest free height in which an object can be hidden [m].
+
+Depth points no higher than this above the floor are sensor noise.
+"""
 _SHADOW_GAP = 0.003
-"""m, between an object and its shadow: where faces just touch, Drake's distances fail by rounding."""
+"""Gap between an object and the box below it [m].
+
+Drake's distance queries are unreliable where faces just touch.
+"""
 _SURFACE_TOLERANCE = 0.008
-"""m, from a known object; what is seen there is taken for its surface."""
+"""Depth points this close to a known object count as its surface [m]."""
 _MIN_POINTS = 12
-"""Of the pixels looked at, for something that nobody has told the name of; fewer are noise at edges."""
+"""Fewest unidentified depth points that form a box; fewer are noise at edges."""
 _EDGE_WINDOW = 25
-"""Pixels; what is seen so near to the arm, or to the rim, may be a shadow of it that a depth camera cannot see into."""
+"""Side of the window around a pixel that must be free of the arm and the rim [pixels].
+
+Closer to them, a depth camera has shadows of its own.
+"""
 _TOP_QUANTILE = 0.98
-"""Quantile of the heights of what is seen of something nameless: single pixels beyond are noise."""
+"""Quantile of the heights of unidentified points at which a box ends; above are outliers."""
 _PIXEL_STRIDE = 2
-"""Pixels, each way, of which one is looked at."""
-_COLUMN_SIZE, _HEIGHT_RESOLUTION, _BOX_HEIGHT_STEP = 0.02, 0.01, 0.03
-"""m, side of the columns into which the space behind objects is cut, how fine their heights are, and
-by how much the heights of one block differ."""
+"""Every so many-th pixel is used, in both directions."""
+_COLUMN_SIZE = 0.02
+"""Side of the vertical columns into which the space behind objects is cut [m]."""
+_HEIGHT_RESOLUTION = 0.01
+"""Resolution of the columns' heights [m]."""
+_BOX_HEIGHT_STEP = 0.03
+"""Largest difference of the heights of columns that form one box [m]."""
 
 
 @dataclass(frozen=True)
 class OccludedBox:
-    """An upright block on the tray's floor that may be full.
+    """An upright box on the support's floor that may contain hidden objects.
 
     Attributes:
-        center: (3,) m, in T. size: (3,) m. yaw: rad, about T's vertical.
+        center: Center in T [m]. Shape (3,).
+        size: Extents along the axes of the box [m]. Shape (3,).
+        yaw: Rotation about T's z axis [rad].
     """
 
     center: tuple[float, float, float]
@@ -47,27 +65,34 @@ class OccludedBox:
 
     @property
     def top_height(self) -> float:
-        """m above the tray's floor."""
+        """Height of the top above the support's floor [m]."""
         return self.size[2]
 
     @staticmethod
     def below_points(points_T: NDArray[np.floating], top: float) -> "OccludedBox":
-        """From the floor up to `top`, m, on the least rectangle around points (N, 2 or more) m."""
-        to_middle, (length, width) = oriented_bounds_2D(points_T[:, :2])  # type: ignore[no-untyped-call]
-        x, y = np.linalg.inv(to_middle)[:2, 2]
-        yaw = -math.atan2(to_middle[1, 0], to_middle[0, 0])
+        """Return the box from the floor up to a height, with the smallest base around points.
+
+        Args:
+            points_T: Points, of which only x and y are used [m]. Shape (N, 2) or (N, 3).
+            top: Height of the box [m].
+        """
+        bounds = oriented_bounds_2D(points_T[:, :2])  # type: ignore[no-untyped-call]
+        to_center, (length, width) = bounds
+        x, y = np.linalg.inv(to_center)[:2, 2]
+        yaw = -math.atan2(to_center[1, 0], to_center[0, 0])
         return OccludedBox((float(x), float(y), top / 2), (float(length), float(width), top), yaw)
 
 
 def occluded_boxes(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> tuple[OccludedBox, ...]:
-    """What lies in the shadow of known objects, and under what is seen but belongs to none of them.
+    """Return boxes over the occluded space and over everything seen that is not a known object.
 
     Args:
-        known_objects: K_t, where they are now.
-        observation: the latest.
-        empty_depth: (height, width) m, the depth that the camera shows of the cell with nothing on the tray, the arm at home.
+        known_objects: K_t, the known objects at their present poses.
+        observation: Latest observation.
+        empty_depth: Depth image of the cell with an empty support and the arm at home [m].
+            Shape (height, width).
     """
     lower = [float(o.bounds_T[0][2]) for o in known_objects]
     shadows = [
@@ -82,85 +107,104 @@ def occluded_boxes(
 def _boxes_behind(
     known_objects: Sequence[SceneObject], observation: Observation
 ) -> list[OccludedBox]:
-    """What a camera that looks at an angle cannot see behind known objects.
+    """Return boxes over the space that a tilted camera cannot see behind known objects.
 
-    What is so near to them that nothing has room in between is left out.
+    The space is cut into vertical columns. Space closer to an object than the surface tolerance is
+    left out, as nothing fits in between.
     """
-    p_TC, top = (
-        observation.camera.X_TC.translation(),
-        max((o.top_height for o in known_objects), default=0.0),
-    )
+    p_TC = observation.camera.X_TC.translation()
+    top = max((o.top_height for o in known_objects), default=0.0)
     x, y = (
         np.arange(-count, count + 1) * (_COLUMN_SIZE / 2)
         for count in (int(side / _COLUMN_SIZE) for side in observation.support.size)
     )
     z = np.arange(_MIN_HIDDEN_HEIGHT, top, _HEIGHT_RESOLUTION)
-    p_TP = np.stack(
-        np.meshgrid(x, y, z, indexing="ij"), axis=-1
-    )  # corners of the columns, and in between their middles
-    shadow, own = np.zeros(p_TP.shape[:3], bool), np.zeros(p_TP.shape[:3], bool)
+    # Odd indices are the centers of the columns, even ones their corners.
+    p_TP = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    is_hidden = np.zeros(p_TP.shape[:3], bool)
+    is_at_object = np.zeros(p_TP.shape[:3], bool)
     for o in known_objects:
-        half, R = np.asarray(o.object_class.size) / 2, o.X_TO.rotation
-        p_OP, p_OC = (p_TP - o.X_TO.p) @ R, (p_TC - o.X_TO.p) @ R
+        half = np.asarray(o.object_class.size) / 2
+        R = o.X_TO.rotation
+        p_OP = (p_TP - o.X_TO.p) @ R
+        p_OC = (p_TC - o.X_TO.p) @ R
+        # Slab test: where the ray from the camera (0) to the point (1) is inside the object's box.
         ray = np.where(np.abs(p_OP - p_OC) > 1e-12, p_OP - p_OC, 1e-12)
-        ray_center, half_span = -p_OC / ray, half / np.abs(ray)
-        enters, leaves = (
-            (ray_center - half_span).max(axis=-1),
-            (ray_center + half_span).min(axis=-1),
-        )
-        shadow |= (enters < leaves) & (enters < 1)
-        own |= (np.abs(p_OP) < half + _COLUMN_SIZE / 2 + _SURFACE_TOLERANCE).all(axis=-1)
-    full = maximum_filter(shadow, (3, 3, 1))[1::2, 1::2] & ~own[1::2, 1::2]
-    heights = np.where(full, np.minimum(z + _HEIGHT_RESOLUTION, top), 0.0).max(axis=2, initial=0.0)
-    x, y = x[1::2], y[1::2]
-    blocks = []
-    for row, across in zip(heights, x, strict=True):
+        ray_center = -p_OC / ray
+        half_span = half / np.abs(ray)
+        enters = (ray_center - half_span).max(axis=-1)
+        leaves = (ray_center + half_span).min(axis=-1)
+        is_hidden |= (enters < leaves) & (enters < 1)
+        near = half + _COLUMN_SIZE / 2 + _SURFACE_TOLERANCE
+        is_at_object |= (np.abs(p_OP) < near).all(axis=-1)
+    is_occluded = maximum_filter(is_hidden, (3, 3, 1))[1::2, 1::2] & ~is_at_object[1::2, 1::2]
+    cell_tops = np.minimum(z + _HEIGHT_RESOLUTION, top)
+    heights = np.where(is_occluded, cell_tops, 0.0).max(axis=2, initial=0.0)
+    boxes = []
+    y = y[1::2]
+    for row, x_center in zip(heights, x[1::2], strict=True):
         ends = np.flatnonzero(np.diff(np.ceil(row / _BOX_HEIGHT_STEP), prepend=0, append=0))
         for begin, end in pairwise(ends.tolist()):
             if row[begin] > 0:
-                height, along = float(row[begin:end].max()), (y[begin] + y[end - 1]) / 2
+                height = float(row[begin:end].max())
+                y_center = (y[begin] + y[end - 1]) / 2
                 size = (_COLUMN_SIZE, _COLUMN_SIZE * (end - begin), height)
-                blocks.append(OccludedBox((float(across), float(along), height / 2), size, 0.0))
-    return blocks
+                center = (float(x_center), float(y_center), height / 2)
+                boxes.append(OccludedBox(center, size, 0.0))
+    return boxes
 
 
 def objects_below_unidentified_points(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> frozenset[str]:
-    """The names of known objects right above which something is seen that belongs to none of them: it may lie on them.
+    """Return the names of known objects on which an unidentified object may lie.
 
-    Arguments: as of `occluded_boxes`.
+    These have depth points right above them that belong to no known object.
+
+    Args:
+        known_objects: See `occluded_boxes`.
+        observation: See `occluded_boxes`.
+        empty_depth: See `occluded_boxes`.
     """
     p_TP, _ = _unidentified_points(known_objects, observation, empty_depth)
-    found = set[str]()
+    names = set[str]()
     for o in known_objects:
         p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
-        level = np.arange(3) != np.abs(o.X_TO.rotation[2]).argmax()
-        over = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2)[:, level].all(axis=1) & (
-            p_TP[:, 2] > o.top_height + _MIN_HIDDEN_HEIGHT
-        )
-        if over.sum() >= _MIN_POINTS:
-            found.add(o.name)
-    return frozenset(found)
+        horizontal_axes = np.arange(3) != np.abs(o.X_TO.rotation[2]).argmax()
+        is_within = np.abs(p_OP) < np.asarray(o.object_class.size) / 2
+        is_higher = p_TP[:, 2] > o.top_height + _MIN_HIDDEN_HEIGHT
+        is_above = is_within[:, horizontal_axes].all(axis=1) & is_higher
+        if is_above.sum() >= _MIN_POINTS:
+            names.add(o.name)
+    return frozenset(names)
 
 
 def _unidentified_boxes(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> list[OccludedBox]:
-    p_TP, part = _unidentified_points(known_objects, observation, empty_depth)
-    blocks = []
-    for k in np.unique(part):
-        points = p_TP[part == k]
+    """Return a box for each patch of depth points that belong to no known object."""
+    p_TP, patch = _unidentified_points(known_objects, observation, empty_depth)
+    boxes = []
+    for k in np.unique(patch):
+        points = p_TP[patch == k]
         if len(points) >= _MIN_POINTS and np.ptp(points[:, :2], axis=0).min() > 0:
             top = float(np.quantile(points[:, 2], _TOP_QUANTILE))
             if not observation.camera.is_vertical:
                 points = np.vstack([points, _project_to_floor(points, observation)])
-            blocks.append(OccludedBox.below_points(points, top))
-    return blocks
+            boxes.append(OccludedBox.below_points(points, top))
+    return boxes
 
 
 def _project_to_floor(p_TP: NDArray[np.float64], observation: Observation) -> NDArray[np.float64]:
-    """Return where rays through points over the support (N, 3) meet its floor or leave it [m]. Shape (N, 3)."""
+    """Return where camera rays through points meet the floor or leave the support.
+
+    Args:
+        p_TP: Points over the support [m]. Shape (N, 3).
+        observation: Observation with camera and support.
+
+    Returns:
+        End points of the rays in T [m]. Shape (N, 3).
+    """
     p_TC = observation.camera.X_TC.translation()
     ray = p_TP - p_TC
     ends = np.copysign([*observation.support.half_size, 0.0], ray)
@@ -173,23 +217,24 @@ def _project_to_floor(p_TP: NDArray[np.float64], observation: Observation) -> ND
 def _unidentified_points(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """p_TP (N, 3) m of what is seen and belongs to nothing known, and (N,) the number of the patch of the image it is in."""
+    """Return the depth points over the support that belong to no known object.
+
+    Returns:
+        p_TP [m], shape (N, 3), and the number of the connected patch of each point, shape (N,).
+    """
     camera = observation.camera
     plane = np.where(np.isfinite(camera.floor_depth), camera.floor_depth, 0)
-    z, floor = (
-        observation.depth[::_PIXEL_STRIDE, ::_PIXEL_STRIDE],
-        (minimum_filter(empty_depth - plane, _EDGE_WINDOW) + plane)[
-            ::_PIXEL_STRIDE, ::_PIXEL_STRIDE
-        ],
-    )
+    empty = minimum_filter(empty_depth - plane, _EDGE_WINDOW) + plane
+    z = observation.depth[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
+    floor = empty[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
     pixels = _PIXEL_STRIDE * pixel_grid(z.shape)
-    measured = (
-        np.isfinite(z) & (z > 0) & np.isfinite(floor)
-    )  # where nothing can be measured, a detector may have filled holes
+    # Where the empty cell has no depth, a detector may have filled holes of the image.
+    measured = np.isfinite(z) & (z > 0) & np.isfinite(floor)
     z = np.where(measured, z, np.nan)
     x, y, height = np.moveaxis(camera.backproject(pixels, z), -1, 0)
     half_x, half_y = observation.support.half_size
-    left = measured & (z < floor - _MIN_HIDDEN_HEIGHT) & (np.abs(x) < half_x) & (np.abs(y) < half_y)
+    is_on_support = (np.abs(x) < half_x) & (np.abs(y) < half_y)
+    left = measured & (z < floor - _MIN_HIDDEN_HEIGHT) & is_on_support
     for o in known_objects:
         where = np.nonzero(left)
         p_TP = np.column_stack([x[where], y[where], height[where]])

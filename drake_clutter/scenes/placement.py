@@ -1,4 +1,4 @@
-"""Where a picked object is put: the free places that the camera sees, and the draw of one."""
+"""Free placements of a picked object that the camera can verify."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,15 +20,15 @@ from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPl
 from drake_clutter.scenes.scene import TRAY, Pose
 
 CELL_SIZE = 0.005
-"""m, of the grid of places on the tray that are considered."""
+"""Side of the grid cells on the support in which placements are searched [m]."""
 _DEPTH_TOLERANCE = 0.004
-"""m, within which a measured height is taken to be a known one."""
+"""Largest difference between a measured and a known height that counts as equal [m]."""
 _HEIGHT_STEP = 0.020
-"""m between the heights at which the air over a place is looked through."""
+"""Distance between the heights at which the space above a cell is checked [m]."""
 _EDGE_MARGIN = 0.005
-"""m from the edge of the support within which no centre of mass is put."""
+"""Smallest distance between a center of mass and the edge of the carrying face [m]."""
 _YAWS = (0.0, np.pi / 2)
-"""rad by which the picked object may be turned, the first that fits is taken."""
+"""Rotations of the picked object that are tried, in this order [rad]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,10 @@ class _Grid:
         return np.column_stack([self.x[cells[:, 0]], self.y[cells[:, 1]]])
 
     def points(self, height: float) -> NDArray[np.float64]:
-        """(n * m, 3) m, the cells' centres at a height, x varying slowest."""
+        """Return the centers of all cells at a height, x varying slowest [m].
+
+        Shape (n * m, 3).
+        """
         x, y = np.meshgrid(self.x, self.y, indexing="ij")
         return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
 
@@ -66,9 +69,9 @@ class _Grid:
 def _project_to_pixels(
     camera: Camera, p_T: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Row and column of the pixel on which each of points (N, 3) m falls, and how deep it is, m.
+    """Return row, column and depth [m] of the pixels on which points (N, 3) [m] fall.
 
-    Out of the frame the depth is NaN, and the pixel any.
+    Outside of the image the depth is NaN, and the pixel is arbitrary.
     """
     pixels, depth = camera.project_with_depth(p_T)
     columns, rows = np.rint(pixels).astype(np.int64).T
@@ -83,18 +86,28 @@ def _project_to_pixels(
 
 
 def is_observed_free(observation: Observation, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether the camera sees past each point (N, 3) m in the tray frame, so that it is known to be free."""
+    """Return whether the camera sees past points, so that they are known to be free.
+
+    Args:
+        observation: What the camera sees.
+        p_T: Points in T [m]. Shape (N, 3).
+
+    Returns:
+        One bool for each point. Shape (N,).
+    """
     rows, columns, depth = _project_to_pixels(observation.camera, p_T)
     return np.asarray(observation.depth[rows, columns] >= depth)
 
 
 class _OrientedObject(NamedTuple):
-    """A picked object as it would be put down.
+    """A picked object in the orientation in which it is placed.
 
     Attributes:
-        quaternion: (4,) of R_TO; the very same if it is not turned.
-        lowest, height: m, of its lowest point below its origin (negative), and of the whole object.
-        footprint: (k, 2) cells, relative to the one under its origin, that must be free; the outermost first.
+        quaternion: Quaternion of R_TO; unchanged if the object is not rotated.
+        lowest: Height of its lowest point relative to its origin (negative) [m].
+        height: Height of the object [m].
+        footprint: Grid cells relative to that of its origin that must be free, the outermost
+            first. Shape (k, 2).
     """
 
     quaternion: tuple[float, float, float, float]
@@ -110,6 +123,7 @@ def _orient_object(
     yaw: float,
     clearance: float,
 ) -> _OrientedObject:
+    """Return an object rotated about the vertical, with its footprint and clearance."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     R_TO = (
         np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -123,7 +137,7 @@ def _orient_object(
     outside = (lines[:, :2] @ np.vstack([x.ravel(), y.ravel()]) * CELL_SIZE + lines[:, 2:]).max(
         axis=0
     )
-    # Half a cell more: no part of the footprint lies in a cell that is not looked at.
+    # Half a cell more, so that no part of the footprint lies in a cell that is not checked.
     covered = np.column_stack([x.ravel(), y.ravel()])[outside <= clearance + CELL_SIZE / 2]
     outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
     oriented = quaternion if yaw == 0 else Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)).quaternion
@@ -134,7 +148,11 @@ def _orient_object(
 
 @lru_cache(maxsize=16)
 def _tray_candidates(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(n, 2) cells of the tray, those furthest from its centre first, and (n,) minus how far, m."""
+    """Return the cells of the support and their costs, the cells farthest from its center first.
+
+    Returns:
+        Cells, shape (n, 2), and their negative distances from the center [m], shape (n,).
+    """
     grid = _Grid.over(support)
     cells = np.argwhere(np.ones((len(grid.x), len(grid.y)), bool))
     cost = -np.abs(grid.centers(cells)).max(axis=1)
@@ -145,12 +163,18 @@ def _tray_candidates(support: Support) -> tuple[NDArray[np.int64], NDArray[np.fl
 def _top_candidates(
     observation: Observation, target: Detection
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(n, 2) cells well inside what is seen of an object's top, those nearest to its middle first, and (n,) how near, m."""
+    """Return the cells on the visible part of an object's top, those nearest to its center first.
+
+    Returns:
+        Cells, shape (n, 2), and their distances from the center [m], shape (n,).
+    """
     grid = _Grid.over(observation.support)
     corners = target.X_TO.apply(target.object_class.corners)
     floor = float(corners[:, 2].max())
-    # A cell more all around: a pixel of the top's edge may lie in a cell whose middle is beside it.
-    axes, lower, upper = (grid.x, grid.y), corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    # One more cell all around: a pixel of the top's edge may lie in a cell with its center outside.
+    axes = (grid.x, grid.y)
+    lower = corners[:, :2].min(axis=0)
+    upper = corners[:, :2].max(axis=0)
     x0, y0 = (
         max(int(np.searchsorted(axis, low)) - 1, 0) for axis, low in zip(axes, lower, strict=True)
     )
@@ -173,10 +197,24 @@ def _top_candidates(
 
 @njit(cache=True)
 def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
-    """The first of the cells over which the footprint is free at all levels (m), and those of the same cost: their positions."""
+    """Return the first of the cells above which the footprint is free, and those of equal cost.
+
+    Args:
+        depth: Depth image [m]. Shape (height, width).
+        camera: `Pinhole` of the camera.
+        x: Centers of the grid's cells along x [m]. Shape (n,).
+        y: Centers of the grid's cells along y [m]. Shape (m,).
+        levels: Heights that must be free [m].
+        footprint: Cells relative to that of the origin. Shape (k, 2).
+        cells: Candidates, ordered by cost. Shape (c, 2).
+        cost: Costs of the candidates. Shape (c,).
+
+    Returns:
+        Indices of the candidates.
+    """
     height, width = depth.shape
     n, m = len(x), len(y)
-    state = np.zeros((n, m), np.int8)  # 1: free, 2: not
+    state = np.zeros((n, m), np.int8)  # 0: not checked yet, 1: free, 2: not free
     found = np.empty(len(cells), np.int64)
     count = 0
     for position in range(len(cells)):
@@ -214,12 +252,12 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
 
 
 def top_height(detection: Detection) -> float:
-    """Height of a detected object's highest point above the tray's floor, m."""
+    """Return the height of a detected object's highest point above the support's floor [m]."""
     return float(detection.X_TO.apply(detection.object_class.corners)[:, 2].max())
 
 
 def has_clear_top(observation: Observation, detection: Detection) -> bool:
-    """Whether the camera sees through the air right above the object, all over it."""
+    """Return whether the camera sees the space right above an object, over its whole top."""
     corners = detection.X_TO.apply(detection.object_class.corners)
     top = float(corners[:, 2].max())
     grid = _Grid.over(observation.support)
@@ -234,7 +272,7 @@ class FreePlacements(NamedTuple):
 
     Attributes:
         translations: p_TO [m]. Shape (n, 3), n > 0.
-        quaternion: Of R_TO, the same for all of them.
+        quaternion: Quaternion of R_TO, the same for all poses.
     """
 
     translations: NDArray[np.float64]
@@ -243,7 +281,7 @@ class FreePlacements(NamedTuple):
 
 _PlacementCache = dict[tuple[Move, ExplorationConfig], FreePlacements | None]
 _FREE_PLACEMENTS: WeakKeyDictionary[Observation, _PlacementCache] = WeakKeyDictionary()
-"""Places that have been searched for, by observation: action filters and commands ask alike."""
+"""Results of earlier searches, by observation: action filters and commands ask for the same."""
 
 
 def find_free_placements(
@@ -251,14 +289,14 @@ def find_free_placements(
     move: Move,
     config: ExplorationConfig,
 ) -> FreePlacements | None:
-    """Return the equally good places for a move, or None if no place is known to be free.
+    """Return the equally good placements for a move, or None if no placement is known to be free.
 
-    The object keeps its orientation, or is turned by a quarter about the vertical if only that
-    fits. A place is free where the camera sees through the air that the object will take up, its
-    clearance included; what lies in shadow, or where the picked object itself still is, is not.
-    On the tray the places farthest from the center are taken, where an object hides least and
-    leaves the most room; on an object, those nearest to the middle of the visible part of its top,
-    with the center of mass over that top.
+            # A tilted camera may see the space below the topmost level, but not the level.
+    fits. A placement is free where the camera sees through the space that the object will occupy,
+    with its clearance. Shadows and the space where the picked object still stands are not free.
+    On the support, the placements farthest from the center are returned: there the object occludes
+    least and leaves the most room. On an object, the placements nearest to the center of the
+    visible part of its top are returned; the center of mass is over that top.
 
     Args:
         observation: What the camera sees before the pick.
@@ -281,47 +319,44 @@ def _search_placements(
 ) -> FreePlacements | None:
     picked = observation[move.pick]
     if move.place == TRAY:
-        floor, (cells, cost) = 0.0, _tray_candidates(observation.support)
+        floor = 0.0
+        cells, cost = _tray_candidates(observation.support)
     else:
         target = observation[move.place]
-        floor, (cells, cost) = top_height(target), _top_candidates(observation, target)
+        floor = top_height(target)
+        cells, cost = _top_candidates(observation, target)
     grid = _Grid.over(observation.support)
     camera = observation.camera.pinhole
     for yaw in _YAWS:
         oriented = _orient_object(
             picked.object_class, picked.X_TO.quaternion, yaw, config.clearance
         )
-        levels = (
-            floor
-            + _DEPTH_TOLERANCE
-            + np.arange(0, oriented.height + config.release_height, _HEIGHT_STEP)
-        )
-        if (
-            not observation.camera.is_vertical
-        ):  # nothing that is seen through below speaks for what is above
+        height = oriented.height + config.release_height
+        levels = floor + _DEPTH_TOLERANCE + np.arange(0, height, _HEIGHT_STEP)
+        if not observation.camera.is_vertical:
+            # A tilted camera may see the space below the topmost level but not the level itself.
             levels = np.append(levels, floor + oriented.height + config.release_height)
         arguments = (grid.x, grid.y, levels, oriented.footprint, cells, cost)
         best = _first_free_cells(observation.depth, camera, *arguments)
         if len(best):
-            # In the order of the cells, so that a draw does not depend on how they were sorted.
+            # Order by cell, so that a random choice does not depend on the sorting by cost.
             best = best[np.lexsort(cells[best].T[::-1])]
-            height = np.full(len(best), floor + config.release_height - oriented.lowest)
-            return FreePlacements(
-                np.column_stack([grid.centers(cells[best]), height]), oriented.quaternion
-            )
+            z = np.full(len(best), floor + config.release_height - oriented.lowest)
+            translations = np.column_stack([grid.centers(cells[best]), z])
+            return FreePlacements(translations, oriented.quaternion)
     return None
 
 
 def resolve_placement(
     move: Move, observation: Observation, config: ExplorationConfig, rng: np.random.Generator
 ) -> PickPlaceCommand | None:
-    """Return the command for a move, or None if no place is known to be free.
+    """Return the command for a move, or None if no placement is known to be free.
 
     Args:
         move: What to pick and where to put it.
         observation: What the camera sees before the pick.
         config: Clearance and release height.
-        rng: Decides between equally good places.
+        rng: Draws one of several equally good placements.
 
     Raises:
         KeyError: The move names an object that is not in view.

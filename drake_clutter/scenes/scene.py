@@ -1,6 +1,7 @@
-"""Scenes: objects with class and pose on the tray, the graph they came from, and nothing of Drake.
+"""Scenes: objects with classes and poses on a support, independent of Drake.
 
-Frames: T the tray (origin on the tray's floor at its centre, z up), O an object (origin at its geometric centre).
+Frames: T is the support's frame (origin at the center of its floor, z up); O is an object's frame
+(origin at the object's geometric center).
 """
 
 import math
@@ -25,8 +26,8 @@ class Pose:
     """A rigid pose X_AB.
 
     Attributes:
-        translation: (3,) m, p_AB.
-        quaternion: (4,) w, x, y, z; of unit length.
+        translation: p_AB [m]. Shape (3,).
+        quaternion: Unit quaternion (w, x, y, z) of R_AB.
     """
 
     translation: tuple[float, float, float]
@@ -34,7 +35,12 @@ class Pose:
 
     @staticmethod
     def from_rotation(rotation: NDArray[np.float64], translation: Iterable[float]) -> "Pose":
-        """The pose with R_AB (3, 3) and p_AB (3,) m; w is not negative."""
+        """Return the pose with a rotation matrix and a translation; w is not negative.
+
+        Args:
+            rotation: R_AB. Shape (3, 3).
+            translation: p_AB [m]. Shape (3,).
+        """
         w, x, y, z = (
             float(v)
             for v in Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
@@ -44,20 +50,24 @@ class Pose:
 
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
-        """R_AB, (3, 3)."""
+        """Rotation matrix R_AB. Shape (3, 3)."""
         return np.asarray(Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix())
 
     @property
     def p(self) -> NDArray[np.float64]:
-        """p_AB, (3,) m, as an array."""
+        """Translation p_AB as an array [m]. Shape (3,)."""
         return np.asarray(self.translation)
 
     def apply(self, p_B: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (N, 3) m given in B, in A."""
+        """Return points given in B, expressed in A.
+
+        Args:
+            p_B: Points in B [m]. Shape (N, 3).
+        """
         return np.asarray(p_B @ self.rotation.T + self.p)
 
     def translated(self, offset: Iterable[float]) -> "Pose":
-        """The pose with p_AB + offset, offset (3,) m."""
+        """Return the pose translated by an offset in A (3,) [m]."""
         x, y, z = (float(v) for v in self.p + np.asarray(list(offset)))
         return replace(self, translation=(x, y, z))
 
@@ -67,10 +77,10 @@ class SceneObject:
     """One object of a scene.
 
     Attributes:
-        name: unique in the scene.
-        object_class: what it is.
-        X_TO: its pose in the tray frame.
-        node: its node in the scene's graph, or None.
+        name: Unique name in the scene.
+        object_class: Class of the object.
+        X_TO: Pose in the support's frame.
+        node: Node of the object in the scene's graph, or None.
     """
 
     name: str
@@ -80,30 +90,30 @@ class SceneObject:
 
     @cached_property
     def corners_T(self) -> NDArray[np.float64]:
-        """Corners of its convex pieces in the tray frame, (V, 3) m."""
+        """Corners of the convex pieces in T [m]. Shape (V, 3)."""
         return self.X_TO.apply(self.object_class.corners)
 
     @cached_property
     def bounds_T(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of its axis-aligned box in the tray frame, (3,) m each."""
+        """Lower and upper corner of the axis-aligned bounding box in T, (3,) each [m]."""
         return self.corners_T.min(axis=0), self.corners_T.max(axis=0)
 
     @property
     def top_height(self) -> float:
-        """Height of its highest point above the tray's floor, m."""
+        """Height of the highest point above the support's floor [m]."""
         return float(self.bounds_T[1][2])
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects on a tray.
+    """Objects on a support.
 
     Attributes:
-        objects: in order; names are unique.
-        support: what they stand on.
-        graph: the terminal graph it was laid out from, or None.
-        derivation: the names of the rules that derived the graph.
-        seed: of the batch it was drawn in, or None.
+        objects: The objects, in order; their names are unique.
+        support: The support that they stand on.
+        graph: Terminal graph from which the scene was laid out, or None.
+        derivation: Names of the rules that derived the graph.
+        seed: Seed of the batch in which the scene was generated, or None.
     """
 
     objects: tuple[SceneObject, ...]
@@ -113,10 +123,10 @@ class Scene:
     seed: int | None = None
 
     def __getitem__(self, name: str) -> SceneObject:
-        """The object of a name.
+        """Return the object of a name.
 
         Raises:
-            KeyError: no such object.
+            KeyError: No object has this name.
         """
         for scene_object in self.objects:
             if scene_object.name == name:
@@ -125,16 +135,16 @@ class Scene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The objects' names, in order."""
+        """Names of the objects, in order."""
         return tuple(scene_object.name for scene_object in self.objects)
 
     @property
     def poses(self) -> dict[str, Pose]:
-        """X_TO by name."""
+        """X_TO of the objects, by name."""
         return {scene_object.name: scene_object.X_TO for scene_object in self.objects}
 
     def with_poses(self, poses: Mapping[str, Pose]) -> "Scene":
-        """The scene with the poses of the objects that are named replaced."""
+        """Return the scene with the poses of the named objects replaced."""
         return replace(
             self,
             objects=tuple(
@@ -144,7 +154,16 @@ class Scene:
 
 
 def sample_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """(count, 3) m: for each object an offset in the tray's plane, drawn uniformly from a disc of the radius (m)."""
+    """Sample one horizontal offset for each object, uniformly from a disc.
+
+    Args:
+        count: Number of objects.
+        radius: Radius of the disc [m].
+        rng: Random generator.
+
+    Returns:
+        Offsets in T with z = 0 [m]. Shape (count, 3).
+    """
     samples = rng.random((count, 2))
     distance, angle = radius * np.sqrt(samples[:, 0]), 2 * math.pi * samples[:, 1]
     return np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)])
@@ -153,7 +172,7 @@ def sample_offsets(count: int, radius: float, rng: np.random.Generator) -> NDArr
 def perturb_poses(
     objects: Sequence[SceneObject], radius: float, rng: np.random.Generator
 ) -> list[SceneObject]:
-    """The objects, each moved by a random offset of its own."""
+    """Return the objects, each translated by a random offset; see `sample_offsets`."""
     offsets = sample_offsets(len(objects), radius, rng)
     return [
         replace(o, X_TO=o.X_TO.translated(offset))
@@ -162,7 +181,10 @@ def perturb_poses(
 
 
 def tilt_between(object_class: ObjectClass, X_TA: Pose, X_TB: Pose) -> float:
-    """How far an object has turned from pose A to pose B, rad; a body of revolution: how far its axis has."""
+    """Return the angle by which an object rotates from pose A to pose B [rad].
+
+    A rotation of a body of revolution about its own axis does not count.
+    """
     if object_class.shape is Shape.CYLINDER:
         axis_A, axis_B = X_TA.rotation[:, 2], X_TB.rotation[:, 2]
         return math.atan2(float(np.linalg.norm(np.cross(axis_A, axis_B))), float(axis_A @ axis_B))

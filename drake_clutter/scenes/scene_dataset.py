@@ -1,7 +1,8 @@
-"""Sets of stable scenes in one small file: training ground for explorers, and the frozen scenes that they are compared on.
+"""Datasets of stable scenes in one JSON file, for training and evaluation.
 
-A file is JSON. It holds the rules that derive each graph, and of a frozen set also where the objects came to rest; and a hash of
-all that, so that nobody compares agents on different work without noticing.
+A file holds the grammar rules that derive each graph, optionally the settled poses of the objects,
+and a hash of its content. Evaluations record the hash, so that results on different scenes are not
+compared by mistake.
 """
 
 import hashlib
@@ -23,18 +24,20 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.validation import to_plain, validate
 
 VERSION = 1
+"""Version of the file format."""
 _LAYOUT_TRIES = 100
+"""Layouts sampled for a graph that was laid out before; it fits, so a failure is bad luck."""
 
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """One stable scene of a set.
+    """One stable scene of a dataset.
 
     Attributes:
-        rules: by name, that derive its graph.
-        canonical_form: its canonical form, see `canonical_form`.
-        num_hidden: objects that were hidden.
-        solvable: what the full-knowledge search said of it; "" if it was not asked.
+        rules: Names of the rules that derive its graph.
+        canonical_form: Hash of its graph, see `drake_clutter.grammar.canonical_form`.
+        num_hidden: Number of objects that are hidden at the start.
+        solvable: Result of the oracle search; empty if it was not run.
         settled_poses: X_TO of every object at rest, in the order of the laid-out scene, or None.
     """
 
@@ -47,15 +50,15 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class SceneDataset:
-    """A set of scenes.
+    """A dataset of stable scenes.
 
     Attributes:
-        name: the file's.
-        classes: of the objects, in the grammar's order.
-        metadata: agent, nodes, seed, object set, commit and whatever else says how it was made.
-        scenes: the scenes.
-        sha256: of all that.
-        cell: the work cell that it was made with.
+        name: Name of the file.
+        classes: Classes of the objects, in the order of the grammar.
+        metadata: How the scenes were generated: agent, nodes, seed, object set, commit.
+        scenes: The scenes.
+        sha256: Hash of the content.
+        cell: Work cell for which the scenes were generated.
     """
 
     name: str
@@ -67,24 +70,24 @@ class SceneDataset:
 
     @property
     def grammar(self) -> SceneGrammar:
-        """Of its classes."""
+        """Grammar of the classes."""
         return SceneGrammar(self.classes)
 
     def derivation(self, index: int, grammar: SceneGrammar) -> Derivation:
-        """The graph of a scene, with the rules that derive it."""
+        """Return the graph of a scene, with the rules that derive it."""
         rules = self.scenes[index].rules
         return Derivation(grammar.replay(rules), rules)
 
     def settled_scene(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
-        """A scene of a frozen set, as it came to rest, on the set's support.
+        """Return a scene with its settled poses, on the dataset's support.
 
         Raises:
-            InputError: the set has no poses.
+            InputError: The dataset has no poses.
         """
         poses = self.scenes[index].settled_poses
         if poses is None:
             raise InputError(
-                f"{self.name}: holds graphs without poses; allowed is a frozen set, as make_scenes.py --frozen writes"
+                f"{self.name}: holds graphs without poses; allowed is a dataset with settled poses"
             )
         world = replace(config, cell=config.cell.with_support(self.cell.support))
         scene = relayout(
@@ -96,13 +99,18 @@ class SceneDataset:
 def relayout(
     derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator
 ) -> Scene:
-    """A graph that has been laid out before, with its stacks in new places."""
+    """Return a scene for a graph that was laid out before, with its stacks in new positions.
+
+    Raises:
+        InputError: No layout fits on the support.
+    """
     for _ in range(_LAYOUT_TRIES):
         scene = lay_out(derivation, grammar.classes, config, rng)
         if not isinstance(scene, LayoutFailure):
             return scene
     raise InputError(
-        f"a graph found no room on the tray, {_LAYOUT_TRIES} times in a row; allowed is a layout that has room for it"
+        f"a graph found no room on the tray, {_LAYOUT_TRIES} times in a row; "
+        "allowed is a layout that has room for it"
     )
 
 
@@ -113,13 +121,13 @@ def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> st
 def save_scene_dataset(
     path: Path, metadata: Mapping[str, Any], scenes: Sequence[SceneRecord], cell: WorkCell
 ) -> None:
-    """Write a set, one scene a line.
+    """Write a dataset, one scene per line.
 
     Args:
         path: The file.
-        metadata: Names the object set (`objects`) and what else is to be known.
+        metadata: How the scenes were generated; `objects` names the object set.
         scenes: The scenes.
-        cell: The work cell that it was made with.
+        cell: Work cell for which the scenes were generated.
     """
     names = sorted({rule for scene in scenes for rule in scene.rules})
     number = {name: k for k, name in enumerate(names)}
@@ -144,10 +152,11 @@ def save_scene_dataset(
 
 
 def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
-    """Reads a set.
+    """Read a dataset.
 
     Raises:
-        InputError: it cannot be read, is of another version, was changed since it was made, or needs other objects.
+        InputError: The file cannot be read, has another version, was changed after it was written,
+            or needs other object classes.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -162,15 +171,17 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{path}: is no set of scenes ({error}); allowed is a file that training/make_scenes.py wrote"
+            f"{path}: is not a scene dataset ({error}); "
+            "allowed is a file that training/generate_scene_dataset.py wrote"
         ) from error
     if version != VERSION:
         raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
     if was_changed:
         raise InputError(
-            f"{path}: sha256: does not belong to its scenes, they were changed; allowed is the file as it was made"
+            f"{path}: sha256: does not match the scenes, which were changed; "
+            "allowed is the file as it was written"
         )
-    # A set of version 0.1 has no cell.
+    # A dataset of version 0.1 has no cell.
     given = document.pop("cell", None)
     cell = default_cell() if given is None else validate(WorkCell, given, f"{path}: cell")
     scenes = []

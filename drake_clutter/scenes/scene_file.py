@@ -1,4 +1,4 @@
-"""Scene files: versioned YAML that a person can read and edit."""
+"""Scene files: versioned YAML for one scene, its work cell and its verdict."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,9 @@ from drake_clutter.validation import (
 from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 VERSION = 2
-_QUATERNION_TOLERANCE = 1e-3  # a hand-written 0.7071 is close enough, and is normalized
+"""Version of the files that are written."""
+_QUATERNION_TOLERANCE = 1e-3
+"""Largest deviation of a quaternion's norm from 1, so that 0.7071 is accepted and normalized."""
 _EDGE_KINDS: dict[str, EdgeKind] = {PRIMITIVE: PRIMITIVE} | {
     orientation.name.lower(): orientation for orientation in Orientation
 }
@@ -41,12 +43,12 @@ _EDGE_KINDS: dict[str, EdgeKind] = {PRIMITIVE: PRIMITIVE} | {
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene file holds.
+    """Content of a scene file.
 
     Attributes:
         scene: The objects as laid out.
-        cell: The work cell that it was made with.
-        verdict: What a judge said of it, or None.
+        cell: Work cell for which the scene was made.
+        verdict: A judge's verdict, or None.
     """
 
     scene: Scene
@@ -55,7 +57,7 @@ class SceneFile:
 
     @property
     def settled_scene(self) -> Scene:
-        """The scene as it settled, or as laid out if it was never judged."""
+        """The scene at rest, or as laid out if it was never judged."""
         return self.scene.with_poses(self.verdict.settled) if self.verdict else self.scene
 
 
@@ -131,7 +133,7 @@ class _TrayEntry(StrictModel):
 
 
 class _Document(StrictModel):
-    """A scene file; one of version 1 has a tray and no cell."""
+    """Schema of a scene file. A file of version 1 has a tray and no cell."""
 
     version: Annotated[int, InRange(1, VERSION)]
     objects: Annotated[tuple[_ObjectEntry, ...], Field(min_length=1)]
@@ -164,21 +166,21 @@ def load_scene(path: Path, catalog: Catalog) -> SceneFile:
 
     Args:
         path: The file.
-        catalog: Of the objects' classes.
+        catalog: Catalog of the object classes.
 
     Raises:
-        InputError: The file, the field and what is allowed, for whatever cannot be a scene.
+        InputError: The file is not a valid scene. The message names the field and what is allowed.
     """
     return _scene_file(read_yaml(path, "a scene file"), str(path), catalog)
 
 
 def scene_from_yaml(text: str, source: str, catalog: Catalog) -> SceneFile:
-    """Read what a scene file holds.
+    """Parse the content of a scene file.
 
     Args:
         text: The content.
-        source: How errors name the file.
-        catalog: Of the objects' classes.
+        source: Name of the source for error messages.
+        catalog: Catalog of the object classes.
 
     Raises:
         InputError: See `load_scene`.
@@ -275,7 +277,7 @@ def _pose_fields(pose: Pose) -> dict[str, list[float]]:
 
 
 def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> dict[str, Any]:
-    """Return the document of a scene file, as plain lists and mappings; see `save_scene`."""
+    """Return the document of a scene file as plain lists and mappings; see `save_scene`."""
     plain = to_plain(cell.with_support(scene.support))
     document: dict[str, Any] = {
         "version": VERSION,
@@ -335,17 +337,17 @@ def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
 
 
 def save_scene(path: Path, scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> None:
-    """Write a scene file in one step.
+    """Write a scene file atomically.
 
     Args:
         path: The file.
         scene: The objects as laid out, and the support, which replaces the cell's.
-        cell: The work cell that it was made with.
-        verdict: What a judge said of it, or None.
+        cell: Work cell for which the scene was made.
+        verdict: A judge's verdict, or None.
     """
     write_text(path, scene_to_yaml(scene, cell, verdict))
 
 
 def scene_to_yaml(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> str:
-    """Return what a scene file holds, see `save_scene`."""
+    """Return the content of a scene file; see `save_scene`."""
     return to_yaml(scene_to_dict(scene, cell, verdict))
