@@ -1,6 +1,7 @@
-"""Tells what this machine can do of what drake_clutter needs, and how to mend what is missing.
+"""Checks of what drake_clutter needs from the machine, with a remedy for what is missing.
 
-Each probe runs in a process of its own and imports what it needs there, so that a crash or a broken library is a finding.
+Each probe runs in a process of its own and imports what it needs there, so that a crash or a broken
+library is a result of the check.
 """
 
 import os
@@ -11,19 +12,21 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-_PROBE_TIMEOUT = 120.0  # s; the first rendering on a machine compiles shaders
-_MIN_MEMORY = 4.0  # GiB
+_PROBE_TIMEOUT = 120.0
+"""Time limit of a probe; the first rendering on a machine compiles shaders [s]."""
+_MIN_MEMORY = 4.0
+"""Memory that one worker process may need [GiB]."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One finding.
+    """Result of one check.
 
     Attributes:
-        name: what was looked at.
-        ok: whether it is there and works.
-        detail: what was found.
-        remedy: how to mend it; empty when it is ok.
+        name: Name of the check.
+        ok: Whether the component is present and works.
+        detail: What was found.
+        remedy: How to install what is missing; empty if `ok`.
     """
 
     name: str
@@ -33,11 +36,11 @@ class Check:
 
 
 class ProbeError(RuntimeError):
-    """What a probe found is not enough; the message is the finding."""
+    """A probe found a component insufficient; the message is the detail of the check."""
 
 
 def run_checks() -> list[Check]:
-    """Looks at everything; takes some seconds."""
+    """Run all checks, which takes some seconds."""
     return [
         _run_probe(probe_drake, "pip install drake; on Debian: apt-get install libglib2.0-0"),
         _run_probe(
@@ -45,17 +48,17 @@ def run_checks() -> list[Check]:
         ),
         _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
         _run_probe(
-            probe_torch, "needed by the learned agents: pip install 'drake-clutter[learned]'"
+            probe_torch, "needed by the trained policies: pip install 'drake-clutter[learned]'"
         ),
         _run_probe(
-            probe_assets, "install drake-clutter anew; in a checkout: drake-clutter assets build"
+            probe_assets, "reinstall drake-clutter; in a checkout: drake-clutter assets build"
         ),
-        _run_probe(probe_machine, f"use fewer workers; one may take {_MIN_MEMORY:g} GiB"),
+        _run_probe(probe_machine, f"use fewer workers; one may need {_MIN_MEMORY:g} GiB"),
     ]
 
 
 def probe_drake() -> str:
-    """The versions of Drake and Python."""
+    """Return the versions of Drake and Python."""
     from importlib.metadata import version
 
     import pydrake.multibody.plant  # noqa: F401
@@ -64,7 +67,11 @@ def probe_drake() -> str:
 
 
 def probe_rendering() -> str:
-    """Renders the depth of a 1 m cube whose face is 2 m ahead, at 64 x 48 pixels, without a screen."""
+    """Render a cube without a display and check its depth.
+
+    The cube has a side of 1 m, and its front face is 2 m from the camera. The image has 64 x 48
+    pixels.
+    """
     import numpy as np
     from pydrake.geometry import (
         Box,
@@ -95,12 +102,12 @@ def probe_rendering() -> str:
     engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(0.1, 9.0)), image)
     depth = float(image.data[24, 32, 0])
     if abs(depth - 2.0) > 0.001:
-        raise ProbeError(f"a face 2 m ahead is rendered at {depth:g} m")
+        raise ProbeError(f"a face at a depth of 2 m is rendered at {depth:g} m")
     return "VTK over EGL renders"
 
 
 def probe_solvers() -> str:
-    """The solvers that planning and equilibria use."""
+    """Return the solvers that motion planning and static equilibrium use."""
     from pydrake.solvers import ClarabelSolver, IpoptSolver, SnoptSolver
 
     solvers = {"SNOPT": SnoptSolver(), "IPOPT": IpoptSolver(), "Clarabel": ClarabelSolver()}
@@ -113,7 +120,7 @@ def probe_solvers() -> str:
 
 
 def probe_torch() -> str:
-    """The version of PyTorch and what it computes on."""
+    """Return the version of PyTorch and its device."""
     import torch
 
     device = (
@@ -125,7 +132,7 @@ def probe_torch() -> str:
 
 
 def probe_assets() -> str:
-    """Every shipped object class has a model."""
+    """Check that every shipped object class has a model."""
     from drake_clutter.catalog import load_catalog
     from drake_clutter.resources import resource_path
 
@@ -137,13 +144,14 @@ def probe_assets() -> str:
     ]
     if unbuilt:
         raise ProbeError(
-            f"{len(unbuilt)} of {len(catalog.classes)} object classes have no model, the first is {unbuilt[0]}"
+            f"{len(unbuilt)} of {len(catalog.classes)} object classes have no model, the first is "
+            f"{unbuilt[0]}"
         )
     return f"{len(catalog.classes)} object classes in {resource_path('sdf_assets')}"
 
 
 def probe_machine() -> str:
-    """Cores that this process may use, and memory."""
+    """Return the number of cores that this process may use, and the memory."""
     cores = len(os.sched_getaffinity(0))
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     detail = f"{cores} cores, {memory:.1f} GiB of memory"
@@ -153,9 +161,9 @@ def probe_machine() -> str:
 
 
 def _run_probe(probe: Callable[[], str], remedy: str) -> Check:
-    """Runs a probe, which is a function of this module, in a new Python process."""
+    """Run a probe, which is a function of this module, in a new Python process."""
     name = probe.__name__.removeprefix("probe_")
-    code = f"from drake_clutter import installation_check; print(installation_check.{probe.__name__}())"
+    code = f"from drake_clutter import installation_check as m; print(m.{probe.__name__}())"
     try:
         process = subprocess.run(
             [sys.executable, "-c", code],
@@ -169,16 +177,13 @@ def _run_probe(probe: Callable[[], str], remedy: str) -> Check:
     if process.returncode == 0:
         return Check(name, True, _last_line(process.stdout))
     if process.returncode < 0:
-        return Check(
-            name,
-            False,
-            f"died of {signal.Signals(-process.returncode).name} {_last_line(process.stderr)}".rstrip(),
-            remedy,
-        )
+        signal_name = signal.Signals(-process.returncode).name
+        detail = f"died of {signal_name} {_last_line(process.stderr)}".rstrip()
+        return Check(name, False, detail, remedy)
     return Check(
         name,
         False,
-        _last_line(process.stderr).removeprefix("drake_clutter.installation_check.MissingError: "),
+        _last_line(process.stderr).removeprefix(f"{__name__}.{ProbeError.__name__}: "),
         remedy,
     )
 

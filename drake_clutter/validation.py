@@ -1,7 +1,7 @@
-"""Reads typed data from files and options.
+"""Validation of data from files and options.
 
-Misuse is one line that names the file, the field, the value and what is allowed. Schemas are
-pydantic models or pydantic dataclasses.
+Schemas are pydantic models or pydantic dataclasses. An error is one line with the file, the field,
+the value and what is allowed.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ _POSE_FIELDS = {
     "pitch": ("rpy_deg", 1),
     "yaw": ("rpy_deg", 2),
 }
-"""Components of a pose that a setting may name."""
+"""Components of a pose that a setting may name: field and index of each."""
 _TYPE_DESCRIPTIONS = {
     "bool": "true or false",
     "string": "a text",
@@ -46,16 +46,16 @@ _TYPE_DESCRIPTIONS = {
     "int": "a whole number",
     "finite": "a finite number",
 }
-"""What is allowed, by the first word of pydantic's type of the error."""
+"""What is allowed, by the first word of the type of a pydantic error."""
 
 
 @dataclass(frozen=True)
 class InRange:
-    """Annotation of an int or float: finite, between two values, and of that type.
+    """Annotation of a strict int or float: finite and between two values.
 
     Attributes:
-        low: Least value.
-        high: Greatest value.
+        low: Smallest allowed value.
+        high: Largest allowed value.
     """
 
     low: float = 0.0
@@ -81,15 +81,15 @@ class InRange:
 
 
 def allowed_error(what: str) -> PydanticCustomError:
-    """Return the error that a validator raises; `what` says what is allowed."""
+    """Return the error of a validator, whose message is what is allowed."""
     return PydanticCustomError("allowed", "{what}", {"what": what})
 
 
 def rejected_error(what: str) -> PydanticCustomError:
-    """Return the error that a validator raises.
+    """Return the error of a validator, whose message names a part of the field.
 
     Args:
-        what: Which part of the field, what is wrong with it, and what is allowed.
+        what: Name of the part, what is wrong with it, and what is allowed.
     """
     return PydanticCustomError("refused", "{what}", {"what": what})
 
@@ -117,7 +117,9 @@ _RENAMED: dict[type, Mapping[str, str]] = {}
 
 
 def renamed_fields(**current: str) -> Callable[[type[Schema]], type[Schema]]:
-    """Return a decorator, below `config_class`, by which files may use earlier names of fields.
+    """Return a class decorator that accepts earlier names of fields in files.
+
+    It stands below `config_class`.
 
     Args:
         current: Current name of a field by its earlier name.
@@ -138,12 +140,11 @@ def renamed_fields(**current: str) -> Callable[[type[Schema]], type[Schema]]:
 def with_current_names(schema: type, given: Any) -> Any:
     """Return a document with the fields of a schema under their current names.
 
-    A field that stands there under both names keeps the earlier one too, which is then refused as
-    unknown.
+    If a field is given under both names, the earlier one is kept, too, and then refused as unknown.
 
     Args:
-        schema: The class of `given`; classes of its fields are left alone.
-        given: What was read.
+        schema: Class of the document; classes of its fields are not considered.
+        given: The document.
     """
     current = {
         earlier: name
@@ -160,14 +161,14 @@ def with_current_names(schema: type, given: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def config_class(cls: type[Schema]) -> type[Schema]:
-    """Return a class as a frozen, validated dataclass that takes no field but those declared."""
+    """Return a class as a frozen, validated dataclass without additional fields."""
     config = ConfigDict(extra="forbid")
     decorated: Any = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
     return cast(type[Schema], decorated)
 
 
 class StrictModel(BaseModel):
-    """Base of what is read from files: frozen, and no field but those that are declared."""
+    """Base class of data read from files: frozen, without additional fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(property,))
 
@@ -250,7 +251,7 @@ def _describe_list(node: Mapping[str, Any]) -> str:
 
 
 def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
-    """Return how a place of a document is named, and its part of the schema's JSON schema."""
+    """Return the path of a field as text, and its part of the schema's JSON schema."""
     document = _json_schema(schema)
     field, node = "", _resolve_reference(document, document)
     for part in loc:
@@ -284,12 +285,12 @@ def _resolve_reference(document: Mapping[str, Any], node: Any) -> Mapping[str, A
 
 
 def to_plain(value: Any) -> Any:
-    """Return a config as mappings, lists, numbers and texts."""
+    """Return a config as mappings, lists, numbers and strings."""
     return _adapter(cast(Hashable, type(value))).dump_python(value, mode="json", by_alias=True)
 
 
 def config_yaml(config: Any) -> str:
-    """Return a config as YAML, every field written out."""
+    """Return a config as YAML with all fields."""
     return to_yaml(to_plain(config), width=100)
 
 
@@ -299,17 +300,18 @@ def load_config_as(
     settings: Sequence[str] = (),
     upgrade: Callable[[Any], Any] = lambda given: given,
 ) -> Schema:
-    """Return a config: the defaults, over them a file's fields, over those single fields.
+    """Return a config from defaults, a file and single settings, the later over the earlier.
 
     Args:
-        defaults: A complete config.
-        path: A YAML file.
-        settings: Fields as text, such as "layout.stack_gap=0.02"; x, y, z, roll, pitch and yaw
-            name a pose's components, numbers a list's.
-        upgrade: Turns what older versions wrote into today's fields.
+        defaults: Complete config, whose class is the schema.
+        path: YAML file, or None.
+        settings: Single fields as text, such as "layout.stack_gap=0.02". The names x, y, z, roll,
+            pitch and yaw select components of a pose, numbers elements of a list.
+        upgrade: Converts a document of an earlier version.
 
     Raises:
-        InputError: The file cannot be read, an unknown field, or a value that is not allowed.
+        InputError: The file cannot be read, or a field is unknown or has a value that is not
+            allowed.
     """
     config = defaults
     if path is not None:
@@ -322,7 +324,7 @@ def load_config_as(
 
 
 def _parse_setting(setting: str, config: Any) -> Any:
-    """Return FIELD=VALUE as nested mappings, with the rest of a list or collection."""
+    """Return FIELD=VALUE as nested mappings, completed by the rest of a list."""
     name, equals, text = setting.partition("=")
     if not equals or not name:
         raise input_error(
@@ -365,14 +367,19 @@ def _field_values(config: Any) -> dict[str, Any]:
 
 
 def override_config(defaults: Schema, given: Any, source: str) -> Schema:
-    """Return a config with the fields of a document over its own.
+    """Return a config with the fields of a document replaced.
 
-    A list, and a part of another kind, replaces the whole. So does what is given with another
-    model, such as a robot, unless only the model is given; and a collection by names, such as
-    cameras, but an entry whose name is there keeps the fields that are not given.
+    Lists are replaced as a whole. So is a part with another `kind`, and one with another `model`
+    unless only the model is given. A collection by names, such as cameras, is replaced, but an
+    entry of the same name keeps the fields that are not given.
+
+    Args:
+        defaults: The config.
+        given: The document.
+        source: File or option of the document, for the message.
 
     Raises:
-        InputError: The first field that cannot be used.
+        InputError: A field is unknown or has a value that is not allowed.
     """
     return validate(type(defaults), _merge(defaults, given), source)
 

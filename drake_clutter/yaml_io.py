@@ -1,6 +1,6 @@
-"""YAML as every file of the package is read and written.
+"""Reading and writing YAML.
 
-Beyond YAML 1.1, 1e-3 is a number, and a key that stands twice in a mapping is refused.
+In addition to YAML 1.1, 1e-3 is a number, and a duplicate key of a mapping is an error.
 """
 
 import re
@@ -12,14 +12,14 @@ import yaml
 from drake_clutter.files import format_value, input_error
 
 _EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
-"""Numbers such as 1e-3, which YAML 1.1 takes as a text."""
+"""Numbers such as 1e-3, which YAML 1.1 reads as strings."""
 
 
 class _Loader(yaml.CSafeLoader):
-    """Reads 1e-3 as a number, and refuses a key that stands twice in a mapping."""
+    """Loader that reads 1e-3 as a number and rejects duplicate keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        own_items = node.value  # without what a merge key adds
+        own_items = node.value  # without the items of a merge key
         mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
         if len(mapping) < len(node.value):
             seen = set[Any]()
@@ -39,10 +39,10 @@ class _Loader(yaml.CSafeLoader):
 
 
 class _Dumper(yaml.CSafeDumper):
-    """Quotes what `_Loader` would read as a number."""
+    """Dumper that quotes strings which `_Loader` would read as numbers."""
 
 
-# Whole containers, so that one that holds itself is an error.
+# Containers are constructed at once, so that one that contains itself is an error.
 _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_whole_mapping)
 _Loader.add_constructor("tag:yaml.org,2002:seq", _Loader.construct_whole_sequence)
 for _kind in (_Loader, _Dumper):
@@ -50,25 +50,25 @@ for _kind in (_Loader, _Dumper):
 
 
 def to_yaml(document: Any, width: int = 160) -> str:
-    """Return a plain document as YAML that `parse_yaml` reads back.
+    """Return a document as YAML that `parse_yaml` reads back.
 
     Args:
-        document: Mappings, lists, numbers and texts.
-        width: Of a line [characters].
+        document: Mappings, lists, numbers and strings.
+        width: Maximum width of a line [characters].
     """
     style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "width": width}
     return str(yaml.dump(document, Dumper=_Dumper, **style))
 
 
 def read_yaml(path: Path, allowed_content: str) -> Any:
-    """Return what a YAML file holds.
+    """Return the document of a YAML file.
 
     Args:
         path: The file.
-        allowed_content: What it may hold, for the message.
+        allowed_content: What the file may contain, for the message.
 
     Raises:
-        InputError: It cannot be read, or is not YAML.
+        InputError: The file cannot be read or is not YAML.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -82,15 +82,15 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
 
 
 def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
-    """Return what a YAML text holds.
+    """Return the document of a YAML text.
 
     Args:
         text: The text.
-        source: Where it was read, for the message.
-        allowed_content: What it may hold, for the message.
+        source: File or option of the text, for the message.
+        allowed_content: What the text may contain, for the message.
 
     Raises:
-        InputError: It is not YAML, or a mapping has a key twice.
+        InputError: The text is not YAML, or a mapping has a duplicate key.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -98,5 +98,5 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         why = f"{line}{error.problem}"
         raise input_error(source, f"is not YAML ({why}); allowed is {allowed_content}") from error
-    except Exception as error:  # constructors raise many kinds for a bad date, number or nesting
+    except Exception as error:  # many types, for a bad date, number or nesting
         raise input_error(source, f"is not YAML ({error}); allowed is {allowed_content}") from error

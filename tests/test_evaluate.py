@@ -67,7 +67,7 @@ def test_what_hides_nothing_from_the_config_s_camera_is_left_out() -> None:
     scenes = load_evaluation_scenes("sg_star_10", None)[:2]
     (row,) = rows_of(scenes, "random", config=config)
     assert row["episodes"] == 1
-    with pytest.raises(InputError, match="none of 1 hides anything"):
+    with pytest.raises(InputError, match="none of 1 scenes has objects that are hidden"):
         rows_of(scenes[1:], "random", config=config)
 
 

@@ -146,9 +146,9 @@ def test_pictures_have_their_size_and_show_something(folder: Path) -> None:
 
 def test_hidden_and_found_objects_are_marked(folder: Path) -> None:
     def pixels(name: str, mark: Highlight) -> int:
-        colour = [int(mark.value[i : i + 2], 16) for i in (1, 3, 5)]
+        color = [int(mark.value[i : i + 2], 16) for i in (1, 3, 5)]
         with Image.open(folder / "images" / name) as picture:
-            return int((np.abs(np.asarray(picture, int) - colour).max(axis=2) < 3).sum())
+            return int((np.abs(np.asarray(picture, int) - color).max(axis=2) < 3).sum())
 
     assert pixels("start_overhead.png", Highlight.HIDDEN) > 500
     assert pixels("start_overhead.png", Highlight.MOVED) == 0

@@ -69,14 +69,14 @@ class Room:
     name: NonEmptyText = "room"
     lit: Flag = True
     seats: Annotated[int, InRange(1, 8)] = 2
-    storey: Integer = 0
+    level: Integer = 0
     share: Fraction = 0.5
     height: Finite | None = None
     door: Literal["left", "right"] = "left"
     steps: tuple[Positive, ...] = (1.0, 2.0)
 
 
-FIELDS = "tool, lamps, shelf, name, lit, seats, storey, share, height, door, steps"
+FIELDS = "tool, lamps, shelf, name, lit, seats, level, share, height, door, steps"
 REFUSED = [
     ("lit: 1", "lit: 1; allowed is true or false"),
     ("lit: 'yes'", "lit: 'yes'; allowed is true or false"),
@@ -85,7 +85,7 @@ REFUSED = [
     ("seats: 2.0", "seats: 2.0; allowed is a whole number from 1 to 8"),
     ("seats: true", "seats: True; allowed is a whole number from 1 to 8"),
     ("seats: 0", "seats: 0; allowed is a whole number from 1 to 8"),
-    ("storey: 0.5", "storey: 0.5; allowed is a whole number"),
+    ("level: 0.5", "level: 0.5; allowed is a whole number"),
     ("share: 2", "share: 2; allowed is a finite number from 0 to 1"),
     ("share: true", "share: True; allowed is a finite number from 0 to 1"),
     ("share: '0.5'", "share: '0.5'; allowed is a finite number from 0 to 1"),
@@ -110,7 +110,7 @@ REFUSED = [
     ("tool: {kind: [hook]}", "tool.kind: ['hook']; allowed is one of cup, jaws"),
     ("tool: {kind: jaws}", "tool.width: is missing; needed are width"),
     ("tool: {kind: jaws, width: 1}", "tool.width: 1; allowed is a finite number from 0.01 to 0.2"),
-    ("tool: {radius: 1, colour: 2}", "tool.colour: is unknown; allowed are kind, radius, rims"),
+    ("tool: {radius: 1, color: 2}", "tool.color: is unknown; allowed are kind, radius, rims"),
     ("tool: {rims: [[1, 2, 3], [1, 2]]}", "tool.rims[1]: [1, 2]; allowed is a list of 3 numbers"),
     ("tool: {rims: [[1, 2, 3, 4]]}", "tool.rims[0]: [1, 2, 3, 4]; allowed is a list of 3 numbers"),
     ("tool: {rims: [up]}", "tool.rims[0]: 'up'; allowed is a list of 3 numbers"),

@@ -1,1 +1,1 @@
-"""What the commands of `drake-clutter` do; `drake_clutter.cli` only parses their arguments."""
+"""Implementation of the commands, whose arguments `drake_clutter.cli` parses."""

@@ -1,4 +1,4 @@
-"""`drake-clutter evaluate`: explorers on scenes at rest that hide something."""
+"""Evaluation of exploration policies on stable scenes with hidden objects."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -24,23 +24,23 @@ from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
 PAPER_MOVE_LIMIT = 10
-"""Moves at which a longer search is read, too (SPEC section 6)."""
+"""Number of moves at which longer episodes are evaluated, too, as in Kumar et al. 2022."""
 
 
 def move_limits(max_moves: int) -> list[int]:
-    """Numbers of moves for which there are figures."""
+    """Return the numbers of moves for which statistics are computed, ascending."""
     return sorted({min(PAPER_MOVE_LIMIT, max_moves), max_moves})
 
 
 @dataclass(frozen=True)
 class EvaluationScene:
-    """A scene at rest that hides something.
+    """Stable scene with hidden objects.
 
     Attributes:
-        file: a scene file, or a set.
-        index: in the set; None for a scene file.
-        classes: names of those that its objects may have.
-        cell: that it was made with.
+        file: Scene file or scene set.
+        index: Index of the scene in its set; None for a scene file.
+        classes: Names of the classes that its objects may have.
+        cell: Work cell that the scene was made with.
     """
 
     file: Path
@@ -50,16 +50,17 @@ class EvaluationScene:
 
 
 def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[EvaluationScene]:
-    """Scenes at rest that hide something: files of a folder that were judged stable, or a frozen set with each number.
+    """Return the stable scenes with hidden objects of a folder or a scene set.
 
     Args:
-        source: a folder, a set's file, or the name of a set that is shipped.
-        catalog_folder: with object classes of one's own.
+        source: Folder of scene files, scene set file, or name of a shipped scene set.
+        catalog_folder: Asset folder with the user's object classes, or None.
 
     Raises:
-        InputError: nothing of that name, no scene files, one that is broken, or none that can be played.
+        InputError: There is no such source, a file cannot be used, or no scene is suitable.
     """
-    catalog, scenes = load_catalog(catalog_folder), Path(source)
+    catalog = load_catalog(catalog_folder)
+    scenes = Path(source)
     if not scenes.exists():
         sets = {
             path.stem: path
@@ -67,9 +68,8 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
             if not path.stem.startswith("train_")
         }
         if source not in sets:
-            raise InputError(
-                f"--scenes {source}: is not there; allowed are a folder, a file, and {', '.join(sorted(sets))}"
-            )
+            allowed = f"a folder, a file, and {', '.join(sorted(sets))}"
+            raise InputError(f"--scenes {source}: is not there; allowed are {allowed}")
         scenes = sets[source]
     if scenes.is_file():
         scene_set = load_scene_dataset(scenes, catalog)
@@ -81,7 +81,8 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
-            f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` wrote, or a set of scenes"
+            f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` "
+            "wrote, or a scene set"
         )
     evaluation_scenes = []
     for path in paths:
@@ -91,16 +92,17 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
             evaluation_scenes.append(EvaluationScene(path, None, names, file.cell))
     if not evaluation_scenes:
         raise InputError(
-            f"{scenes}: none of {len(paths)} scenes was judged stable and hides something; allowed are such scenes"
+            f"{scenes}: none of {len(paths)} scenes is stable and has hidden objects; allowed are "
+            "scenes that `generate` judged so"
         )
     return evaluation_scenes
 
 
 def common_cell(scenes: Sequence[EvaluationScene]) -> WorkCell:
-    """Return the cell in which all of the scenes were made; its support is the first one's.
+    """Return the cell in which all scenes were made, with the support of the first.
 
     Raises:
-        InputError: Two were made in different cells.
+        InputError: Two scenes were made in different cells.
     """
     first = scenes[0]
     for scene in scenes:
@@ -123,23 +125,38 @@ def evaluate_explorers(
     progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
     ray_address: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Plays every agent on every scene; `out`: JSON with the rows, every episode, and commit and hashes of the scenes.
+    """Run every policy on every scene and return statistics by policy.
 
-    Rows are of the scenes that hide something as the config's camera sees them.
+    Statistics are over the scenes with objects that are hidden from the camera of `config`.
+
+    Args:
+        scenes: The scenes.
+        agents: Names of the policies; repeated names are ignored.
+        max_moves: Maximum number of moves per episode.
+        fidelity: Fidelity at which moves are executed, one of `FIDELITIES`.
+        seed: Seed of policies and simulation.
+        config: Configuration.
+        catalog_folder: Asset folder with the user's object classes, or None.
+        workers: Number of worker processes.
+        out: JSON file for statistics, episodes, commit and hashes of the scenes; or None.
+        progress: Wraps the results, given the number of episodes.
+        ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
+
+    Returns:
+        Statistics of each policy; see `summarize_episodes`.
 
     Raises:
-        InputError: an agent that there is not or that does not know the objects, no place for `out`, or nothing is hidden.
+        InputError: A policy does not exist or was not trained with the classes of the scenes, `out`
+            cannot be written, or no scene hides an object.
     """
     if out is not None and (out.is_dir() or not out.parent.is_dir()):
         raise InputError(
             f"--out {out}: is a folder, or in none; allowed is a file in a folder that exists"
         )
-    agents, classes = (
-        list(dict.fromkeys(agents)),
-        frozenset[str]().union(*(scene.classes for scene in scenes)),
-    )
+    agents = list(dict.fromkeys(agents))
+    classes = frozenset[str]().union(*(scene.classes for scene in scenes))
     for agent in agents:
-        make_policy_factory(agent, config, classes)  # says what is wrong before anything is played
+        make_policy_factory(agent, config, classes)  # raises before any episode is run
     episodes = [
         EpisodeSpec(scene.file, scene.index, agent, index)
         for agent in agents
@@ -150,7 +167,8 @@ def evaluate_explorers(
     results = [result for result in progress(results_in_order, len(episodes)) if result.hidden]
     if not results:
         raise InputError(
-            f"--scenes: none of {len(scenes)} hides anything from the camera of --config; give scenes that do"
+            f"--scenes: none of {len(scenes)} scenes has objects that are hidden from the "
+            "configured camera; allowed are scenes with hidden objects"
         )
     rows = [
         {"agent": agent}

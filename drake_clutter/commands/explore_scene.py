@@ -1,4 +1,4 @@
-"""`drake-clutter explore`, `move`: moves in a scene, with `episode.json` and a page to watch."""
+"""Exploration episodes and given moves in a scene, with `episode.json` and a web page."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,18 +32,20 @@ from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, valida
 from drake_clutter.yaml_io import read_yaml
 
 TransitionCallback = Callable[[Transition], None]
+"""Function that is called with each transition of an episode."""
 
 
 def settle_scene(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
-    """The scene as it settles.
+    """Return a scene at its settled poses.
 
     Raises:
-        InputError: it is not stable, so there is nothing to explore.
+        InputError: The scene is not stable.
     """
     verdict = DrakeJudge(config).judge(scene, item_rng(seed))
     if verdict.instability is not None:
         raise InputError(
-            f"the scene is not stable: {verdict.instability}; allowed is one that stays as it is when it settles"
+            f"the scene is not stable: {verdict.instability}; allowed is a scene that is at rest "
+            "when Drake simulates it"
         )
     return scene.with_poses(verdict.settled)
 
@@ -57,16 +59,16 @@ def explore_scene(
     config: ClutterConfig,
     on_transition: TransitionCallback,
 ) -> ExplorationTask:
-    """Plays an episode on a scene at rest.
+    """Run an exploration episode.
 
     Args:
-        scene: at rest.
-        agent_name: see `make_explorers`.
-        fidelity: one of `FIDELITIES`.
-        max_moves: after which it ends.
-        seed: of the agent's and the world's chances.
-        config: the world.
-        on_transition: called after each move.
+        scene: Scene at rest.
+        agent_name: Name of the policy; see `make_policy_factory`.
+        fidelity: Fidelity at which moves are executed, one of `FIDELITIES`.
+        max_moves: Maximum number of moves.
+        seed: Seed of the policy and the simulation.
+        config: Configuration.
+        on_transition: Called after each move.
     """
     backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
     policy = make_policy_factory(agent_name, config)(backend)
@@ -74,17 +76,26 @@ def explore_scene(
 
 
 def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene: Scene) -> None:
+    """Check that the objects of a move are visible and different.
+
+    Args:
+        moves: All moves.
+        index: Index of the move to check.
+        visible: Names of the visible objects.
+        scene: The scene.
+
+    Raises:
+        InputError: A name is not allowed.
+    """
     move = moves[index]
     for role, name, allowed in (
         ("pick", move.pick, visible),
         ("place", move.place, [TRAY, *visible]),
     ):
         if name not in allowed or (role == "place" and name == move.pick):
-            problem = (
-                "is not in view, or the object itself"
-                if name in (*scene.names, TRAY)
-                else "is not in the scene"
-            )
+            problem = "is not in the scene"
+            if name in (*scene.names, TRAY):
+                problem = "is not in view, or the picked object itself"
             raise InputError(
                 f"move {index + 1}, {role}: {name!r} {problem}; allowed are {', '.join(allowed)}"
             )
@@ -98,10 +109,18 @@ def execute_moves(
     on_transition: TransitionCallback,
     fidelity: str = "settle",
 ) -> ExplorationTask:
-    """Carries a list of moves out, on a scene at rest, until one makes it collapse.
+    """Execute a list of moves in a scene at rest, until one makes it collapse.
+
+    Args:
+        scene: Scene at rest.
+        moves: The moves.
+        seed: Seed of placements and of the simulation.
+        config: Configuration.
+        on_transition: Called after each move.
+        fidelity: Fidelity at which moves are executed, one of `FIDELITIES`.
 
     Raises:
-        InputError: a move names an object that is not in the scene or not in view, or puts one on itself.
+        InputError: A move names an object that is not visible, or places an object on itself.
     """
     backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
 
@@ -128,16 +147,26 @@ def execute_moves(
 def plan_moves(
     scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path
 ) -> list[dict[str, Any]]:
-    """Plans how the arm would carry out each move in a scene at rest, as it is; writes `plan.json`, and returns what it holds.
+    """Plan the arm's motion for each move without executing it; write `plan.json`.
+
+    Every move is planned for the scene as it is, not for the scene after the moves before.
+
+    Args:
+        scene: Scene at rest.
+        moves: The moves.
+        seed: Seed of placements.
+        config: Configuration.
+        out: Output folder.
+
+    Returns:
+        The plans as documents.
 
     Raises:
-        InputError: as `carry_out`.
+        InputError: A move names an object that is not visible, or places an object on itself.
     """
-    perception, rng, executor = (
-        LabelDetector(config.cell.camera).perceive(scene),
-        item_rng(seed),
-        ArmExecutor(config),
-    )
+    perception = LabelDetector(config.cell.camera).perceive(scene)
+    rng = item_rng(seed)
+    executor = ArmExecutor(config)
     plans = list[dict[str, Any]]()
     for number, move in enumerate(moves):
         _check_move(moves, number, [d.name for d in perception.observation.detections], scene)
@@ -164,10 +193,10 @@ class _MoveEntry(StrictModel):
 
 
 def read_moves(path: Path) -> list[Move]:
-    """Moves from a YAML list of `{pick: NAME, place: NAME or tray}`.
+    """Return the moves of a YAML list of `{pick: NAME, place: NAME or tray}`.
 
     Raises:
-        InputError: the file, the entry and what is allowed.
+        InputError: The file or one of its entries cannot be used.
     """
     content = f"a list of {{pick: NAME, place: NAME or {TRAY}}}"
     entries = validate(tuple[_MoveEntry, ...], read_yaml(path, content), str(path))
@@ -177,7 +206,7 @@ def read_moves(path: Path) -> list[Move]:
 
 
 def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
-    """The document of `episode.json`."""
+    """Return the document of `episode.json`."""
     end = task.termination or TerminationReason.GAVE_UP
     moves = []
     for step in task.transitions:
@@ -221,9 +250,22 @@ def write_episode(
     *,
     extra_fields: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Writes `episode.json`, `after.yaml` (the scene at the end) and the page; returns what `episode.json` holds.
+    """Write `episode.json`, the final scene `after.yaml` and the web page of an episode.
 
-    At fidelity `arm` also `trajectory.h5`, see `station/trajectory_file.py`. `extra_fields` replace fields of the episode.
+    At fidelity `arm` also `trajectory.h5`, the recorded motions.
+
+    Args:
+        out: Output folder.
+        task: The episode.
+        title: Title of the page.
+        agent: Name of the policy.
+        fidelity: Fidelity at which moves were executed.
+        seed: Seed of the episode.
+        config: Configuration.
+        extra_fields: Fields that are added to the document, or replace its own.
+
+    Returns:
+        The document of `episode.json`.
     """
     fields = {**episode_to_dict(task, agent, fidelity, seed), **(extra_fields or {})}
     cell = config.cell.with_support(task.initial_scene.support)

@@ -454,7 +454,7 @@ def _write_results(
 def _write_csv(
     path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
 ) -> None:
-    """Write a table; without columns they are the first row's, and an empty table is not written."""
+    """Write a table; the default columns are those of the first row, and none of an empty table."""
     columns = columns or (list(rows[0]) if rows else [])
     if not columns:
         return

@@ -1,4 +1,7 @@
-"""`drake-clutter generate`: a batch of scenes, resumable, in parallel, the same for any number of workers."""
+"""Generation of scenes, parallel and resumable.
+
+The result does not depend on the number of workers.
+"""
 
 import json
 import time

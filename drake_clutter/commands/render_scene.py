@@ -1,4 +1,4 @@
-"""`drake-clutter render`: what the cameras of the cell see of a scene."""
+"""Images of the cameras of a work cell."""
 
 from pathlib import Path
 
@@ -13,16 +13,25 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 
 DEPTH_UNIT = 1e-4
-"""m per step of depth.png, of 16 bits; 0 where nothing is seen, or what is too far for them."""
+"""Depth per step of the 16-bit `depth.png` [m].
+
+The value is 0 where the depth is unknown or too large for 16 bits.
+"""
 
 
 def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, float]:
-    """Writes the images of a scene at rest, after the camera's name if there are several.
+    """Write the images of a scene at rest.
 
-    `label.png` holds 0 for what is no object and k for the k-th object of the scene.
+    File names start with the camera's name if the cell has several cameras. `label.png` contains 0
+    where there is no object and k at object k of the scene, counted from 1.
+
+    Args:
+        scene: The scene.
+        config: Configuration with the cell.
+        out: Output folder.
 
     Returns:
-        The visible share of each object, of the camera that an explorer sees through.
+        Visible fraction of each object by name, from the camera used for exploration.
     """
     cameras = config.cell.cameras
     visible_fractions = [
@@ -34,7 +43,7 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
 
 
 def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
-    """Writes what one camera sees; returns the visible share of each object."""
+    """Write the images of one camera; return the visible fraction of each object."""
     camera = CameraRenderer(config)
     images, visible_fractions = camera.render(scene), camera.visible_fractions(scene)
     depth = np.rint(images.depth / DEPTH_UNIT)

@@ -1,4 +1,4 @@
-"""`drake-clutter run` and `demo`: the closed loop, from images to the arm's motion, with a page to watch."""
+"""Closed-loop exploration, from camera images to simulated arm motion."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -19,28 +19,31 @@ from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationRea
 from drake_clutter.validation import config_yaml
 
 MAX_DEMO_SCENES = 5
-"""Scenes that the demo explores at most."""
+"""Maximum number of scenes that the demo explores; the arm may fail in one of them."""
 MAX_GENERATED_SCENES = 50
-"""Scenes that a generator may make until one is stable and hides something."""
+"""Maximum number of scenes that are generated until one is stable and has hidden objects."""
 
 
 def load_or_generate_scene(
     scenario: Scenario, first_index: int = 0, is_suitable: Callable[[Scene], bool] = lambda _: True
 ) -> tuple[Scene, int]:
-    """The scenario's scene at rest, and the index under which the generator made it; from `first_index` on, the first that suits.
+    """Return the scene of a scenario at rest, and its index among the generated scenes.
+
+    Args:
+        scenario: The scenario.
+        first_index: Index of the first scene to generate.
+        is_suitable: Whether a generated scene may be returned.
 
     Raises:
-        InputError: a scene file that cannot be used, or a generator that makes no such scene that is stable and hides something.
+        InputError: The scene file cannot be used, or no generated scene is stable, has hidden
+            objects and is suitable.
     """
     catalog = Path(scenario.catalog) if scenario.catalog else None
     if scenario.scene:
         file = load_scene(Path(scenario.scene), load_catalog(catalog))
-        judged = file.verdict is not None and file.verdict.stable
-        return (
-            file.settled_scene
-            if judged
-            else settle_scene(file.scene, scenario.world, scenario.seed)
-        ), 0
+        if file.verdict is not None and file.verdict.stable:
+            return file.settled_scene, 0
+        return settle_scene(file.scene, scenario.world, scenario.seed), 0
     job = GenerationJob(
         scenario.generator,
         scenario.objects,
@@ -52,19 +55,30 @@ def load_or_generate_scene(
     generator = SceneGenerator(job)
     for index in range(first_index, first_index + MAX_GENERATED_SCENES):
         generated = generator(index)
-        if generated.verdict.hidden and is_suitable(
-            scene := generated.scene.with_poses(generated.verdict.settled)
-        ):
+        if not generated.verdict.hidden:
+            continue
+        scene = generated.scene.with_poses(generated.verdict.settled)
+        if is_suitable(scene):
             return scene, index
     raise InputError(
-        f"generator: none of {MAX_GENERATED_SCENES} scenes by {scenario.generator} is stable, hides something and suits"
+        f"generator: none of {MAX_GENERATED_SCENES} scenes by {scenario.generator} is stable, has "
+        "hidden objects and can be explored completely by the arm"
     )
 
 
 def run_closed_loop(
     scenario: Scenario, scene: Scene, on_transition: TransitionCallback
 ) -> tuple[ExplorationTask, Timing]:
-    """Plays a scenario on a scene at rest."""
+    """Run the episode of a scenario in closed loop.
+
+    Args:
+        scenario: The scenario.
+        scene: Scene at rest.
+        on_transition: Called after each move.
+
+    Returns:
+        The episode, and the times that it took.
+    """
     policy = make_policy(scenario.agent, scenario.world)
     perceive = make_perception(scenario, scene.support)
     closed_loop = ClosedLoop(
@@ -88,19 +102,39 @@ def write_scenario_results(
     title: str,
     **extra_fields: int,
 ) -> dict[str, Any]:
-    """Writes `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the page; returns what `episode.json` holds."""
+    """Write the files of a closed-loop episode.
+
+    These are `scenario.yaml`, `scene.yaml`, `episode.json`, `trajectory.h5` and the web page.
+
+    Args:
+        out: Output folder.
+        scenario: The scenario.
+        task: The episode.
+        timing: The times that it took.
+        title: Title of the page.
+        extra_fields: Additional fields of `episode.json`.
+
+    Returns:
+        The document of `episode.json`.
+    """
     write_text(out / "scenario.yaml", config_yaml(scenario))
     save_scene(out / "scene.yaml", task.initial_scene, scenario.world.cell)
-    told: dict[str, Any] = {"timing": asdict(timing), **extra_fields}
     return write_episode(
-        out, task, title, scenario.agent, "arm", scenario.seed, scenario.world, extra_fields=told
+        out,
+        task,
+        title,
+        scenario.agent,
+        "arm",
+        scenario.seed,
+        scenario.world,
+        extra_fields={"timing": asdict(timing), **extra_fields},
     )
 
 
 def run_scenario(
     scenario: Scenario, out: Path, on_transition: TransitionCallback
 ) -> dict[str, Any]:
-    """Plays a scenario; see `write`."""
+    """Run a scenario and write its results; see `write_scenario_results`."""
     scene, _ = load_or_generate_scene(scenario)
     task, timing = run_closed_loop(scenario, scene, on_transition)
     return write_scenario_results(
@@ -108,17 +142,19 @@ def run_scenario(
         scenario,
         task,
         timing,
-        f"{scenario.agent} and the arm search {Path(scenario.scene).name or 'a scene'}",
+        f"{scenario.agent} explores {Path(scenario.scene).name or 'a scene'} with the arm",
     )
 
 
 def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -> dict[str, Any]:
-    """SG* makes scenes, and the arm searches them by depth images alone, until everything is found in one; see `write`.
+    """Explore generated scenes from depth images until all objects of one are found.
 
-    Scenes in which no arm finds everything are passed over.
+    Writes the results of the last scene; see `write_scenario_results`. Scenes in which the arm
+    cannot reveal every object are skipped.
     """
-    arm_bound, index = ArmReachabilityBound(scenario.world), -1
-    for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, the last one is told
+    arm_bound = ArmReachabilityBound(scenario.world)
+    index = -1
+    for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, used after the loop
         scene, index = load_or_generate_scene(
             scenario, index + 1, lambda scene: not arm_bound.find_unrevealable(scene)
         )
@@ -130,6 +166,6 @@ def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -
         scenario,
         task,
         timing,
-        f"SG* hides, the arm searches: seed {scenario.seed}, scene {index}",
+        f"Closed-loop exploration of an SG* scene (seed {scenario.seed}, scene {index})",
         scenes_tried=num_scenes,
     )

@@ -1,4 +1,4 @@
-"""`drake-clutter solve`: the fewest moves that reveal everything, and whether Drake confirms them."""
+"""Shortest plans from full state information, confirmed in Drake."""
 
 from pathlib import Path
 from typing import Any
@@ -21,22 +21,24 @@ def solve_scene(
     config: ClutterConfig,
     on_transition: TransitionCallback,
 ) -> dict[str, Any]:
-    """Searches, carries a plan out at fidelity `settle`, and writes `solution.json`; with a plan also `moves.yaml` and a page.
+    """Search for the shortest plan that reveals all objects, and execute it.
+
+    Writes `solution.json` and, if there is a plan, `moves.yaml`, `episode.json` and a web page.
 
     Args:
-        scene: at rest.
-        scene_name: of the scene, for the page's title.
-        out: the folder.
-        seed: of the places that are equally good, and of Drake's random offsets.
-        budget: moves that the search may try.
-        config: the world.
-        on_transition: called after each move that is carried out.
+        scene: Scene at rest.
+        scene_name: Name of the scene, for the page's title.
+        out: Output folder.
+        seed: Seed of placements among equally good ones, and of Drake's random offsets.
+        budget: Maximum number of moves that the search may evaluate.
+        config: Configuration.
+        on_transition: Called after each executed move.
 
     Returns:
-        What `solution.json` holds.
+        The document of `solution.json`.
 
     Raises:
-        InputError: the scene has more objects than the search takes.
+        InputError: The scene has too many objects for the search.
     """
     solution = OracleSearch(config).solve(scene, seed, budget)
     fields: dict[str, Any] = {

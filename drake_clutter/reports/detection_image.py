@@ -1,4 +1,4 @@
-"""A depth image and what a detector recognised in it, as a picture."""
+"""Depth images with the detected objects outlined."""
 
 import matplotlib
 import numpy as np
@@ -11,20 +11,26 @@ from drake_clutter.reports.scene_images import display_name
 from drake_clutter.scenes.interfaces import Observation
 
 IMAGE_SIDE = 720
+"""Width and height of the image in pixels."""
 _OVERSAMPLING = 2
 _MAX_HEIGHT = 0.45
-"""m, drawn brightest."""
+"""Height that is drawn brightest [m]."""
 _RIM_HEIGHT = 0.3
-"""m; of what stands so high at the tray's edge all is in the picture."""
+"""Objects up to this height at the edge of the support are completely in the image [m]."""
 _OUTLINE_COLOR = "#d7263d"
 
 
 def draw_detections(observation: Observation) -> NDArray[np.uint8]:
-    """(720, 720, 3) the part of the image with the tray, the brighter, the higher above it.
+    """Return the part of a depth image around the support, with detected objects outlined.
 
-    What was recognised is outlined.
+    Args:
+        observation: The depth image and the detections.
+
+    Returns:
+        RGB image, the brighter, the higher above the support. Shape (720, 720, 3).
     """
-    camera, depth = observation.camera, observation.depth
+    camera = observation.camera
+    depth = observation.depth
     size_px = np.array([camera.width, camera.height])
     center_px, support_side = camera.support_bounds(observation.support, _RIM_HEIGHT) or (
         np.array(camera.principal_point),
@@ -34,7 +40,8 @@ def draw_detections(observation: Observation) -> NDArray[np.uint8]:
     left, top = np.clip(
         np.floor(center_px + 1 - side / 2 + 1e-6).astype(int), 0, size_px - side
     ).tolist()
-    rows, columns = slice(top, top + side), slice(left, left + side)
+    rows = slice(top, top + side)
+    columns = slice(left, left + side)
     pixels = pixel_grid(depth.shape)[rows, columns]
     measured = np.isfinite(depth) & (depth > 0)
     height = np.where(
@@ -47,7 +54,7 @@ def draw_detections(observation: Observation) -> NDArray[np.uint8]:
     canvas = Canvas(
         Image.fromarray((255 * shades).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
     )
-    labels = []
+    labels = list[TextLabel]()
     for detection in observation.detections:
         cropped_mask = Image.fromarray(detection.mask[rows, columns])
         mask = np.asarray(cropped_mask.resize(size, Image.Resampling.NEAREST))
@@ -56,14 +63,7 @@ def draw_detections(observation: Observation) -> NDArray[np.uint8]:
         canvas.draw_outline(mask, (0, 0), _OUTLINE_COLOR, 4)
         ys, xs = np.nonzero(mask)
         bounds = (float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max()))
-        labels.append(
-            TextLabel(
-                display_name(detection.object_class.name),
-                innermost_point(mask),
-                bounds,
-                _OUTLINE_COLOR,
-                34,
-            )
-        )
+        name = display_name(detection.object_class.name)
+        labels.append(TextLabel(name, innermost_point(mask), bounds, _OUTLINE_COLOR, 34))
     canvas.draw_labels(labels)
     return np.asarray(canvas.image.resize((IMAGE_SIDE, IMAGE_SIDE), Image.Resampling.LANCZOS))

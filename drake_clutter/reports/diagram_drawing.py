@@ -1,6 +1,6 @@
-"""A picture of a Diagram: its systems along their longest loop, and what runs between them.
+"""Drawing of a Drake Diagram: its systems on a circle, and their connections.
 
-python -m drake_clutter.reports.diagram_drawing docs/images/closed_loop.svg
+Usage: python -m drake_clutter.reports.diagram_drawing docs/images/closed_loop.svg
 """
 
 import sys
@@ -21,20 +21,26 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.closed_loop import ClosedLoop
 
-_BOX_WIDTH, _BOX_HEIGHT = 4.3, 1.0
-"""Of a system's box, in the units of the picture."""
+_BOX_WIDTH = 4.3
+"""Width of the box of a system, in the units of the drawing."""
+_BOX_HEIGHT = 1.0
+"""Height of the box of a system, in the same units."""
 _ARROW_OFFSET = 0.13
-"""By which the arrow of one direction keeps away from that of the other."""
+"""Distance by which arrows of opposite directions are separated, in the same units."""
 
 
 def connection_graph(diagram: Diagram) -> nx.DiGraph:
-    """Systems by name; on an edge `ports`, what runs along it: the output ports' names, and the inputs' if they have others."""
+    """Return the systems of a diagram by name, and their connections.
+
+    The attribute `ports` of an edge lists the names of the connected output ports, with those of
+    the input ports where they differ.
+    """
     port_labels = defaultdict[tuple[str, str], list[str]](list)
-    for (reader, to), (writer, of) in diagram.connection_map().items():
-        output, input_ = writer.get_output_port(of).get_name(), reader.get_input_port(to).get_name()
-        port_labels[writer.get_name(), reader.get_name()].append(
-            output if output == input_ else f"{output} → {input_}"
-        )
+    for (reader, input_index), (writer, output_index) in diagram.connection_map().items():
+        output_name = writer.get_output_port(output_index).get_name()
+        input_name = reader.get_input_port(input_index).get_name()
+        label = output_name if output_name == input_name else f"{output_name} → {input_name}"
+        port_labels[writer.get_name(), reader.get_name()].append(label)
     graph = nx.DiGraph()
     graph.add_nodes_from(system.get_name() for system in diagram.GetSystems())
     graph.add_edges_from(
@@ -44,7 +50,10 @@ def connection_graph(diagram: Diagram) -> nx.DiGraph:
 
 
 def draw_diagram(diagram: Diagram, path: Path) -> None:
-    """Draws a diagram to a file of a kind that Matplotlib knows."""
+    """Draw a diagram to a file of a format that Matplotlib supports.
+
+    The systems of the longest cycle come first, in its order.
+    """
     graph = connection_graph(diagram)
     cycle = max(nx.simple_cycles(graph), key=len)
     first = cycle.index(min(cycle))
@@ -75,15 +84,12 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
         axes.text(x, y - 0.22, name, ha="center", va="center", size=12, color="#444444", zorder=3)
     for a, b, ports in graph.edges(data="ports"):
         direction = centers[b] - centers[a]
-        offset = (
-            _ARROW_OFFSET * np.array([direction[1], -direction[0]]) / np.linalg.norm(direction)
-            if graph.has_edge(b, a)
-            else np.zeros(2)
-        )
-        start, end = (
-            _box_intersection(centers[a], direction, offset),
-            _box_intersection(centers[b], -direction, offset),
-        )
+        offset = np.zeros(2)
+        if graph.has_edge(b, a):
+            normal = np.array([direction[1], -direction[0]]) / np.linalg.norm(direction)
+            offset = _ARROW_OFFSET * normal
+        start = _box_intersection(centers[a], direction, offset)
+        end = _box_intersection(centers[b], -direction, offset)
         arrow = {
             "arrowstyle": "-|>",
             "linewidth": 2,
@@ -94,7 +100,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
         }
         axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=arrow, zorder=1)
         label_position = (start + end) / 2 + 2.2 * offset
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
+        label_box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
         axes.text(
             label_position[0],
             label_position[1],
@@ -102,7 +108,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
             ha="center",
             va="center",
             size=11,
-            bbox=box,
+            bbox=label_box,
             zorder=2,
         )
     axes.set(xlim=(-9, 9), ylim=(-4.8, 4.8), aspect="equal")
@@ -112,7 +118,13 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
 
 
 def _box_intersection(center: np.ndarray, direction: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Where a line that goes past the middle of a box, so far aside of it, leaves the box."""
+    """Return where a line leaves a box.
+
+    Args:
+        center: Center of the box. Shape (2,).
+        direction: Direction of the line. Shape (2,).
+        offset: Distance of the line from the center, perpendicular to it. Shape (2,).
+    """
     with np.errstate(divide="ignore"):
         scale = np.min(
             (np.copysign(np.array([_BOX_WIDTH, _BOX_HEIGHT]) / 2, direction) - offset) / direction

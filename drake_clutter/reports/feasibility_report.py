@@ -119,14 +119,17 @@ def write_feasibility_report(
     if pose_errors:
         parts.append(
             _figure(
-                "Plans from erroneous object poses that are valid for the true poses (bars: 95 % CI)",
+                "Plans from erroneous object poses, valid for the true poses (bars: 95 % CI)",
                 _plot_pose_errors(pose_errors),
             )
         )
     if targets:
         parts.append(_targets_table(targets))
     if moves:
-        parts.append("<h2>Extreme cases</h2>")
+        parts.append(
+            "<h2>Extreme cases</h2><p>The move from above and, if it is planned, the arm at the "
+            "grasp, halfway to the place, and at the place.</p>"
+        )
         parts += _extreme_cases_html(moves, setups, load_scene)
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Kinematic feasibility</title>'
@@ -175,7 +178,7 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
         "payload",
         "moves planned",
         "fraction planned (95 % CI)",
-        "median motion",
+        "median motion duration",
         "planning time (p50, p95)",
     )
     return _table(columns, rows)
@@ -267,6 +270,12 @@ def _plot_planned_fractions(
     axes.set(title=title, ylim=(0, 1))
 
 
+def _height_interval(row: Mapping[str, Any]) -> str:
+    """Return the interval of 10 cm of the height of the picked object's top face."""
+    low = 10 * int(row["pick_top"] // 0.1)
+    return f"{low:2d} to {low + 10} cm"
+
+
 def _plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
     _plot_planned_fractions(
@@ -277,7 +286,7 @@ def _plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
         axes[2],
         moves,
         setups,
-        lambda row: f"{10 * int(row['pick_top'] // 0.1):02d}+ cm",
+        _height_interval,
         "height of the top face",
     )
     axes[0].set_ylabel(_PLANNED_LABEL)
@@ -318,7 +327,8 @@ def _plot_by_pick_position(moves: Rows, setups: Mapping[str, WorkCell]) -> Figur
         count, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y))
         planned, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y), weights=is_planned)
         with np.errstate(invalid="ignore"):
-            image = _plot_heatmap(panel, planned / count, (-half_x, half_x, -half_y, half_y), 1.0)
+            fraction = planned / count
+        image = _plot_heatmap(panel, fraction, (-half_x, half_x, -half_y, half_y), 1.0)
         for i, center_x in enumerate((edges_x[1:] + edges_x[:-1]) / 2):
             for j, center_y in enumerate((edges_y[1:] + edges_y[:-1]) / 2):
                 if count[i, j]:
@@ -328,7 +338,7 @@ def _plot_by_pick_position(moves: Rows, setups: Mapping[str, WorkCell]) -> Figur
                         f"{count[i, j]:.0f}",
                         ha="center",
                         va="center",
-                        color="white",
+                        color="white" if fraction[i, j] < 0.6 else "black",
                         fontsize=11,
                     )
         panel.set(title=setup, xlabel="x in the tray frame [m]", ylabel="y [m]")

@@ -1,4 +1,4 @@
-"""Scenes that move, in the browser: one HTML file that plays offline, or a live view (Meshcat)."""
+"""3-D recordings of scenes in motion: one HTML file, or a live view (Meshcat)."""
 
 import logging
 import re
@@ -34,16 +34,27 @@ from drake_clutter.tasks.exploration_task import Transition
 
 FRAMES_PER_SECOND = 40
 _CARRY_TIME = 0.5
-"""s, for each of up, across and down."""
-_PAUSE_AFTER_MOVE, _PAUSE_AT_ENDS = 0.6, 1.5
-"""s, after each move; before the first and after the last."""
+"""Duration of each of lifting, carrying and lowering [s]."""
+_PAUSE_AFTER_MOVE = 0.6
+"""Pause after each move [s]."""
+_PAUSE_AT_ENDS = 1.5
+"""Pause before the first and after the last move [s]."""
 _CLEARANCE = 0.03
-"""m, between what is carried and the highest other object."""
-_KEY_FRAME_DISTANCE, _KEY_FRAME_ANGLE = 1e-4, 1e-3
-"""m, rad; poses that differ by less share a key frame, which makes the file a third as large."""
+"""Distance between a carried object and the highest other object [m]."""
+_KEY_FRAME_DISTANCE = 1e-4
+"""Translation below which poses share a key frame, which reduces the file to a third [m]."""
+_KEY_FRAME_ANGLE = 1e-3
+"""Rotation below which poses share a key frame [rad]."""
 _NUM_REPETITIONS = 1_000_000_000
-_CAMERA_POSITION, _CAMERA_TARGET, _FOV_Y_DEG = (0.45, -1.35, 1.10), (0.0, 0.0, 0.14), 36.0
-"""m, for a tray of 0.7 m."""
+_REFERENCE_SIDE = 0.70
+"""Side of the support for which the camera poses are given; they scale with the support [m]."""
+_CAMERA_POSITION = (0.45, -1.35, 1.10)
+_CAMERA_TARGET = (0.0, 0.0, 0.14)
+"""Point that the camera looks at, in the tray frame [m]."""
+_CAMERA_POSITION_WITH_ARM = (0.75, -1.90, 1.40)
+_CAMERA_TARGET_WITH_ARM = (-0.15, 0.0, 0.36)
+"""Point that the camera looks at if the arm is shown, in the tray frame [m]."""
+_FOV_Y_DEG = 36.0
 _LIGHTS: dict[str, dict[str, Any]] = {
     "SpotLight": {
         "intensity": 20.0,
@@ -56,23 +67,33 @@ _LIGHTS: dict[str, dict[str, Any]] = {
     "AmbientLight": {"intensity": 0.4},
     "FillLight": {"intensity": 0.3},
 }
-"""Meshcat's own, dimmed: left as they are, they bleach bright products. The bias keeps surfaces from shading themselves."""
+"""Properties of Meshcat's own lights.
+
+They are dimmed, because the defaults overexpose bright products. The bias prevents surfaces from
+casting shadows on themselves.
+"""
 _SOURCE_COMMENT = re.compile(r"^\s*// \w+\[\d+\] from .*$", re.MULTILINE)
 
 
 def episode_frames(start: Scene, steps: Sequence[Transition]) -> list[MotionSample]:
-    """An episode's moves as one motion: each object is lifted, carried over and set down, then everything settles.
+    """Return the moves of an episode as one motion.
 
-    Where a move was made by teleport, in one instant, lifting and carrying are an illustration, and no robot's motion. Moves that
-    could not be carried out are left out.
+    Teleported objects are shown as lifted, carried and set down, which is an illustration. Moves
+    that were not executed are omitted.
+
+    Args:
+        start: Scene before the first move.
+        steps: Transitions in order.
     """
-    poses, time = dict(start.poses), _PAUSE_AT_ENDS
+    poses = dict(start.poses)
+    time = _PAUSE_AT_ENDS
     frames = [MotionSample(0.0, dict(poses))]
     scene = start
     for step in steps:
         if not step.outcome.result.was_executed:
             continue
-        pick, motion = step.move.pick, step.outcome.motion
+        pick = step.move.pick
+        motion = step.outcome.motion
         if not (motion and motion[0].arm):
             for X_TO in _illustrate_carry(
                 scene, pick, step.outcome.X_TO_released or step.outcome.scene[pick].X_TO
@@ -92,8 +113,9 @@ def episode_frames(start: Scene, steps: Sequence[Transition]) -> list[MotionSamp
 
 
 def concatenate_motions(motions: Sequence[Sequence[MotionSample]]) -> list[MotionSample]:
-    """Motions one after the other, with pauses."""
-    frames, time = list[MotionSample](), 0.0
+    """Return motions one after the other, with pauses."""
+    frames = list[MotionSample]()
+    time = 0.0
     for motion in motions:
         frames += [replace(frame, time=time + frame.time) for frame in motion]
         time = frames[-1].time + _PAUSE_AFTER_MOVE
@@ -101,13 +123,20 @@ def concatenate_motions(motions: Sequence[Sequence[MotionSample]]) -> list[Motio
 
 
 def _illustrate_carry(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
-    """The illustrated way of an object from where it is to its place, at 40 Hz: up, across, down."""
+    """Return poses of an object that is lifted, carried and set down, at 40 Hz.
+
+    Args:
+        scene: Scene before the move.
+        pick: Name of the moved object.
+        X_T_placed: Pose of the object at the end.
+    """
     picked = scene[pick]
     # Its lowest point may lie below its origin by as much as its farthest corner.
     reach = float(np.linalg.norm(picked.object_class.corners, axis=1).max())
     tops = [o.top_height for o in scene.objects if o.name != pick]
     height = max([picked.X_TO.p[2], X_T_placed.p[2], *(top + reach for top in tops)]) + _CLEARANCE
-    start, end = picked.X_TO.p, X_T_placed.p
+    start = picked.X_TO.p
+    end = X_T_placed.p
     corners = np.array([start, [start[0], start[1], height], [end[0], end[1], height], end])
     slerp = Slerp([0.0, 1.0], Rotation.from_matrix([picked.X_TO.rotation, X_T_placed.rotation]))
     count = round(_CARRY_TIME * FRAMES_PER_SECOND)
@@ -129,21 +158,22 @@ def _illustrate_carry(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
 def write_recording(
     path: Path, scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
 ) -> None:
-    """Writes one HTML file that shows the frames again and again, without a network.
+    """Write one HTML file that plays frames in a loop, without a network.
 
     Args:
-        path: the file.
-        scene: the objects, and the pose of those that a frame does not name.
-        frames: in order of time; a single one is a still scene.
-        cell: whose arm is shown, if the frames know where it was.
+        path: The file.
+        scene: The objects, and the poses of those that a frame does not contain.
+        frames: Frames in order of time; a single frame is a still scene.
+        cell: Work cell, whose arm is shown if frames have its joint positions.
     """
-    # Meshcat notes in which folder of this machine each texture lay; that is nobody's business.
+    # Meshcat writes the path of each texture on this machine into comments.
     write_text(path, _SOURCE_COMMENT.sub("", _animate(scene, frames, cell).StaticHtml()))
 
 
 def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
+    """Return a viewer with the animation of frames; see `write_recording`."""
     arm_positions = [frame.arm.q for frame in frames if frame.arm]
-    # Nobody is to open the address that Drake announces for a recording; that of a view is for the caller to say.
+    # Drake logs the address of the viewer, which callers print where it is of use.
     with suppress_drake_log(logging.WARNING):
         meshcat, paths, arm_poses = _build_viewer(scene, cell, arm=bool(arm_positions))
     if len(frames) > 1:
@@ -154,7 +184,9 @@ def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Me
         numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
         all_poses, q = list[dict[str, Pose]](), arm_positions[0] if arm_positions else ()
         for frame in frames:
-            q = frame.arm.q if frame.arm else q  # it stays where it was
+            q = (
+                frame.arm.q if frame.arm else q
+            )  # without joint positions the arm stays where it was
             all_poses.append({**scene.poses, **frame.poses, **arm_poses(q)})
         for name, meshcat_path in paths.items():
             for index, pose in _key_frames([poses[name] for poses in all_poses]):
@@ -164,23 +196,36 @@ def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Me
 
 
 def serve_recording(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
-    """Shows a scene, or frames as `write_recording`, at `web_url()` of what is returned, on this machine, while that is kept."""
+    """Serve frames at the `web_url()` of the returned viewer, while it is kept.
+
+    The arguments are those of `write_recording`.
+    """
     return _animate(scene, frames, cell)
 
 
 ArmPoses = Callable[[Sequence[float]], dict[str, Pose]]
-"""X_TL of the arm's links by name, from its joint angles."""
+"""Function from the arm's joint positions [rad] to X_TL of its links by name."""
 
 
 def _build_viewer(
     scene: Scene, cell: WorkCell, *, arm: bool = False
 ) -> tuple[Meshcat, dict[str, str], ArmPoses]:
-    """A viewer with the scene in it, with or without the arm; the Meshcat path of each object and link by name; `ArmPoses`."""
+    """Return a viewer that shows a scene.
+
+    Args:
+        scene: The objects.
+        cell: The work cell.
+        arm: Whether to show the arm and the fixtures.
+
+    Returns:
+        The viewer, the Meshcat path of each object and link by name, and `ArmPoses`.
+    """
     builder = DiagramBuilder()
     objects = [(o.name, o.object_class) for o in scene.objects]
     scene_plant = add_scene_plant(builder, objects, scene.support, 0.01, visuals=True)
     plant = scene_plant.plant
-    links, work_cell_model = {}, None
+    links = {}
+    work_cell_model = None
     if arm:
         work_cell_model = add_work_cell(
             plant,
@@ -207,18 +252,20 @@ def _build_viewer(
     scene_plant.set_poses(plant_context, scene.objects)
     visualizer.ForcedPublish(visualizer.GetMyContextFromRoot(context))
 
-    scale = max(scene.support.size) / 0.70
+    scale = max(scene.support.size) / _REFERENCE_SIDE
+    position = _CAMERA_POSITION_WITH_ARM if arm else _CAMERA_POSITION
+    target = _CAMERA_TARGET_WITH_ARM if arm else _CAMERA_TARGET
     meshcat.SetCamera(Meshcat.PerspectiveCamera(fov=_FOV_Y_DEG))
-    meshcat.SetCameraPose(scale * np.array(_CAMERA_POSITION), scale * np.array(_CAMERA_TARGET))
+    meshcat.SetCameraPose(scale * np.array(position), scale * np.array(target))
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Lights/SpotLight", "visible", True)
     for lamp, properties in _LIGHTS.items():
         for name, value in properties.items():
             meshcat.SetProperty(f"/Lights/{lamp}/<object>", name, value)
-    # Grey, because the background also lights the products from all sides.
-    for which, colour in (("top_color", [0.50, 0.53, 0.57]), ("bottom_color", [0.70, 0.71, 0.73])):
-        meshcat.SetProperty("/Background", which, colour)
+    # Gray, because the background also lights the products from all sides.
+    for name, color in (("top_color", [0.50, 0.53, 0.57]), ("bottom_color", [0.70, 0.71, 0.73])):
+        meshcat.SetProperty("/Background", name, color)
     inspector = scene_plant.scene_graph.model_inspector()
     frame_ids = {
         name: plant.GetBodyFrameIdOrThrow(body.index())
@@ -240,7 +287,10 @@ def _build_viewer(
 
 
 def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
-    """Index and pose of the frames between which a viewer may interpolate; a rest has one at each of its ends."""
+    """Return index and pose of the frames between which a viewer may interpolate.
+
+    An object at rest has a key frame at the start and at the end of its rest.
+    """
     keys = [(0, poses[0])]
     for index, pose in enumerate(poses[1:], start=1):
         last, held = keys[-1]
@@ -254,9 +304,10 @@ def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
 
 
 def _nearly_equal(a: Pose, b: Pose) -> bool:
-    # A turn by a small angle moves the unit quaternion by half of it; q and -q are one rotation.
-    turn = 2 * min(
+    # A rotation by a small angle changes the unit quaternion by half the angle; q and -q are equal.
+    """Return whether two poses may share a key frame."""
+    angle = 2 * min(
         np.linalg.norm(np.subtract(a.quaternion, b.quaternion)),
         np.linalg.norm(np.add(a.quaternion, b.quaternion)),
     )
-    return bool(np.linalg.norm(a.p - b.p) < _KEY_FRAME_DISTANCE and turn < _KEY_FRAME_ANGLE)
+    return bool(np.linalg.norm(a.p - b.p) < _KEY_FRAME_DISTANCE and angle < _KEY_FRAME_ANGLE)

@@ -1,4 +1,4 @@
-"""Pictures of scenes for people: from above and at an angle, with shadows; and with what matters marked."""
+"""Images of scenes for people: from above and from the front, plain or annotated."""
 
 import re
 from dataclasses import dataclass
@@ -20,14 +20,20 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer, RenderedIma
 from drake_clutter.simulation.scene_plant import pose_from_transform
 
 OVERHEAD_SIZE = (720, 720)
+"""Width and height of overhead images in pixels."""
 OBLIQUE_SIZE = (960, 720)
-"""Width and height, pixels."""
-# Pictures are rendered and drawn larger and scaled down, which smooths the edges.
+"""Width and height of oblique images in pixels."""
 _OVERSAMPLING = 2
+"""Factor by which images are rendered and drawn larger, then downsampled to smooth edges."""
 _FOV_Y_DEG = 30.0
-# For a tray of 0.7 m, that is, with room for a stack at its rim; pictures of other trays are taken from farther or nearer.
-_CAMERA_HEIGHT, _REFERENCE_SIDE = 1.60, 0.70
-_CAMERA_POSITION, _CAMERA_TARGET = (0.45, -1.30, 1.05), (0.0, -0.02, 0.08)
+_REFERENCE_SIDE = 0.70
+"""Side of the support for which the camera poses are given; they scale with the support [m]."""
+_CAMERA_HEIGHT = 1.60
+"""Height of the overhead camera, with room for a stack at the rim of the support [m]."""
+_CAMERA_POSITION = (0.45, -1.30, 1.05)
+"""Position of the oblique camera in the tray frame [m]."""
+_CAMERA_TARGET = (0.0, -0.02, 0.08)
+"""Point that the oblique camera looks at [m]."""
 
 
 def _make_light(
@@ -44,7 +50,8 @@ def _make_light(
     )
 
 
-# Only the spot casts shadows: point lights cannot, and directional ones would also shine through what is parked out of sight.
+# Only the spot light casts shadows. Point lights cannot, and shadows of directional lights would
+# also come from bodies that are parked out of sight.
 RENDER_ENGINE = RenderEngineVtkParams(
     backend="EGL",
     default_clear_color=[0.95, 0.955, 0.96],
@@ -60,7 +67,7 @@ RENDER_ENGINE = RenderEngineVtkParams(
 
 
 class Highlight(Enum):
-    """What a colour says in annotated pictures; the value is sRGB."""
+    """Meaning of a color in annotated images; the value is an sRGB color."""
 
     VISIBLE = "#1f2630"
     MOVED = "#0b5cd6"
@@ -72,15 +79,15 @@ class Highlight(Enum):
 
 @dataclass(frozen=True)
 class Annotations:
-    """What an annotated picture points out; objects are given by name.
+    """Objects to point out in an annotated image, by name.
 
     Attributes:
-        hidden: out of view and not found yet: dashed where they are.
-        occluded: out of view, but found before: dashed.
-        found: newly found.
-        fallen: did not stay.
-        moved: the object that a move is about, or None.
-        X_T_placed: X_TO of `moved` where the move puts it: an arrow leads there; None for no arrow.
+        hidden: Objects out of view and not found yet, drawn dashed.
+        occluded: Objects out of view but found before, drawn dashed.
+        found: Newly found objects.
+        fallen: Objects that fell or slipped.
+        moved: Object that is moved, or None.
+        X_T_placed: Pose to which `moved` is moved, shown by an arrow; None for no arrow.
     """
 
     hidden: tuple[str, ...] = ()
@@ -91,7 +98,7 @@ class Annotations:
     X_T_placed: Pose | None = None
 
     def highlight(self, name: str) -> Highlight:
-        """The mark of an object."""
+        """Return the highlight of an object."""
         groups = (
             (Highlight.FALLEN, self.fallen),
             (Highlight.MOVED, (self.moved,)),
@@ -103,19 +110,24 @@ class Annotations:
 
 
 def display_name(name: str) -> str:
-    """A name of an object, or a key, as people write it: "sugar_box_3" is "Sugar box 3"."""
+    """Return an identifier as people write it: "sugar_box_3" is "Sugar box 3"."""
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
 
 
 def _short_name(name: str) -> str:
-    """The number at a name's end, if it has one: pictures of many objects have no room for more."""
+    """Return the number at the end of a name, or the name if there is none."""
     number = re.search(r"\d+$", name)
     return number.group() if number else display_name(name)
 
 
 def look_at_pose(position: NDArray[np.float64], target: NDArray[np.float64]) -> Pose:
-    """X_TC of a camera at `position` (3,) m that looks at `target` (3,) m, upright."""
+    """Return X_TC of an upright camera that looks at a point.
+
+    Args:
+        position: Position of the camera in the tray frame [m]. Shape (3,).
+        target: Point that it looks at [m]. Shape (3,).
+    """
     z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -123,17 +135,17 @@ def look_at_pose(position: NDArray[np.float64], target: NDArray[np.float64]) -> 
 
 
 class SceneRenderer:
-    """Takes pictures of scenes."""
+    """Renders images of scenes."""
 
     def __init__(self) -> None:
         self._latest: tuple[Scene, RenderedImages] | None = None
 
     def render_overhead(self, scene: Scene) -> NDArray[np.uint8]:
-        """The tray from straight above, (720, 720, 3) uint8."""
+        """Return an RGB image from straight above. Shape (720, 720, 3)."""
         return _downsample(Image.fromarray(self._render_overhead_images(scene).color))
 
     def render_oblique(self, scene: Scene) -> NDArray[np.uint8]:
-        """The tray from the front, at an angle, (720, 960, 3) uint8."""
+        """Return an RGB image from the front, at an angle. Shape (720, 960, 3)."""
         scale = max(scene.support.size) / _REFERENCE_SIDE
         images = self._oblique.render(
             scene,
@@ -142,19 +154,29 @@ class SceneRenderer:
         return _downsample(Image.fromarray(images.color))
 
     def render_annotated(self, scene: Scene, annotations: Annotations) -> NDArray[np.uint8]:
-        """`overhead`, with the objects outlined and named, (720, 720, 3) uint8.
+        """Return the overhead image with outlined and named objects.
 
-        What is in view and not marked bears only the number of its name.
+        Visible objects without an annotation are labeled with the number at the end of their name.
+
+        Args:
+            scene: The scene.
+            annotations: Objects to point out.
+
+        Returns:
+            RGB image. Shape (720, 720, 3).
         """
         images = self._render_overhead_images(scene)
         canvas = Canvas(Image.fromarray(images.color))
         areas = find_objects(images.label + 1, max_label=len(scene.objects))
         dashed: list[tuple[NDArray[np.float64], Highlight]] = []
-        labels, subtle_labels, arrows = [], [], []
+        labels = list[TextLabel]()
+        subtle_labels = list[TextLabel]()
+        arrows = list[tuple[tuple[float, float], tuple[float, float]]]()
         for index, (scene_object, area) in enumerate(zip(scene.objects, areas, strict=True)):
-            name, highlight = scene_object.name, annotations.highlight(scene_object.name)
+            name = scene_object.name
+            highlight = annotations.highlight(name)
             if highlight in (Highlight.HIDDEN, Highlight.OCCLUDED) or area is None:
-                if highlight is Highlight.VISIBLE:  # it has left the picture
+                if highlight is Highlight.VISIBLE:  # it is outside of the image
                     continue
                 corners = self._project(scene, scene_object.corners_T)
                 bounds = _bounds(corners)
@@ -200,27 +222,30 @@ class SceneRenderer:
         return CameraRenderer(_camera_above(default_cell().support, OBLIQUE_SIZE), RENDER_ENGINE)
 
     def _render_overhead_images(self, scene: Scene) -> RenderedImages:
-        # One move's picture "after" shows the same scene as the next one's "before".
+        # The image after a move shows the same scene as the image before the next move.
         if self._latest is None or self._latest[0] is not scene:
-            self._latest = (
-                scene,
-                self._overhead.render(
-                    scene, pose_from_transform(_camera_above(scene.support).X_TC)
-                ),
-            )
+            X_TC = pose_from_transform(_camera_above(scene.support).X_TC)
+            self._latest = scene, self._overhead.render(scene, X_TC)
         return self._latest[1]
 
     def _project(self, scene: Scene, p_T: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (N, 2) in the picture from above, before it is scaled down, of points (N, 3) m in the tray frame."""
+        """Return the pixels of points in the overhead image before downsampling.
+
+        Args:
+            scene: The scene.
+            p_T: Points in the tray frame [m]. Shape (n, 3).
+
+        Returns:
+            Pixels (x, y). Shape (n, 2).
+        """
         camera = _camera_above(scene.support)
-        # Nothing reaches the camera, save what a collapse has flung there.
-        return camera.project(
-            np.minimum(p_T, [np.inf, np.inf, camera.X_TC.translation()[2] - 0.05])
-        )
+        # A collapse may throw objects above the camera; their points are moved below it.
+        max_height = camera.X_TC.translation()[2] - 0.05
+        return camera.project(np.minimum(p_T, [np.inf, np.inf, max_height]))
 
 
 def _camera_above(support: Support, size: tuple[int, int] = OVERHEAD_SIZE) -> Camera:
-    """A camera for pictures of a size from above a support."""
+    """Return a camera above a support, for images of a size in pixels."""
     width, height = (_OVERSAMPLING * pixels for pixels in size)
     return Camera.overhead(
         _CAMERA_HEIGHT * max(support.size) / _REFERENCE_SIDE,
@@ -231,18 +256,16 @@ def _camera_above(support: Support, size: tuple[int, int] = OVERHEAD_SIZE) -> Ca
 
 
 def _bounds(points: NDArray[np.float64]) -> Rectangle:
-    left, top, right, bottom = (float(v) for v in (*points.min(axis=0), *points.max(axis=0)))
-    return left, top, right, bottom
+    """Return the bounding rectangle of points. Shape (n, 2)."""
+    left, top = points.min(axis=0)
+    right, bottom = points.max(axis=0)
+    return float(left), float(top), float(right), float(bottom)
 
 
 def _center(rectangle: Rectangle) -> tuple[float, float]:
     return (rectangle[0] + rectangle[2]) / 2, (rectangle[1] + rectangle[3]) / 2
 
 
-def _downsample(picture: Image.Image) -> NDArray[np.uint8]:
-    return np.asarray(
-        picture.resize(
-            (picture.width // _OVERSAMPLING, picture.height // _OVERSAMPLING),
-            Image.Resampling.LANCZOS,
-        )
-    )
+def _downsample(image: Image.Image) -> NDArray[np.uint8]:
+    size = (image.width // _OVERSAMPLING, image.height // _OVERSAMPLING)
+    return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
