@@ -14,7 +14,7 @@ from drake_clutter.simulation.cell_plant import validate_models
 
 JOINTS = ", ".join(robot("ur5e").joint_names)
 SHIPPED = "package://drake_clutter_models/FILE"
-ORDER = "the least, then the greatest"
+ORDER = "the lower, then the upper limit"
 PLACES = "a value for each joint, here or in the model file"
 
 
@@ -169,7 +169,7 @@ def test_a_gripper_in_the_arms_file() -> None:
         (
             "</robot>",
             '<link name="loose"/></robot>',
-            "link 'loose' hangs on no joint; allowed is an arm alone",
+            "link 'loose' has no parent joint; allowed is an arm alone",
         ),
         (
             "<limit",

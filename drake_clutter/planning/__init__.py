@@ -1,1 +1,1 @@
-"""Motion planning for picking and placing: collision model, search, timing, optimization."""
+"""Pick-and-place planning: collision model, search, timing, optimization."""

@@ -1,4 +1,4 @@
-"""Signed distances and their gradients between the arm, an attached object and obstacles.
+"""Signed distances between arm, attached object and obstacles, with gradients.
 
 Frames: T is the support and the world, F is the flange, G is the gripper, O is an object.
 """
@@ -121,7 +121,7 @@ class CollisionModel:
         return geometries
 
     def _find_geometry_depths(self, link_depths: Mapping[str, int]) -> dict[GeometryId, int]:
-        """Return the number of joints between the base and each geometry of robot and gripper.
+        """Return the number of joints between the base and each geometry of the arm.
 
         The key is the geometry, because a link, a part of the gripper and an object may share a
         name.

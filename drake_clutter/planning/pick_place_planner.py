@@ -1,4 +1,4 @@
-"""Pick-and-place planner: grasp selection, collision-free paths and time-optimal trajectories.
+"""Pick-and-place planner: grasps, collision-free paths, time-optimal trajectories.
 
 Frames: T is the support, G is the gripper, O is the picked object.
 """

@@ -1,4 +1,4 @@
-"""Search for a pick-and-place plan over grasps, yaw angles, IK solutions and transfer heights.
+"""Search for a plan over grasps, yaw angles, IK solutions and transfer heights.
 
 Frames: T is the support, G is the gripper, O is the picked object.
 """
@@ -227,7 +227,7 @@ class PickPlaceSearch:
     def _required_distance(
         self, distance: SignedDistance, endpoint: EndpointContext, min_distance: float
     ) -> float:
-        """Return the required distance of a pair at the configuration of the last query [m].
+        """Return the required distance of a pair at the last query's configuration [m].
 
         The gripper may touch the picked object, and the attached object may touch its neighbors at
         the endpoint. The required distance grows with the horizontal distance from the endpoint.
@@ -264,7 +264,7 @@ class PickPlaceSearch:
         return EndpointContext(p_TG_xy, self._contact_distances(q))
 
     def _place_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
-        """Return the endpoint at the place pose, or None if arm or object are in collision."""
+        """Return the endpoint at the place pose, or None in collision."""
         self._set_up_segment("carry", X_OG)
         p_TG_xy = (self._X_TO_place @ _to_matrix(X_OG))[:2, 3]
         context = EndpointContext(p_TG_xy, self._contact_distances(q))
@@ -272,7 +272,7 @@ class PickPlaceSearch:
         return None if distance is None else context
 
     def _contact_distances(self, q: Floats) -> dict[str, float]:
-        """Return the allowed distances of the attached object to its neighbors, by name [m]."""
+        """Return the allowed distances to neighbors of the attached object, by name [m]."""
         name = self._picked.name
         distances = self._collision_model.distances_below(q, self._config.min_distance)
         of_object = [distance for distance in distances if distance.pair[0] == name]
@@ -293,7 +293,7 @@ class PickPlaceSearch:
     def plan_grasp(
         self, grasp: Grasp, q_pick: Floats, q_place: Floats, yaw: float
     ) -> PickPlacePlan | None:
-        """Return a plan with one candidate of `ik_candidates`, at the lowest feasible height.
+        """Return a plan with one of the `ik_candidates` at the lowest feasible height.
 
         Args:
             grasp: Grasp of the object.
@@ -349,7 +349,7 @@ class PickPlaceSearch:
         )
 
     def _guarded_descent(self, X_OG: RigidTransform, q_place: Floats) -> Trajectory | None:
-        """Return the vertical descent from the place pose, as far as the arm is collision-free.
+        """Return the vertical descent from the place pose as far as the arm is free.
 
         The attached object is ignored: it is expected to touch something.
         """
@@ -485,7 +485,7 @@ class PickPlaceSearch:
         return EndpointContext(endpoint.p_TG_xy, {})
 
     def _exceeds_tilt(self, path: Floats, progress: int) -> bool:
-        """Return whether the gripper tilts more than `MAX_CARRY_TILT`, and record the failure.
+        """Return whether the tilt exceeds `MAX_CARRY_TILT`, and record that failure.
 
         Paths of robots with `vertical_tool_rows` do not tilt the gripper.
 

@@ -1,4 +1,4 @@
-"""Reachability maps: gripper poses that the arm reaches without collision in its empty cell.
+"""Reachability maps of the arm in its empty cell.
 
 Frames: T is the support, G is the gripper. The cell has all its fixtures, and no objects.
 """

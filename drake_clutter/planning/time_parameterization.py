@@ -1,4 +1,4 @@
-"""Time parameterization: from waypoints in joint space to trajectories within the limits.
+"""Time parameterization: from joint-space waypoints to feasible trajectories.
 
 Frames: B is the robot's base, F is the flange, G is the gripper, Cm is the load's center of mass.
 """
@@ -62,7 +62,7 @@ def _cached_dynamics_plant(
 
 
 def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
-    """Return a plant of arm, rigid gripper and load, without the other parts of the cell."""
+    """Return a plant of arm, rigid gripper and load alone."""
     return _cached_dynamics_plant(cell, payload.mass, payload.p_GCm)
 
 
@@ -127,7 +127,7 @@ def bspline_path(waypoints: Floats) -> BsplineTrajectory:
 
 
 def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats:
-    """Return configurations at uniform parameters, whose mean distance is about `spacing`.
+    """Return configurations at uniform parameters, about `spacing` apart.
 
     Args:
         path: Path or trajectory in joint space.
@@ -212,7 +212,7 @@ def parameterize_time_optimal(
 
 
 def smooth_time_scaling(time_scaling: Trajectory) -> Trajectory:
-    """Return a time scaling averaged over `SMOOTHING_TIME`, by which its duration increases.
+    """Return a time scaling averaged over `SMOOTHING_TIME`; its duration increases.
 
     Accelerations then change continuously. A step of the acceleration would excite an oscillation
     of the load on the elastic cup with twice the static deflection.

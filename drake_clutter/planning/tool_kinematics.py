@@ -97,7 +97,7 @@ class CarryPath:
 
     @property
     def waypoints(self) -> Floats:
-        """Configurations from the grasp to the place pose without duplicates. Shape (j, n)."""
+        """Configurations from grasp to place pose without duplicates. Shape (j, n)."""
         return np.vstack([self.lift, self.transfer[1:-1], self.reversed_lowering[::-1]])
 
 
@@ -130,7 +130,7 @@ class ToolKinematics:
         return np.asarray(self._X_TB @ self.robot.forward_kinematics(q) @ self._X_FG)
 
     def axis(self, q: Floats) -> Floats:
-        """Return the z axis of G in T, shape (..., 3), at joint positions of shape (..., n)."""
+        """Return the z axis of G in T, shape (..., 3), at positions of shape (..., n)."""
         return self.pose(q)[..., :3, 2]
 
     def solve_ik(self, X_TG: Floats) -> Floats:

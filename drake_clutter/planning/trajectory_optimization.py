@@ -133,7 +133,7 @@ class TrajectoryOptimizationProblem:
 
 
 def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajectory | None:
-    """Return a trajectory that is faster than the initial one, or None if none is found."""
+    """Return a faster trajectory than the initial one, or None if none is found."""
     initial_duration = problem.initial_trajectory.end_time()
     points = _fit_control_points(problem.initial_trajectory, problem.num_fixed_control_points)
     duration = initial_duration
@@ -219,7 +219,7 @@ class _LinearConstraints:
 
 
 def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matrix:
-    """Return the matrix from all control points to directional components of spline values.
+    """Return the matrix from control points to components of spline values.
 
     Args:
         weights: Weights of the control points in each value. Shape (m, 28).

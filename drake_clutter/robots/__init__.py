@@ -1,1 +1,1 @@
-"""Robot models: parsed from SDF or URDF, their limits, kinematics, inverse kinematics, and how they join a plant."""
+"""Robot models: parsing, limits, kinematics, inverse kinematics and plants."""

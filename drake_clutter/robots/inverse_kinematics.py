@@ -1,6 +1,6 @@
-"""Inverse kinematics of a robot: the protocol, and the closed form of the UR family.
+"""Inverse kinematics: the protocol, and the closed-form solution of the UR family.
 
-Frames: B the base; F the flange.
+Frames: B is the robot's base, F is its flange.
 """
 
 from dataclasses import dataclass
@@ -15,72 +15,78 @@ from drake_clutter.robots.ur_kinematics import DenavitHartenberg, branch_index, 
 Floats = NDArray[np.float64]
 
 MAX_JOINT_JUMP = 0.5
-"""From one pose of a path to the next, a joint that turns further has left its branch [rad]."""
+"""Largest change of a joint between neighboring poses of a continuous path [rad]. A larger change
+means that the solution changed its branch."""
 
 
 class InverseKinematics(Protocol):
-    """Joint positions that reach poses of the flange.
-
-    Attributes:
-        num_solutions: Solutions that are given for each pose at most, K.
-    """
+    """Inverse kinematics of an arm with n joints."""
 
     @property
-    def num_solutions(self) -> int: ...
+    def num_solutions(self) -> int:
+        """Largest number of solutions for a pose, K."""
 
     def solve(self, X_BF: Floats) -> Floats:
-        """Return joint positions within the limits.
+        """Return the solutions within the joint limits.
 
         Args:
-            X_BF: Shape (..., 4, 4).
+            X_BF: Poses of the flange. Shape (..., 4, 4).
 
         Returns:
-            Shape (..., K, n); NaN in rows without a solution.
+            Joint positions; NaN in rows without a solution. Shape (..., K, n).
         """
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
-        """Return solutions in the order of those of another pose.
+        """Return solutions of a pose in the order of those of another pose.
 
         Args:
-            q_from: What `solve` gave for one pose. Shape (..., K, n).
-            q_to: What `solve` gave for another. Shape (..., K, n).
+            q_from: Solutions of the first pose, see `solve`. Shape (..., K, n).
+            q_to: Solutions of the second pose, see `solve`. Shape (..., K, n).
 
         Returns:
-            q_to, each row on the branch of the same row of q_from, or NaN. Shape (..., K, n).
+            Solutions of the second pose, each on the branch of the same row of `q_from`; NaN where
+            there is none. Shape (..., K, n).
         """
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
-        """Return the continuous path of solutions along close poses.
+        """Return the continuous path of solutions along closely spaced poses.
 
         Args:
-            X_BF: The first is that of q_start. Shape (m, 4, 4).
-            q_start: Shape (n,).
+            X_BF: Poses of the flange; the first is the pose at `q_start`. Shape (m, 4, 4).
+            q_start: Joint positions at the first pose. Shape (n,).
 
         Returns:
-            Shape (m, n); None if it leaves reach or limits, or jumps.
+            Joint positions, shape (m, n); None if a pose is unreachable, a joint limit is violated
+            or a joint changes by more than `MAX_JOINT_JUMP`.
         """
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
-        """Return the solution on the branch of a configuration, at a pose that may be far from it.
+        """Return the solution of a pose on the branch of a configuration.
+
+        Unlike in `track`, the pose may be far from the configuration.
 
         Args:
-            X_BF: Shape (4, 4).
-            q: Shape (n,).
+            X_BF: Pose of the flange. Shape (4, 4).
+            q: Configuration. Shape (n,).
 
         Returns:
-            The equivalent that is nearest to q, shape (n,); None out of reach.
+            The nearest equivalent of the solution to `q`, shape (n,); None if the pose is
+            unreachable.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class UrInverseKinematics:
-    """Closed form of the UR family: eight branches, which keep their number from pose to pose.
+    """Closed-form inverse kinematics of the UR family.
+
+    There are eight branches, which keep their index from pose to pose.
 
     Attributes:
-        parameters: Of the arm.
-        joint_range: Range of the joints.
-        X_0B: Of the model's base in frame 0 of the convention; None: the identity. Shape (4, 4).
-        X_F6: Of frame 6 of the convention in the flange; None: the identity. Shape (4, 4).
+        parameters: Denavit-Hartenberg parameters of the arm.
+        joint_range: Joint limits.
+        X_0B: Pose of the model's base in Denavit-Hartenberg frame 0; None for the identity. Shape
+            (4, 4).
+        X_F6: Pose of Denavit-Hartenberg frame 6 in the flange; None for the identity. Shape (4, 4).
     """
 
     parameters: DenavitHartenberg
@@ -90,11 +96,11 @@ class UrInverseKinematics:
 
     @property
     def num_solutions(self) -> int:
-        """Number of branches."""
+        """Number of branches, 8."""
         return 8
 
     def solve(self, X_BF: Floats) -> Floats:
-        """Return all branches, see `InverseKinematics`; where singular, they coincide."""
+        """Return all branches, see `InverseKinematics`. At singularities some are equal."""
         X = X_BF if self.X_0B is None else self.X_0B @ X_BF
         q = ik_branches(X if self.X_F6 is None else X @ self.X_F6, parameters=self.parameters)
         lower, upper = self.joint_range.limits.T
@@ -105,7 +111,7 @@ class UrInverseKinematics:
         )
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
-        """Return q_to, whose rows are branches already."""
+        """Return `q_to`: its rows are already in the order of the branches."""
         return q_to
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
@@ -121,5 +127,5 @@ class UrInverseKinematics:
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
         """Return the branch of q at a pose, see `InverseKinematics`."""
         q_branch = self.solve(X_BF)[branch_index(q, self.parameters)]
-        found = self.joint_range.unwrap(q_branch, q)
-        return found if np.isfinite(found).all() else None
+        q_nearest = self.joint_range.unwrap(q_branch, q)
+        return q_nearest if np.isfinite(q_nearest).all() else None

@@ -1,4 +1,4 @@
-"""Positions that joints can take, and whole turns within them."""
+"""Joint limits, and equivalent positions of revolute joints within them."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,18 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 FULL_TURN = 2 * np.pi
+"""Full turn of a revolute joint [rad]."""
 _ROUNDING = 1e-9
-"""A joint that is no further outside of its range is put on its limit [rad or m]."""
+"""Tolerance of the joint limits [rad or m]; positions beyond a limit by less are clipped."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointRange:
-    """Ranges of an arm's joints.
+    """Position limits of the joints of an arm.
 
     Attributes:
-        limits: Least and greatest position [rad, or m for a prismatic joint]. Shape (n, 2).
-        revolute: Which joints turn. Shape (n,).
+        limits: Lower and upper limit [rad, or m for a prismatic joint]. Shape (n, 2).
+        revolute: Whether each joint is revolute. Shape (n,).
     """
 
     limits: Floats
@@ -26,36 +27,41 @@ class JointRange:
 
     @property
     def exceeds_full_turn(self) -> NDArray[np.bool_]:
-        """Which joints can reach a pose at more than one angle. Shape (n,)."""
+        """Whether each revolute joint's range exceeds a full turn. Shape (n,)."""
         return np.asarray(self.revolute & (self.limits[:, 1] - self.limits[:, 0] > FULL_TURN))
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
-        """Return equivalent positions that are nearest to others.
+        """Return the equivalent positions within the limits nearest to a reference.
 
         Args:
             q: Positions within the limits. Shape (..., n).
-            reference: Shape (..., n).
+            reference: Reference positions. Shape (..., n).
 
         Returns:
-            q, joints with a range of more than a turn moved by whole turns. Shape (..., n).
+            Positions; joints with a range of more than a full turn are moved by full turns. Shape
+            (..., n).
         """
-        turned = q + FULL_TURN * np.round((reference - q) / FULL_TURN)
-        turned = np.where(
-            turned > self.limits[:, 1],
-            turned - FULL_TURN,
-            np.where(turned < self.limits[:, 0], turned + FULL_TURN, turned),
+        nearest = q + FULL_TURN * np.round((reference - q) / FULL_TURN)
+        nearest = np.where(
+            nearest > self.limits[:, 1],
+            nearest - FULL_TURN,
+            np.where(nearest < self.limits[:, 0], nearest + FULL_TURN, nearest),
         )
-        return np.asarray(np.where(self.exceeds_full_turn, turned, q))
+        return np.asarray(np.where(self.exceeds_full_turn, nearest, q))
 
     def wrap_to_limits(self, q: Floats) -> Floats:
-        """Return equivalent positions within the limits; all NaN if one joint has none.
+        """Return equivalent positions within the limits.
 
         Args:
-            q: Shape (..., n).
+            q: Positions. Shape (..., n).
+
+        Returns:
+            Positions; all NaN if a joint has no equivalent position within its limits. Shape
+            (..., n).
         """
         lower, upper = self.limits.T
-        middle = (lower + upper) / 2
-        moved = np.where(self.revolute, q - FULL_TURN * np.round((q - middle) / FULL_TURN), q)
-        q = np.where((q >= lower) & (q <= upper), q, moved)
+        center = (lower + upper) / 2
+        wrapped = np.where(self.revolute, q - FULL_TURN * np.round((q - center) / FULL_TURN), q)
+        q = np.where((q >= lower) & (q <= upper), q, wrapped)
         inside = ((q >= lower - _ROUNDING) & (q <= upper + _ROUNDING)).all(axis=-1, keepdims=True)
         return np.where(inside, np.clip(q, lower, upper), np.nan)

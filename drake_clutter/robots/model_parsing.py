@@ -1,4 +1,4 @@
-"""A robot's model file, SDF or URDF: where it is, whether it is whole, and its limits of torque."""
+"""Parsing of robot models: SDF or URDF files, their meshes and torque limits."""
 
 import math
 import re
@@ -15,20 +15,20 @@ from drake_clutter.resources import resource_path
 from drake_clutter.robots.stl_conversion import convert_stl_to_obj
 
 PACKAGE = "drake_clutter_models"
-"""Name of the package whose files ship as `models/`."""
+"""ROS package name of the shipped folder `models/`."""
 _DRAKE = "drake.mit.edu"
-"""Namespace of Drake's own elements and attributes."""
+"""XML namespace of Drake's extensions of SDF and URDF."""
 
 
 def resolve_model_path(model: str, field: str = "robot.model") -> Path:
-    """Return the file of a model.
+    """Return the path of a model file.
 
     Args:
-        model: A path, or package://drake_clutter_models/ and a path in `models/`.
-        field: Where it is named in the cell's file.
+        model: Path, or `package://drake_clutter_models/` followed by a path in `models/`.
+        field: Field of the cell file that names the model, for error messages.
 
     Raises:
-        InputError: There is no such file, or it is neither SDF nor URDF.
+        InputError: The file does not exist, or is neither SDF nor URDF.
     """
     prefix = f"package://{PACKAGE}/"
     shipped, inside = model.startswith(prefix), model.removeprefix(prefix)
@@ -39,16 +39,19 @@ def resolve_model_path(model: str, field: str = "robot.model") -> Path:
 
 
 def find_packages(path: Path) -> PackageMap:
-    """Return the packages that a model file may name.
+    """Return the ROS packages to which a model file may refer.
 
-    Those of ROS_PACKAGE_PATH, that of the next folder above with a package.xml, and
+    These are the packages in ROS_PACKAGE_PATH, the package that contains the file, and
     `drake_clutter_models`.
+
+    Args:
+        path: Model file.
     """
     packages = PackageMap()
     packages.PopulateFromRosPackagePath()
-    above = (folder / "package.xml" for folder in path.parents)
-    found = next((package for package in above if package.is_file()), None)
-    for package in (found, resource_path("models/package.xml")):
+    candidates = (folder / "package.xml" for folder in path.parents)
+    own_package = next((package for package in candidates if package.is_file()), None)
+    for package in (own_package, resource_path("models/package.xml")):
         if package is not None:
             packages.AddPackageXml(str(package))
     return packages
@@ -56,16 +59,17 @@ def find_packages(path: Path) -> PackageMap:
 
 @lru_cache(maxsize=32)
 def read_model_text(path: Path, *, visuals: bool) -> str:
-    """Return a model that is not static, with absolute paths of its meshes, for Drake's parser.
+    """Return the text of a model for Drake's parser.
 
-    Drake parses a text in a few milliseconds, and the file that it came from in sixty.
+    Mesh paths become absolute, and `static` elements are removed. Parsing the text takes a few
+    milliseconds; parsing the file takes 60 ms, because Drake resolves each path anew.
 
     Args:
         path: SDF or URDF file.
-        visuals: False to leave out what cameras see.
+        visuals: Whether to keep visual geometry.
 
     Raises:
-        InputError: The file is not XML, or a mesh that it names is missing.
+        InputError: The file is not XML, or a mesh is missing.
     """
     root = _read_xml(path)
     for link in root.iter("link"):
@@ -73,7 +77,7 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
             link.remove(visual)
     for model in root.iter("model"):
         for static in model.findall("static"):
-            model.remove(static)  # else it is fixed to the world's origin
+            model.remove(static)  # Drake welds static models to the world at the origin.
     packages = find_packages(path)
     for mesh in root.iter("mesh"):
         if (uri := mesh.find("uri")) is not None:
@@ -84,10 +88,12 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
 
 
 def _read_xml(path: Path) -> ElementTree.Element:
-    ElementTree.register_namespace("drake", _DRAKE)  # else the prefix is renamed
+    # Without registration, ElementTree would rename the prefix, which Drake would not recognize.
+    ElementTree.register_namespace("drake", _DRAKE)
     try:
         text = path.read_text(encoding="utf-8")
-        if "drake:" in text and _DRAKE not in text:  # as in many a URDF, which Drake accepts
+        # Many URDF files use the prefix without declaring it, which Drake accepts.
+        if "drake:" in text and _DRAKE not in text:
             text = re.sub(r"<(robot|sdf)\b", rf'<\1 xmlns:drake="{_DRAKE}"', text, count=1)
         return ElementTree.fromstring(text)
     except (OSError, ValueError, ElementTree.ParseError) as error:
@@ -114,18 +120,24 @@ def parse_model(
     visuals: bool,
     field: str = "robot.model",
 ) -> ModelInstanceIndex:
-    """Add a model to a plant that is not finalized; arguments as of `model_path`, `model_text`.
+    """Add a model to a plant before it is finalized.
+
+    Args:
+        plant: Plant to which the model is added.
+        model: Model file, see `resolve_model_path`.
+        visuals: Whether to add visual geometry.
+        field: Field of the cell file that names the model, for error messages.
 
     Raises:
-        InputError: The file is missing or damaged, or does not hold one model.
+        InputError: The file is missing or invalid, or does not contain exactly one model.
     """
     path = resolve_model_path(model, field)
     text = read_model_text(path, visuals=visuals)
     try:
         parser = Parser(plant)
-        parser.SetAutoRenaming(True)  # of a second model of one name
+        parser.SetAutoRenaming(True)  # Several models may have the same name.
         instances = parser.AddModelsFromString(text, path.suffix.removeprefix("."))
-    except (RuntimeError, ValueError, SystemExit) as error:  # the last: Drake's assertions
+    except (RuntimeError, ValueError, SystemExit) as error:  # SystemExit: assertions of Drake
         words = " ".join(str(error).split())
         raise InputError(f"{path}: {words}; allowed is a model that Drake reads") from error
     if len(instances) != 1:
@@ -134,7 +146,7 @@ def parse_model(
 
 
 def find_mimic_joint(path: Path) -> str | None:
-    """Return the name of a joint of a model file that follows another one; None: it has none."""
+    """Return the name of a joint that mimics another one, or None."""
     joints = _read_xml(path).iter("joint")
     return next(
         (joint.get("name", "") for joint in joints if joint.find(".//mimic") is not None), None
@@ -143,15 +155,21 @@ def find_mimic_joint(path: Path) -> str | None:
 
 @lru_cache(maxsize=32)
 def read_torque_limits(path: Path) -> dict[str, float]:
-    """Return the largest torque [N m] or force [N] of the joints of a model file, by name.
+    """Return the effort limits of the joints of a model file.
 
-    Drake reads them from a URDF only if it has transmissions, which many have not. A joint without
-    a value, or with 0, is missing here.
+    Drake reads them from a URDF only if it has transmissions, which many URDFs lack.
+
+    Args:
+        path: SDF or URDF file.
+
+    Returns:
+        Largest torque [N m] or force [N] by joint name; joints without a positive limit are left
+        out.
     """
-    found = {}
+    limits = {}
     for joint in _read_xml(path).iter("joint"):
         limit = joint.find("limit") if joint.find("limit") is not None else joint.find("axis/limit")
         text = None if limit is None else limit.get("effort") or limit.findtext("effort")
         if text is not None and 0 < float(text) < math.inf:
-            found[joint.get("name", "")] = float(text)
-    return found
+            limits[joint.get("name", "")] = float(text)
+    return limits

@@ -1,10 +1,10 @@
-"""Inverse kinematics of any serial arm by damped least squares from many starts, compiled.
+"""Numerical inverse kinematics of serial arms by damped least squares, compiled.
 
 The damping is the squared error (Chan and Lawrence 1988, "General inverse kinematics with the error
-damped pseudoinverse"). An arm with more than six joints is drawn towards its home within the null
-space of the Jacobian, so that neighboring poses have neighboring solutions.
+damped pseudoinverse"). In an arm with more than six joints, a null-space motion towards the home
+configuration makes solutions of neighboring poses similar.
 
-Frames: B the base; F the flange.
+Frames: B is the robot's base, F is its flange.
 """
 
 from dataclasses import dataclass
@@ -22,34 +22,36 @@ from drake_clutter.robots.serial_chain import SerialChain, chain_frames, chain_j
 Floats = NDArray[np.float64]
 
 MAX_SOLUTIONS = 8
-"""Solutions of one pose that are looked for."""
+"""Largest number of solutions of a pose."""
 _TABLE_SIZE = 20_000
-"""Configurations among which starts are chosen."""
+"""Number of random configurations from which starts are selected."""
 _NUM_STARTS = 48
-"""Starts for each pose; those of the table whose poses are nearest."""
+"""Number of starts for each pose: the configurations of the table with the closest poses."""
 _MIN_SOLUTION_DISTANCE = 0.1
-"""Solutions that differ less in every joint are one [rad]."""
+"""Solutions that differ by less in every joint are duplicates [rad]."""
 _ROTATION_WEIGHT = 0.5
-"""Of the flange's axes beside its position in units of the arm's length, to choose starts."""
+"""Weight of the axes of the flange relative to its position in units of the arm's length, in the
+distance between poses."""
 _MAX_ITERATIONS = 40
+"""Largest number of iterations from a start."""
 _NULL_SPACE_ITERATIONS = 20
-"""Iterations in which a redundant arm is drawn to its home."""
+"""First iterations, in which a redundant arm has a null-space motion towards home."""
 _NULL_SPACE_GAIN = 0.5
-"""Share of the way home that is taken in one of them."""
+"""Fraction of the distance to home that is desired in one iteration."""
 _ABANDON_ITERATION = 12
-"""Iterations after which a start that is not near a solution is given up."""
+"""Iteration at which a start is abandoned unless its squared error is small."""
 _ERROR_TOLERANCE = 1e-10
-"""Error of a solution [rad and m]."""
+"""Largest error of a solution, rotation [rad] and position [m] combined."""
 
 
 @dataclass(frozen=True, eq=False)
 class NumericalInverseKinematics:
-    """Damped least squares from the nearest configurations of a table; deterministic.
+    """Damped least squares from the closest configurations of a table; deterministic.
 
     Attributes:
-        chain: The arm.
-        joint_range: Range of the joints.
-        home: Redundant arms are drawn to it; solutions near to it come first. Shape (n,).
+        chain: Kinematic chain of the arm.
+        joint_range: Joint limits.
+        home: Home configuration. Solutions are sorted by their distance from it. Shape (n,).
     """
 
     chain: SerialChain
@@ -58,91 +60,92 @@ class NumericalInverseKinematics:
 
     @property
     def num_solutions(self) -> int:
-        """Solutions that are given for each pose at most."""
+        """Largest number of solutions of a pose."""
         return MAX_SOLUTIONS
 
     @cached_property
     def _start_range(self) -> Floats:
-        """Positions that are tried: one turn at most. Shape (n, 2)."""
-        middle = self.joint_range.limits.mean(axis=1, keepdims=True)
-        turn = middle + np.array([-np.pi, np.pi])
+        """Limits of the table's configurations, at most one full turn. Shape (n, 2)."""
+        center = self.joint_range.limits.mean(axis=1, keepdims=True)
+        turn = center + np.array([-np.pi, np.pi])
         return np.where(self.joint_range.exceeds_full_turn[:, None], turn, self.joint_range.limits)
 
     @cached_property
     def _start_table(self) -> tuple[Floats, cKDTree]:
-        """Configurations, and a tree of their flanges' poses."""
+        """Random configurations, shape (_TABLE_SIZE, n), and a k-d tree of their poses."""
         lower, upper = self._start_range.T
         q = np.random.default_rng(0).uniform(lower, upper, (_TABLE_SIZE, len(lower)))
         return q, cKDTree(self._pose_features(self.chain.forward_kinematics(q)))
 
     def _pose_features(self, X_BF: Floats) -> Floats:
+        """Return points, shape (..., 9), whose Euclidean distance compares poses."""
         reach = np.linalg.norm(self.chain.fixed[:, :3, 3], axis=1).sum()
         rotation = X_BF[..., :3, [0, 2]].reshape(*X_BF.shape[:-2], 6)
         return np.concatenate([X_BF[..., :3, 3] / reach, _ROTATION_WEIGHT * rotation], axis=-1)
 
     def solve(self, X_BF: Floats) -> Floats:
-        """Return distinct solutions, the nearest to home first, see `InverseKinematics`."""
+        """Return distinct solutions, the closest to home first, see `InverseKinematics`."""
         X = np.ascontiguousarray(X_BF, float).reshape(-1, 4, 4)
         q_table, tree = self._start_table
         starts = q_table[tree.query(self._pose_features(X), _NUM_STARTS)[1]]
-        found = _solve_poses(*self._arm_arguments, X, starts)
+        q = _solve_poses(*self._arm_arguments, X, starts)
         lower = self._start_range[:, 0]
-        found = np.where(
-            self.joint_range.exceeds_full_turn, (found - lower) % FULL_TURN + lower, found
-        )
-        order = np.argsort(np.linalg.norm(found - self.home, axis=-1), axis=-1, kind="stable")
-        found = np.take_along_axis(found, order[..., None], axis=1)
-        return np.asarray(found.reshape(*X_BF.shape[:-2], MAX_SOLUTIONS, self.chain.num_joints))
+        q = np.where(self.joint_range.exceeds_full_turn, (q - lower) % FULL_TURN + lower, q)
+        order = np.argsort(np.linalg.norm(q - self.home, axis=-1), axis=-1, kind="stable")
+        q = np.take_along_axis(q, order[..., None], axis=1)
+        return np.asarray(q.reshape(*X_BF.shape[:-2], MAX_SOLUTIONS, self.chain.num_joints))
 
     @property
     def _arm_arguments(self) -> tuple[Floats, NDArray[np.bool_], Floats, Floats]:
         return self.chain.fixed, self.chain.revolute, self.joint_range.limits, self.home
 
     def match(self, q_from: Floats, q_to: Floats) -> Floats:
-        """Return solutions near to q_from at the poses of q_to, see `InverseKinematics`.
+        """Return solutions at the poses of `q_to` close to `q_from`.
 
-        Each is what iterations that start at a row of q_from lead to, or a row of q_to if that is
-        nearer; so a redundant arm need not change its posture from pose to pose.
+        Iterations start at each row of `q_from`. A row of `q_to` replaces the result if it is
+        closer. A redundant arm so keeps its posture from pose to pose.
         """
-        start, given = np.broadcast_arrays(q_from, q_to)
+        start, target = np.broadcast_arrays(q_from, q_to)
         rows = start.shape[-2:]
-        start, given = start.reshape(-1, *rows), given.reshape(-1, *rows)
-        there = np.isfinite(given[..., 0]).any(axis=-1)
-        found = np.full(start.shape, np.nan)
-        which = np.isfinite(given[..., 0]).argmax(axis=-1)
-        X_BF = self.chain.forward_kinematics(given[np.arange(len(given)), which])
-        for k in np.flatnonzero(there):
+        start = start.reshape(-1, *rows)
+        target = target.reshape(-1, *rows)
+        is_reachable = np.isfinite(target[..., 0]).any(axis=-1)
+        first_solution = np.isfinite(target[..., 0]).argmax(axis=-1)
+        X_BF = self.chain.forward_kinematics(target[np.arange(len(target)), first_solution])
+        matched = np.full(start.shape, np.nan)
+        for k in np.flatnonzero(is_reachable):
             near = _solve_from_starts(*self._arm_arguments, X_BF[k], np.ascontiguousarray(start[k]))
             for row in np.flatnonzero(np.isfinite(start[k, :, 0])):
-                choice = np.vstack([near[row], given[k]])
-                found[k, row] = self._nearest(choice, start[k, row])
-        return found.reshape(np.broadcast_shapes(q_from.shape, q_to.shape))
+                candidates = np.vstack([near[row], target[k]])
+                matched[k, row] = self._nearest(candidates, start[k, row])
+        return matched.reshape(np.broadcast_shapes(q_from.shape, q_to.shape))
 
-    def _nearest(self, choice: Floats, q: Floats) -> Floats:
-        apart = np.abs(self.joint_range.unwrap(choice, q) - q).max(axis=-1)
-        return np.asarray(choice[np.nanargmin(apart)])
+    def _nearest(self, candidates: Floats, q: Floats) -> Floats:
+        """Return the row of candidates (k, n) with the smallest displacement from q (n,)."""
+        distances = np.abs(self.joint_range.unwrap(candidates, q) - q).max(axis=-1)
+        return np.asarray(candidates[np.nanargmin(distances)])
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
-        """Return the path that goes on from q_start step by step, see `InverseKinematics`."""
+        """Return the path in which each pose starts from the previous solution."""
         path = np.empty((len(X_BF), len(q_start)))
         path[0] = q_start
-        on_the_way = _track_path(*self._arm_arguments, np.ascontiguousarray(X_BF, float), path)
-        return path if on_the_way else None
+        is_continuous = _track_path(*self._arm_arguments, np.ascontiguousarray(X_BF, float), path)
+        return path if is_continuous else None
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:
-        """Return a solution near to q, see `InverseKinematics`."""
+        """Return the closest solution to `q` that is found, see `InverseKinematics`."""
         near = _solve_from_starts(
             *self._arm_arguments, np.ascontiguousarray(X_BF, float), q[None].copy()
         )
-        choice = np.vstack([near, self.solve(X_BF)])
-        if np.isnan(choice).all():
+        candidates = np.vstack([near, self.solve(X_BF)])
+        if np.isnan(candidates).all():
             return None
-        return self.joint_range.unwrap(self._nearest(choice, q), q)
+        return self.joint_range.unwrap(self._nearest(candidates, q), q)
 
 
 @njit(cache=True)
 def _pose_error(X_target, X, e):  # type: ignore[no-untyped-def]
-    """Write rotation vector and shift from X to X_target into e (6,); return e^2."""
+    """Write the error twist from X to X_target into e (6,); return e^T e."""
     R = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -154,14 +157,14 @@ def _pose_error(X_target, X, e):  # type: ignore[no-untyped-def]
     if sine > 1e-8:
         for i in range(3):
             e[i] *= angle / sine
-    elif angle > 1.0:  # half a turn: any axis leads on
+    elif angle > 1.0:  # The axis of a half turn is undetermined: use x.
         e[0] = angle
     return e[0] ** 2 + e[1] ** 2 + e[2] ** 2 + e[3] ** 2 + e[4] ** 2 + e[5] ** 2
 
 
 @njit(cache=True)
 def _solve_cholesky(A, b):  # type: ignore[no-untyped-def]
-    """Solve A x = b in place of b by Cholesky's method; A (6, 6) is overwritten."""
+    """Solve A x = b by Cholesky decomposition, in place of A (6, 6) and b (6,)."""
     for j in range(6):
         for k in range(j):
             for i in range(j, 6):
@@ -181,7 +184,7 @@ def _solve_cholesky(A, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _damped_step(J, e, damping, dq_null, dq):  # type: ignore[no-untyped-def]
-    """Write J^T (J J^T + damping)^-1 (e - J pull) + pull into dq."""
+    """Write J^T (J J^T + damping I)^-1 (e - J dq_null) + dq_null into dq (n,)."""
     n = J.shape[1]
     A, b = np.empty((6, 6)), np.empty(6)
     for i in range(6):
@@ -202,7 +205,10 @@ def _damped_step(J, e, damping, dq_null, dq):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _iterate(fixed, revolute, limits, home, X, q, null_space_iterations):  # type: ignore[no-untyped-def]
-    """Move q (n,) until the flange is at X, first drawn to home; False if it does not arrive."""
+    """Iterate q (n,) in place until the flange is at X (4, 4); return success.
+
+    The first iterations have a null-space motion towards home.
+    """
     n = len(q)
     frames, J, e = np.empty((n + 1, 4, 4)), np.empty((6, n)), np.empty(6)
     pull, dq = np.zeros(n), np.empty(n)
@@ -226,44 +232,49 @@ def _iterate(fixed, revolute, limits, home, X, q, null_space_iterations):  # typ
 
 @njit(cache=True)
 def _solve_poses(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
+    """Return distinct solutions of poses X (m, 4, 4), shape (m, MAX_SOLUTIONS, n).
+
+    Starts have shape (m, num_starts, n); rows without a solution are NaN.
+    """
     n = len(revolute)
-    found = np.full((len(X), MAX_SOLUTIONS, n), np.nan)
+    solutions = np.full((len(X), MAX_SOLUTIONS, n), np.nan)
     for k in range(len(X)):
         count = 0
         for start in range(starts.shape[1]):
             q = starts[k, start].copy()
-            drawn = _NULL_SPACE_ITERATIONS if n > 6 and start % 2 == 0 else 0
-            if not _iterate(fixed, revolute, limits, home, X[k], q, drawn):
+            iterations = _NULL_SPACE_ITERATIONS if n > 6 and start % 2 == 0 else 0
+            if not _iterate(fixed, revolute, limits, home, X[k], q, iterations):
                 continue
-            new = True
+            is_new = True
             for other in range(count):
-                apart = 0.0
+                distance = 0.0
                 for joint in range(n):
-                    difference = abs(q[joint] - found[k, other, joint])
+                    difference = abs(q[joint] - solutions[k, other, joint])
                     if revolute[joint]:
                         difference = abs((difference + np.pi) % (2 * np.pi) - np.pi)
-                    apart = max(apart, difference)
-                new = new and apart > _MIN_SOLUTION_DISTANCE
-            if new:
-                found[k, count] = q
+                    distance = max(distance, difference)
+                is_new = is_new and distance > _MIN_SOLUTION_DISTANCE
+            if is_new:
+                solutions[k, count] = q
                 count += 1
                 if count == MAX_SOLUTIONS:
                     break
-    return found
+    return solutions
 
 
 @njit(cache=True)
 def _solve_from_starts(fixed, revolute, limits, home, X, starts):  # type: ignore[no-untyped-def]
-    """Return where iterations from starts (K, n) lead; NaN where they do not reach X (4, 4)."""
-    found = starts.copy()
+    """Return the solutions of X (4, 4) from starts (K, n); NaN without convergence."""
+    solutions = starts.copy()
     for k in range(len(starts)):
-        if not _iterate(fixed, revolute, limits, home, X, found[k], 0):
-            found[k] = np.nan
-    return found
+        if not _iterate(fixed, revolute, limits, home, X, solutions[k], 0):
+            solutions[k] = np.nan
+    return solutions
 
 
 @njit(cache=True)
 def _track_path(fixed, revolute, limits, home, X, path):  # type: ignore[no-untyped-def]
+    """Write the path (m, n) along X (m, 4, 4) from its first row; return success."""
     for k in range(1, len(X)):
         path[k] = path[k - 1]
         if not _iterate(fixed, revolute, limits, home, X[k], path[k], 0):

@@ -1,4 +1,7 @@
-"""The arm of a model file: its joints from base to flange, its links, and the chain they make."""
+"""Parsing of an arm: joints from base to flange, links and kinematic chain.
+
+Frames: B is the robot's base, F is its flange.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,20 +32,20 @@ from drake_clutter.robots.model_parsing import (
 from drake_clutter.robots.serial_chain import SerialChain
 
 _DRAKE_FRAME_SUFFIXES = ("__model__", "_parent", "_child")
-"""Ends of the names of frames that Drake's parser adds."""
+"""Suffixes of frame names that Drake's parser adds."""
 
 
 @dataclass(frozen=True, eq=False)
 class ParsedArm:
-    """An arm alone in a finalized plant, its base in the world's origin.
+    """Arm in a finalized plant of its own, with its base at the world's origin.
 
     Attributes:
-        plant: Of the arm, without geometry.
-        path: The model file.
+        plant: Plant of the arm, without geometry.
+        path: Model file.
         base: Frame B.
         flange: Frame F.
-        joints: Those that move the flange, from the base on.
-        link_depths: How many of the joints, from the base on, move a link.
+        joints: Joints between base and flange, from the base on.
+        link_depths: Number of joints between the base and each link, by name.
     """
 
     plant: MultibodyPlant
@@ -54,12 +57,12 @@ class ParsedArm:
 
     @property
     def revolute(self) -> NDArray[np.bool_]:
-        """Which joints turn. Shape (n,)."""
+        """Whether each joint is revolute. Shape (n,)."""
         return np.array([isinstance(joint, RevoluteJoint) for joint in self.joints])
 
     @property
     def limits(self) -> Mapping[str, list[float]]:
-        """Limits by kind, in the order of the joints; infinite where there is none."""
+        """Joint limits `lower`, `upper`, `velocity` and `torque`; infinite if absent."""
         torques = read_torque_limits(self.path)
         return {
             "lower": [float(joint.position_lower_limits()[0]) for joint in self.joints],
@@ -70,38 +73,45 @@ class ParsedArm:
 
     @cached_property
     def chain(self) -> SerialChain:
-        """The transforms between the joints' axes, each turned so that its axis is z."""
+        """Kinematic chain whose joint axes are the z axes of its frames."""
         context = self.plant.CreateDefaultContext()
         self.plant.SetPositions(context, np.zeros(self.plant.num_positions()))
-        fixed, before, X_before = [], self.base, RigidTransform()
+        fixed = []
+        previous = self.base
+        X_previous = RigidTransform()  # rotates the z axis to the previous joint's axis
         for joint in self.joints:
-            turns = isinstance(joint, RevoluteJoint)
-            axis = joint.revolute_axis() if turns else joint.translation_axis()
+            is_revolute = isinstance(joint, RevoluteJoint)
+            axis = joint.revolute_axis() if is_revolute else joint.translation_axis()
             R = RotationMatrix() if axis[2] == 1.0 else RotationMatrix.MakeFromOneVector(axis, 2)
-            X = self.plant.CalcRelativeTransform(context, before, joint.frame_on_parent())
-            fixed.append((X_before.inverse() @ X @ RigidTransform(R)).GetAsMatrix4())
-            before, X_before = joint.frame_on_child(), RigidTransform(R)
-        X = self.plant.CalcRelativeTransform(context, before, self.flange)
-        fixed.append((X_before.inverse() @ X).GetAsMatrix4())
+            X = self.plant.CalcRelativeTransform(context, previous, joint.frame_on_parent())
+            fixed.append((X_previous.inverse() @ X @ RigidTransform(R)).GetAsMatrix4())
+            previous = joint.frame_on_child()
+            X_previous = RigidTransform(R)
+        X = self.plant.CalcRelativeTransform(context, previous, self.flange)
+        fixed.append((X_previous.inverse() @ X).GetAsMatrix4())
         return SerialChain(np.array(fixed), self.revolute)
 
 
 def parse_arm(spec: RobotSpec) -> ParsedArm:
-    """Read the arm of a model file.
+    """Parse the arm of a model file.
+
+    Args:
+        spec: Robot of the work cell.
 
     Raises:
-        InputError: The file is not whole, has no such base or flange, or is not a serial arm.
+        InputError: The file is invalid, has no such base or flange, or is not a serial arm.
     """
-    path, plant = resolve_model_path(spec.model), MultibodyPlant(0.0)
-    instance = parse_model(plant, spec.model, visuals=True)  # so that each mesh is looked for
-    above = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
+    path = resolve_model_path(spec.model)
+    plant = MultibodyPlant(0.0)
+    instance = parse_model(plant, spec.model, visuals=True)  # Missing meshes are reported, too.
+    parent_joints = {joint.child_body().name(): joint for joint in _joints(plant, instance)}
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
-    roots = [body.name() for body in bodies if body.name() not in above]
+    roots = [body.name() for body in bodies if body.name() not in parent_joints]
     if spec.base_link not in roots:
         known = ", ".join(roots) or "a link that is not fixed to the world"
         raise InputError(f"robot.base_link: {spec.base_link!r}; allowed in {path.name} is {known}")
     if loose := [name for name in roots if name != spec.base_link]:
-        raise InputError(f"{path}: link {loose[0]!r} hangs on no joint; allowed is an arm alone")
+        raise InputError(f"{path}: link {loose[0]!r} has no parent joint; allowed is an arm alone")
     if not plant.HasFrameNamed(spec.tool_frame, instance):
         frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
         known = ", ".join(name for name in frames if not name.endswith(_DRAKE_FRAME_SUFFIXES))
@@ -109,14 +119,16 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
         raise InputError(f"{given}; allowed in {path.name} are {known}")
     base = plant.GetFrameByName(spec.base_link, instance)
     flange = plant.GetFrameByName(spec.tool_frame, instance)
-    moving = _movable_joints(_joints_to_base(flange.body(), above))
+    moving = _movable_joints(_joints_to_base(flange.body(), parent_joints))
     if not moving:
         raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is one that joints move")
     _check_serial(path, _joints(plant, instance), moving)
     plant.WeldFrames(plant.world_frame(), base)
     plant.Finalize()
-    links = {body.name(): len(_movable_joints(_joints_to_base(body, above))) for body in bodies}
-    return ParsedArm(plant, path, base, flange, tuple(moving), links)
+    link_depths = {
+        body.name(): len(_movable_joints(_joints_to_base(body, parent_joints))) for body in bodies
+    }
+    return ParsedArm(plant, path, base, flange, tuple(moving), link_depths)
 
 
 def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
@@ -124,11 +136,12 @@ def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Joint]:
 
 
 def _joints_to_base(body: RigidBody, parent_joints: Mapping[str, Joint]) -> list[Joint]:
-    found = []
+    """Return the joints between the base and a body, from the base on."""
+    path = []
     while (joint := parent_joints.get(body.name())) is not None:
-        found.append(joint)
+        path.append(joint)
         body = joint.parent_body()
-    return found[::-1]
+    return path[::-1]
 
 
 def _movable_joints(joints: list[Joint]) -> list[Joint]:
@@ -136,6 +149,7 @@ def _movable_joints(joints: list[Joint]) -> list[Joint]:
 
 
 def _check_serial(path: Path, joints: list[Joint], moving: list[Joint]) -> None:
+    """Raise an error unless all movable joints move the tool frame independently."""
     for joint in _movable_joints(joints):
         what = f"{path}: joint {joint.name()!r}"
         if joint not in moving:

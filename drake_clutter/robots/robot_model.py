@@ -1,6 +1,6 @@
-"""A robot that is loaded: joints, limits, kinematics and inverse kinematics of a `RobotSpec`.
+"""Robot model: joints, limits, kinematics and inverse kinematics of a `RobotSpec`.
 
-Frames: T the support; B the robot's base; F its flange, z out of the arm.
+Frames: T is the support, B is the robot's base, F is its flange, z out of the arm.
 """
 
 from collections.abc import Mapping
@@ -24,30 +24,32 @@ from drake_clutter.robots.ur_fit import UrFit, fit_ur
 Floats = NDArray[np.float64]
 
 _MAX_FIT_ERROR = 1e-6
-"""Largest error of the closed form's poses: entries of rotations, and positions [m]."""
+"""Largest difference between the poses of the closed form and of the model: entries of rotation
+matrices, and positions [m]. Rounded lengths in URDF files stay below it."""
 _UR_VERTICAL_TOOL_ROWS = np.array([[0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
-"""The three parallel axes tilt the tool by the sum of their angles, wrist 2 out of their plane."""
+"""Rows A with A dq = 0 if the tool axis stays vertical: the three parallel axes tilt the tool by
+the sum of their angles, and wrist 2 tilts it out of their plane. Shape (2, 6)."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A robot as planning and simulation use it.
+    """Robot with n joints.
 
     Attributes:
-        spec: What it was loaded from.
-        joint_names: In the order of q.
-        joint_range: Range of the joints.
-        velocity_limits: [rad/s]. Shape (n,).
-        acceleration_limits: [rad/s^2]. Shape (n,).
-        jerk_limits: Infinite where the cell gives none [rad/s^3]. Shape (n,).
-        torque_limits: [N m]. Shape (n,).
-        home: Where moves begin and end [rad]. Shape (n,).
-        link_depths: How many of the joints, from the base on, move a link.
-        chain: Kinematics, as the model file has them.
-        ur_fit: The same in closed form, of an arm of the UR family; else None.
+        spec: Specification from which the robot was loaded.
+        joint_names: Names of the joints, in the order of q.
+        joint_range: Position limits.
+        velocity_limits: Velocity limits [rad/s]. Shape (n,).
+        acceleration_limits: Acceleration limits [rad/s^2]. Shape (n,).
+        jerk_limits: Jerk limits; infinite where the cell has none [rad/s^3]. Shape (n,).
+        torque_limits: Torque limits [N m]. Shape (n,).
+        home: Home configuration, in which moves start and end [rad]. Shape (n,).
+        link_depths: Number of joints between the base and each link, by name.
+        chain: Kinematic chain of the model file.
+        ur_fit: Closed-form kinematics of an arm of the UR family; None for other arms.
         ik: Inverse kinematics.
-        vertical_tool_rows: Rows A with A dq = 0 exactly if a vertical tool axis stays vertical;
-            None: the arm has no such linear relation. Shape (m, n).
+        vertical_tool_rows: Rows A with A dq = 0 if and only if a vertical tool axis stays vertical,
+            shape (m, n); None if there is no such linear relation.
     """
 
     spec: RobotSpec
@@ -71,16 +73,16 @@ class RobotModel:
 
     @property
     def position_limits(self) -> Floats:
-        """Least and greatest position [rad]. Shape (n, 2)."""
+        """Lower and upper position limits [rad]. Shape (n, 2)."""
         return self.joint_range.limits
 
     @property
     def X_TB(self) -> RigidTransform:
-        """Pose of the base."""
+        """Pose of the base in T."""
         return self.spec.X_TB
 
     def forward_kinematics(self, q: Floats) -> Floats:
-        """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
+        """Return X_BF, shape (..., 4, 4), at joint positions of shape (..., n)."""
         if self.ur_fit is None:
             return self.chain.forward_kinematics(q)
         X = kinematics.forward_kinematics(q, self.ur_fit.parameters)
@@ -88,37 +90,51 @@ class RobotModel:
         return X if self.ur_fit.X_6F is None else X @ self.ur_fit.X_6F
 
     def jacobian(self, q: Floats) -> Floats:
-        """Return w_BF [rad/s] over v_BF [m/s] in B per joint velocity, (6, n), at q (n,)."""
+        """Return the spatial Jacobian of F in B, angular rows first. Shape (6, n).
+
+        Args:
+            q: Joint positions. Shape (n,).
+        """
         return self.chain.jacobian(q)
 
     def manipulability(self, q: Floats) -> Floats:
-        """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985); 0 if singular."""
+        """Return the manipulability sqrt(det(J J^T)) (Yoshikawa 1985). Shape (...).
+
+        Args:
+            q: Joint positions. Shape (..., n).
+        """
         if self.ur_fit is None:
             return self.chain.manipulability(q)
         return kinematics.manipulability(q, self.ur_fit.parameters)
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
-        """Return the equivalents of q nearest to a reference, (..., n), see `JointRange`."""
+        """Return the equivalents of `q` nearest to a reference, see `JointRange.unwrap`."""
         return self.joint_range.unwrap(q, reference)
 
 
 @lru_cache(maxsize=32)
 def load_robot(spec: RobotSpec) -> RobotModel:
-    """Read a robot's model and limits.
+    """Load the model and the limits of a robot.
+
+    Args:
+        spec: Robot of the work cell.
 
     Raises:
-        InputError: The model is not whole or does not fit the specification, or a limit is missing.
+        InputError: The model is invalid or does not match the specification, or a limit is missing.
     """
     arm = parse_arm(spec)
     joints = JointRange(_position_limits(spec, arm), arm.revolute)
     home = _home(spec, arm, joints)
-    unlimited, jerk = [np.inf] * len(arm.joints), spec.limits.jerk
+    unlimited = [np.inf] * len(arm.joints)
+    jerk = spec.limits.jerk
     fit = _fit_ur_arm(arm) if spec.ik == "ur" else None
     ik: InverseKinematics = NumericalInverseKinematics(arm.chain, joints, home)
     if fit is not None:
         ik = UrInverseKinematics(fit.parameters, joints, _inverse(fit.X_B0), _inverse(fit.X_6F))
-    at_home = arm.chain.forward_kinematics(home)[None]
-    ik.solve(at_home), ik.track(at_home, home)  # compiled here: no plan's time limit pays for it
+    # Compile the kinematics now, so that compilation does not count for time limits of planning.
+    X_BF_home = arm.chain.forward_kinematics(home)[None]
+    ik.solve(X_BF_home)
+    ik.track(X_BF_home, home)
     return RobotModel(
         spec,
         tuple(joint.name() for joint in arm.joints),
@@ -137,6 +153,7 @@ def load_robot(spec: RobotSpec) -> RobotModel:
 
 
 def _home(spec: RobotSpec, arm: ParsedArm, joints: JointRange) -> Floats:
+    """Return the home configuration after checking it. Shape (n,)."""
     home = np.array(spec.home)
     _check_length("home", len(home), arm)
     for joint, q, (lower, upper) in zip(arm.joints, home, joints.limits, strict=True):
@@ -147,18 +164,18 @@ def _home(spec: RobotSpec, arm: ParsedArm, joints: JointRange) -> Floats:
 
 
 def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
-    """Return the limits of position (n, 2), the cell's over the model's."""
-    found = np.column_stack([arm.limits["lower"], arm.limits["upper"]])
+    """Return the position limits of the cell or else of the model. Shape (n, 2)."""
+    limits = np.column_stack([arm.limits["lower"], arm.limits["upper"]])
     if spec.limits.position is not None:
         _check_length("limits.position", len(spec.limits.position), arm)
-        found = np.array(spec.limits.position)
-    for joint, (lower, upper) in zip(arm.joints, found, strict=True):
+        limits = np.array(spec.limits.position)
+    for joint, (lower, upper) in zip(arm.joints, limits, strict=True):
         if not np.isfinite([lower, upper]).all():
             raise _missing_limit("position", joint.name())
         if not lower < upper:
             given = f"robot.limits.position: {lower:g}, {upper:g} for joint {joint.name()!r}"
-            raise InputError(f"{given}; allowed is the least, then the greatest")
-    return found
+            raise InputError(f"{given}; allowed is the lower, then the upper limit")
+    return limits
 
 
 def _joint_limits(
@@ -167,7 +184,7 @@ def _joint_limits(
     arm: ParsedArm,
     of_model: list[float],
 ) -> Floats:
-    """Return limits (n,), the cell's over the model's."""
+    """Return the limits of the cell, or else those of the model. Shape (n,)."""
     if given is not None:
         _check_length(f"limits.{kind}", len(given), arm)
         return np.array(given)
@@ -190,6 +207,7 @@ def _missing_limit(kind: str, joint: str) -> InputError:
 
 
 def _fit_ur_arm(arm: ParsedArm) -> UrFit:
+    """Return the closed-form kinematics of an arm, or raise an error if it has none."""
     fit = fit_ur(arm.chain) if len(arm.joints) == 6 and arm.revolute.all() else None
     if fit is None or not fit.error < _MAX_FIT_ERROR:
         off = f"{len(arm.joints)} joints" if fit is None else f"off by {fit.error:.2g} m"
@@ -203,7 +221,7 @@ def _inverse(X: Floats | None) -> Floats | None:
 
 
 def _has_vertical_axes(spec: RobotSpec, fit: UrFit) -> bool:
-    """Whether the first axis is vertical and the tool's axis that of the last joint."""
+    """Return whether the first axis is vertical and the tool axis along the last one."""
     X_TB = spec.X_TB.GetAsMatrix4()
     X_T0 = X_TB if fit.X_B0 is None else X_TB @ fit.X_B0
     along = 1.0 if fit.X_6F is None else fit.X_6F[2, 2]

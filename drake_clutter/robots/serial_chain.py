@@ -1,6 +1,6 @@
-"""Kinematics of any serial arm: fixed transforms between revolute and prismatic joints, compiled.
+"""Kinematics of serial arms with revolute and prismatic joints, compiled.
 
-Frames: B the base; F the flange, z out of the arm.
+Frames: B is the robot's base, F is its flange, z out of the arm.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SerialChain:
-    """An arm as a product of transforms: X_BF = fixed[0] J_1(q_1) fixed[1] ... J_n(q_n) fixed[n].
+    """Kinematic chain X_BF = fixed[0] J_1(q_1) fixed[1] ... J_n(q_n) fixed[n].
 
     Attributes:
-        fixed: Transforms between joints, whose axes are z. Shape (n + 1, 4, 4).
-        revolute: Whether a joint turns about its z; else it moves along it. Shape (n,).
+        fixed: Fixed transforms between the joints, whose axes are z. Shape (n + 1, 4, 4).
+        revolute: Whether a joint rotates about its axis; else it moves along it. Shape (n,).
     """
 
     fixed: Floats
@@ -30,35 +30,50 @@ class SerialChain:
         return len(self.revolute)
 
     def forward_kinematics(self, q: Floats) -> Floats:
-        """Return X_BF, (..., 4, 4), at joint positions (..., n)."""
+        """Return X_BF, shape (..., 4, 4), at joint positions of shape (..., n)."""
         q = np.asarray(q, float)
         rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
         poses = _forward_kinematics(self.fixed, self.revolute, rows)
         return np.asarray(poses.reshape(*q.shape[:-1], 4, 4))
 
     def joint_frames(self, q: Floats) -> Floats:
-        """Return the joints' frames in B, z along the axes, and X_BF, (n + 1, 4, 4), at q (n,)."""
+        """Return the poses in B of the joint frames, z along the axes, and X_BF.
+
+        Args:
+            q: Joint positions. Shape (n,).
+
+        Returns:
+            Poses. Shape (n + 1, 4, 4).
+        """
         frames = np.empty((self.num_joints + 1, 4, 4))
         chain_frames(self.fixed, self.revolute, np.ascontiguousarray(q, float), frames)
         return frames
 
     def jacobian(self, q: Floats) -> Floats:
-        """Return w_BF [rad/s] over v_BF [m/s] in B per joint velocity, (6, n), at q (n,)."""
+        """Return the spatial Jacobian of F in B, angular rows first. Shape (6, n).
+
+        Args:
+            q: Joint positions. Shape (n,).
+        """
         J = np.empty((6, self.num_joints))
         chain_jacobian(self.joint_frames(q), self.revolute, J)
         return J
 
     def manipulability(self, q: Floats) -> Floats:
-        """Return sqrt(det(J J^T)), (...), at q (..., n) (Yoshikawa 1985)."""
+        """Return the manipulability sqrt(det(J J^T)) (Yoshikawa 1985). Shape (...).
+
+        Args:
+            q: Joint positions. Shape (..., n).
+        """
         q = np.asarray(q, float)
         rows = np.ascontiguousarray(q).reshape(-1, self.num_joints)
-        worth = _manipulability(self.fixed, self.revolute, rows)
-        return np.asarray(worth.reshape(q.shape[:-1]))
+        manipulability = _manipulability(self.fixed, self.revolute, rows)
+        return np.asarray(manipulability.reshape(q.shape[:-1]))
 
 
 @njit(cache=True)
 def _multiply_transforms(A, B, C):  # type: ignore[no-untyped-def]
-    """Write the product of two rigid transforms into C, which is neither."""
+    """Write the product A B of rigid transforms into C, which must be another array."""
     for i in range(3):
         for j in range(4):
             C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
@@ -69,7 +84,7 @@ def _multiply_transforms(A, B, C):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def chain_frames(fixed, revolute, q, frames):  # type: ignore[no-untyped-def]
-    """Write the joints' frames, before the joints move, and X_BF into frames (n + 1, 4, 4)."""
+    """Write joint frames (without own motion) and X_BF into frames (n + 1, 4, 4)."""
     n = len(revolute)
     moved = np.empty((4, 4))
     frames[0] = fixed[0]
@@ -88,7 +103,7 @@ def chain_frames(fixed, revolute, q, frames):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def chain_jacobian(frames, revolute, J):  # type: ignore[no-untyped-def]
-    """Write the Jacobian (6, n) of the last frame, turning first, from the joints' frames."""
+    """Write the Jacobian of the last of frames (n + 1, 4, 4), angular rows first."""
     n = len(revolute)
     for k in range(n):
         z0, z1, z2 = frames[k, 0, 2], frames[k, 1, 2], frames[k, 2, 2]
@@ -105,20 +120,27 @@ def chain_jacobian(frames, revolute, J):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _forward_kinematics(fixed, revolute, q):  # type: ignore[no-untyped-def]
+    """Return X_BF, shape (m, 4, 4), at joint positions q (m, n)."""
     n = len(revolute)
-    found, frames = np.empty((len(q), 4, 4)), np.empty((n + 1, 4, 4))
+    poses = np.empty((len(q), 4, 4))
+    frames = np.empty((n + 1, 4, 4))
     for k in range(len(q)):
         chain_frames(fixed, revolute, q[k], frames)
-        found[k] = frames[n]
-    return found
+        poses[k] = frames[n]
+    return poses
 
 
 @njit(cache=True)
 def _manipulability(fixed, revolute, q):  # type: ignore[no-untyped-def]
+    """Return the manipulability, shape (m,), at q (m, n); NaN where q is NaN."""
     n = len(revolute)
-    found, frames, J = np.empty(len(q)), np.empty((n + 1, 4, 4)), np.empty((6, n))
+    manipulability = np.empty(len(q))
+    frames = np.empty((n + 1, 4, 4))
+    J = np.empty((6, n))
     for k in range(len(q)):
         chain_frames(fixed, revolute, q[k], frames)
         chain_jacobian(frames, revolute, J)
-        found[k] = np.sqrt(max(np.linalg.det(J @ J.T), 0.0)) if np.isfinite(q[k]).all() else np.nan
-    return found
+        manipulability[k] = (
+            np.sqrt(max(np.linalg.det(J @ J.T), 0.0)) if np.isfinite(q[k]).all() else np.nan
+        )
+    return manipulability

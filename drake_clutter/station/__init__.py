@@ -1,1 +1,1 @@
-"""Drake simulation of the work cell: station diagram, executor of plans, gripper, recordings."""
+"""Drake simulation of the work cell: station, plan executor, gripper, recordings."""

@@ -78,7 +78,7 @@ def evaluate_outcome(
     lost_object: bool,
     config: SettleConfig,
 ) -> Outcome:
-    """Settle the disturbed objects after an arm motion and return the outcome of the move.
+    """Settle the disturbed objects after an arm motion and return the outcome.
 
     Args:
         before: Scene at rest before the motion.
@@ -112,7 +112,7 @@ def evaluate_outcome(
 def worst_instability(
     expected: Sequence[SceneObject], after: Scene, config: SettleConfig
 ) -> Instability | None:
-    """Return the instability with the largest displacement, or None if all objects are stable.
+    """Return the instability with the largest displacement, or None if all are stable.
 
     Args:
         expected: Objects at their expected poses.

@@ -181,7 +181,7 @@ class BodySleepManager:
         return speeds
 
     def _lock_all_but(self, root: Context, awake: Set[str]) -> None:
-        """Lock all objects except some, and set the velocities of the newly locked ones to zero.
+        """Lock all objects except some; newly locked ones are stopped.
 
         Collisions of locked objects with fixed bodies and with each other are filtered out: Drake
         fails at penetrations between bodies that cannot move.

@@ -1,4 +1,4 @@
-"""Work cell as a Drake Diagram: plant, scene graph, and arm with joint position control."""
+"""Work cell as a Drake Diagram: plant, scene graph and position-controlled arm."""
 
 from collections.abc import Mapping, Sequence
 
@@ -212,7 +212,7 @@ class ClutterStation(Diagram):
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
 
     def objects_in_contact(self, context: Context) -> set[str]:
-        """Return the names of the objects in contact with the arm, the gripper or other objects.
+        """Return the names of objects in contact with the arm or with other objects.
 
         Contacts between locked objects are filtered out. A locked object is reported if the arm or
         an awake object hits it.
@@ -246,7 +246,7 @@ def _set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
 def _make_grasp_constraint(
     plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], weldable_object: str
 ) -> GraspConstraint:
-    """Return a `WeldGrasp` of the weldable object, or a `CompliantGrasp` if there is none."""
+    """Return a `WeldGrasp` of the weldable object, or a `CompliantGrasp` without one."""
     if weldable_object:
         return WeldGrasp(plant, arm, bodies[weldable_object])
     return CompliantGrasp(plant, arm)

@@ -1,4 +1,4 @@
-"""Command schedule of a plan: joint references, feed-forward torques and suction over time."""
+"""Command schedule of a plan: joint commands and suction over time."""
 
 import math
 from dataclasses import dataclass

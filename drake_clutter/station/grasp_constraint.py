@@ -60,7 +60,7 @@ class GraspConstraint(Protocol):
 
 
 def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
-    """Return force and moment in the bellows joint, without the weight of the cup, in G."""
+    """Return force and moment in the bellows joint without the cup's weight, in G."""
     bellows = plant.GetJointByName("bellows", arm.tool)
     reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
     down_G = -arm.cup.CalcPoseInWorld(context).rotation().matrix()[2]
@@ -69,7 +69,7 @@ def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats
 
 
 class WeldGrasp:
-    """Grasp without compliance: a floating joint between cup and object that is locked.
+    """Rigid grasp: a floating joint between cup and object that is locked.
 
     The joint replaces the free joint of the object, so only one object can be attached.
     """

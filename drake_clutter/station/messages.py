@@ -26,7 +26,7 @@ class Message:
     number: int = 0
 
     def __deepcopy__(self, memo: object) -> Self:
-        """Return the message itself: it is immutable, and Drake copies abstract values often."""
+        """Return the message itself; it is immutable and often copied by Drake."""
         return self
 
 

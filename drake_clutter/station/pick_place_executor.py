@@ -168,7 +168,7 @@ class PickPlaceExecutor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
-        """Return the state, with the contact time if contact occurs during a guarded descent."""
+        """Return the state, updated if contact occurs during a guarded descent."""
         schedule = state.schedule
         if schedule is None or state.plan is None or not self._bellows.HasValue(context):
             return state

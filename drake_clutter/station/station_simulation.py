@@ -225,7 +225,7 @@ class StationSimulation:
             self.step()
 
     def sample(self) -> MotionSample:
-        """Return the state of arm and objects, with the time since the start of the last plan."""
+        """Return the state of arm and objects, with the time since the last plan's start."""
         context = self.plant_context
         arm = self.station.arm_state(context, self._is_suction_on(self.root))
         time = self.root.get_time() - self.executor_state.start_time

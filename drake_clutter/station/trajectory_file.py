@@ -129,7 +129,7 @@ def read_trajectories(
 
 
 def _read_cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
-    """Return the work cell of a file; files of version 0.1 of the package have only the arm."""
+    """Return the work cell of a file; files of package version 0.1 have only the arm."""
     field = "cell" if "cell" in attributes else "arm"
     source = f"{path}:{field}"
     document = parse_yaml(str(attributes.get(field, "{}")), source)
