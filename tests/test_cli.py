@@ -1,4 +1,4 @@
-"""The commands as a user calls them, on small scenes."""
+"""Commands in processes of their own, on small scenes."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ SCENE = {"version": 1, "objects": [BELOW, ABOVE]}
 
 
 def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Runs the command in a process of its own, as a user would."""
+    """Run a command in a process of its own and check its exit code."""
     command = [
         sys.executable,
         "-c",
@@ -51,7 +51,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def scenes_of(folder: Path) -> dict[str, bytes]:
+def read_scene_files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((folder / "scenes").iterdir())}
 
 
@@ -74,12 +74,12 @@ def generate(out: Path, count: int, *more: str) -> dict[str, object]:
     return summary
 
 
-def test_generate_resumes_and_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
+def test_generate_resumes_and_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     whole = generate(tmp_path / "whole", 4, "--workers", "2")
     generate(tmp_path / "parts", 2)
     parts = generate(tmp_path / "parts", 4)
-    assert scenes_of(tmp_path / "whole") == scenes_of(tmp_path / "parts")
-    assert list(scenes_of(tmp_path / "whole")) == [
+    assert read_scene_files(tmp_path / "whole") == read_scene_files(tmp_path / "parts")
+    assert list(read_scene_files(tmp_path / "whole")) == [
         "0000.yaml",
         "0001.yaml",
         "0002.yaml",
@@ -89,7 +89,8 @@ def test_generate_resumes_and_is_the_same_for_any_number_of_workers(tmp_path: Pa
     assert {k: v for k, v in whole.items() if k not in timing} == {
         k: v for k, v in parts.items() if k not in timing
     }
-    fields = "nodes count stability_rate stability_ci95 hidden_mean hidden_ci95 distinct_share mean_stacks seconds seed config"
+    fields = "nodes count stability_rate stability_ci95 hidden_mean hidden_ci95 distinct_share "
+    fields += "mean_stacks seconds seed config"
     assert set(fields.split()) <= set(whole)
     assert json.loads((tmp_path / "whole/summary.json").read_text()) == whole
     assert Image.open(tmp_path / "whole/contact_sheet.png").width > 400
@@ -101,7 +102,7 @@ def test_generate_resumes_and_is_the_same_for_any_number_of_workers(tmp_path: Pa
     assert whole["stability_rate"] == stable / 4
 
 
-def test_generate_goes_on_after_a_kill(tmp_path: Path) -> None:
+def test_generate_resumes_after_a_kill(tmp_path: Path) -> None:
     out = tmp_path / "killed"
     command = [sys.executable, "-c", "from drake_clutter.cli import main; main()"]
     command += ["generate", "--nodes", "6", "--count", "4", "--seed", "5", "--out", str(out)]
@@ -115,11 +116,11 @@ def test_generate_goes_on_after_a_kill(tmp_path: Path) -> None:
     process.wait()
     generate(out, 4)
     generate(tmp_path / "whole", 4)
-    assert scenes_of(out) == scenes_of(tmp_path / "whole")
+    assert read_scene_files(out) == read_scene_files(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("fidelity", ["settle", "static_or_drake"])
-def test_explore_finds_what_is_below(fidelity: str, scene: Path, tmp_path: Path) -> None:
+def test_explore_finds_the_hidden_object(fidelity: str, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "episode"
     options = ("--agent", "largest-clear", "--fidelity", fidelity, "--json")
     printed = json.loads(run("explore", scene, *options, "--out", out).stdout)
@@ -137,7 +138,7 @@ def test_explore_finds_what_is_below(fidelity: str, scene: Path, tmp_path: Path)
     assert (out / "index.html").is_file()
 
 
-def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: Path) -> None:
+def test_solve_finds_a_plan_of_one_move_that_drake_confirms(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "solution"
     printed = json.loads(run("solve", scene, "--json", "--out", out).stdout)
     assert printed == json.loads((out / "solution.json").read_text())
@@ -157,7 +158,7 @@ def test_solve_finds_the_one_move_and_drake_confirms_it(scene: Path, tmp_path: P
     assert (out / "index.html").is_file()
 
 
-def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
+def test_evaluate_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
     verdict = {
         "stable": True,
@@ -204,7 +205,7 @@ def test_evaluate_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
     assert largest_first["hidden"] == largest_first["within_2"]["found"] == 1.0
 
 
-def test_evaluate_knows_the_frozen_sets_by_name() -> None:
+def test_evaluate_accepts_names_of_shipped_scene_sets() -> None:
     shown = run(
         "evaluate",
         "--scenes",
@@ -223,7 +224,7 @@ def test_evaluate_knows_the_frozen_sets_by_name() -> None:
     assert "--scenes: give it once" in run("evaluate", code=2).stderr
 
 
-def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
+def test_move_executes_a_list(scene: Path, tmp_path: Path) -> None:
     moves = tmp_path / "moves.yaml"
     moves.write_text("- {pick: above, place: tray}\n- {pick: below, place: above}\n")
     run("move", scene, "--moves", moves, "--out", tmp_path / "out")
@@ -237,7 +238,7 @@ def test_move_carries_out_a_list(scene: Path, tmp_path: Path) -> None:
     assert np.allclose(after["below"][:2], after["above"][:2], atol=0.01)
 
 
-def test_render_writes_what_the_camera_sees(scene: Path, tmp_path: Path) -> None:
+def test_render_writes_camera_images(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "images"
     run("render", scene, "--out", out)
     visible = json.loads((out / "visible.json").read_text())
@@ -262,7 +263,7 @@ def broken(**changes: object) -> str:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "parts"),
     [
         (("generate", "--nodes", "2", "--out", "new"), ("nodes", "2", "3")),
         (("generate", "--count", "0", "--out", "new"), ("--count 0",)),
@@ -270,22 +271,31 @@ def broken(**changes: object) -> str:
         (("generate", "--out", "full"), ("full", "not empty")),
         (("generate", "--out", "scene.yaml"), ("scene.yaml", "is a file")),
         (("generate", "--catalog", "full", "--out", "new"), ("catalog.yaml",)),
-        (("generate", "--config", "config.yaml", "--out", "new"), ("config.yaml", "visibility_threshold")),
+        (
+            ("generate", "--config", "config.yaml", "--out", "new"),
+            ("config.yaml", "visibility_threshold"),
+        ),
         (("explore", "missing.yaml", "--out", "new"), ("missing.yaml",)),
-        (("explore", "unknown.yaml", "--out", "new"), ("unknown.yaml", "objects[0].class", "teapot")),
+        (
+            ("explore", "unknown.yaml", "--out", "new"),
+            ("unknown.yaml", "objects[0].class", "teapot"),
+        ),
         (("explore", "overlap.yaml", "--out", "new"), ("overlap.yaml", "above", "below", "mm")),
         (("explore", "unstable.yaml", "--out", "new"), ("not stable",)),
         (("evaluate", "--scenes", "full", "--out", "new.json"), ("full", "no scene files")),
-        (("move", "scene.yaml", "--pick", "below", "--place", "tray", "--out", "new"), ("below", "not in view")),
+        (
+            ("move", "scene.yaml", "--pick", "below", "--place", "tray", "--out", "new"),
+            ("below", "not in view"),
+        ),
         (("move", "scene.yaml", "--pick", "above", "--out", "new"), ("--pick", "--moves")),
         (("export", "scene.yaml", "--format", "glb", "--out", "full"), ("full", "not empty")),
     ],
-)  # fmt: skip
-def test_bad_input_is_one_line_and_leaves_nothing(
+)
+def test_invalid_input_is_one_line_and_writes_nothing(
     tmp_path: Path,
     scene: Path,
     arguments: Sequence[str],
-    says: Sequence[str],
+    parts: Sequence[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -305,7 +315,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
     result = run(*arguments, code=2)
     assert result.stderr.startswith("error")
-    for part in says:
+    for part in parts:
         assert part in result.stderr
     assert "Traceback" not in result.stderr
     written = [path for path in tmp_path.rglob("*") if path.relative_to(tmp_path) not in before]

@@ -1,4 +1,4 @@
-"""Commands with a cell of one's own: what they use, what they write, and what they refuse in one line."""
+"""Commands with other work cells: what they use, what they write, and what they refuse."""
 
 import json
 from pathlib import Path
@@ -33,15 +33,13 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str | Path) -> None:
-    told = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    if told.exception is not None and not isinstance(told.exception, SystemExit):
-        raise told.exception
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
 
 
-def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(
-    scene_file: Path, tmp_path: Path
-) -> None:
+def test_a_move_uses_and_stores_the_cell_of_the_scene(scene_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(
         "move",
@@ -65,7 +63,7 @@ def test_a_move_is_made_in_the_scene_s_cell_and_what_is_written_holds_it(
     assert episode["moves"][0]["outcome"] == "placed"
 
 
-def test_options_go_over_the_scene_s_cell_but_for_its_support(
+def test_options_replace_the_cell_of_the_scene_except_its_support(
     scene_file: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -92,9 +90,7 @@ def test_a_scenario_has_the_support_of_its_scene(scene_file: Path) -> None:
 @pytest.mark.parametrize(
     "setting", ["support.size=[0.8, 0.8]", "cell.support.floor_height=0.2", "layout.tray_side=0.8"]
 )
-def test_scenes_keep_the_support_on_which_their_objects_stand(
-    setting: str, scene_file: Path, tmp_path: Path
-) -> None:
+def test_scenes_keep_their_support(setting: str, scene_file: Path, tmp_path: Path) -> None:
     commands: list[list[str | Path]] = [
         ["feasibility", scene_file],
         ["evaluate", tmp_path],
@@ -126,7 +122,7 @@ def test_scenes_keep_the_support_on_which_their_objects_stand(
         ({"fixtures": [{"name": "post"}]}, r"fixtures\[0\].*allowed"),
     ],
 )
-def test_a_cell_that_is_none_is_one_line(
+def test_an_invalid_cell_is_reported_in_one_line(
     change: dict[str, object], message: str, scene_file: Path, tmp_path: Path
 ) -> None:
     cell = tmp_path / "cell.yaml"
@@ -161,10 +157,10 @@ def test_a_cell_that_is_none_is_one_line(
     "options",
     [("--cell", "own.yaml"), ("--config", "config.yaml"), ("--set", "robot.model=none.sdf")],
 )
-def test_commands_that_need_no_arm_check_the_cell_too(
+def test_commands_without_an_arm_check_the_cell(
     options: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else it fails hours later, with the scenes that were made with it."""
+    """Otherwise scenes made with it would fail later."""
     monkeypatch.chdir(tmp_path)
     own = DEFAULT_CELL.model_copy(
         update={"robot": DEFAULT_CELL.robot.model_copy(update={"model": "none.sdf"})}
@@ -180,15 +176,15 @@ def test_commands_that_need_no_arm_check_the_cell_too(
 
 
 def test_a_model_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Options name it from the folder of the command; what is written has its absolute path."""
+    """Options are relative to the working directory; written files contain absolute paths."""
     monkeypatch.chdir(tmp_path)
     Path("arm.sdf").write_text(resource_path("models/robots/ur10.sdf").read_text())
     world = load_config_from_options(None, None, ["robot.model=arm.sdf"])
     assert world.cell.robot.model == str(tmp_path / "arm.sdf")
 
 
-def test_a_config_goes_over_the_cell(tmp_path: Path) -> None:
-    """In all commands; here one of version 0.1."""
+def test_a_config_replaces_fields_of_the_cell(tmp_path: Path) -> None:
+    """The config is one of version 0.1."""
     config = tmp_path / "config.yaml"
     config.write_text("{layout: {tray_side: 0.5}, camera: {altitude: 1.4}}")
     world = load_config_from_options(config, UR5E, ["robot.base.z=0.35"])
@@ -198,12 +194,12 @@ def test_a_config_goes_over_the_cell(tmp_path: Path) -> None:
     assert world.cell.camera.pose.translation[2] == 1.4
 
 
-def test_a_study_refuses_cells_of_one_name(scene_file: Path, tmp_path: Path) -> None:
+def test_a_study_refuses_cells_with_the_same_name(scene_file: Path, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     other = tmp_path / "other" / UR5E.name
     other.write_text(config_yaml(load_cell(UR5E)))
     with pytest.raises(
         InputError,
-        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are unique file names",
+        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are unique file",
     ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

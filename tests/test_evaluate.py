@@ -1,4 +1,4 @@
-"""Comparing explorers: what is played, and what is refused before anything is."""
+"""Evaluation of exploration policies: which episodes are run, and which input is refused."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -24,55 +24,57 @@ from drake_clutter.scenes.scene_file import save_scene
 CONFIG = ClutterConfig()
 
 
-def rows_of(
+def run_evaluation(
     scenes: Sequence[EvaluationScene],
     *agents: str,
     config: ClutterConfig = CONFIG,
     out: Path | None = None,
-    most: int = 100,
+    max_episodes: int = 100,
 ) -> list[dict[str, Any]]:
-    """The rows; `most`: episodes that are to be played."""
+    """Return the statistics; there must be at most `max_episodes` episodes."""
 
     def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
-        assert total <= most
+        assert total <= max_episodes
         return results
 
     return evaluate_explorers(scenes, agents, 3, "static", 0, config, None, 1, out, progress)
 
 
-def test_an_agent_that_is_named_twice_plays_once() -> None:
+def test_a_repeated_policy_is_run_once() -> None:
     scenes = load_evaluation_scenes("sg_star_10", None)[:2]
-    assert rows_of(scenes, "random", "random", most=2) == rows_of(scenes, "random")
+    assert run_evaluation(scenes, "random", "random", max_episodes=2) == run_evaluation(
+        scenes, "random"
+    )
 
 
-def test_a_set_that_there_is_not() -> None:
+def test_an_unknown_scene_set() -> None:
     with pytest.raises(
         InputError, match=r"--scenes sg_star_9: is not there; allowed are .*sg_star_25"
     ):
         load_evaluation_scenes("sg_star_9", None)
 
 
-def test_mistakes_are_told_before_anything_is_played(tmp_path: Path) -> None:
+def test_invalid_input_is_refused_before_any_episode(tmp_path: Path) -> None:
     scenes = load_evaluation_scenes("sg_14", None)[:1]
     for out in (tmp_path, tmp_path / "none" / "out.json"):
         with pytest.raises(InputError, match=r"--out .* allowed is a file in a folder that exists"):
-            rows_of(scenes, "random", out=out, most=0)
+            run_evaluation(scenes, "random", out=out, max_episodes=0)
     with pytest.raises(InputError, match="was not trained with cereal_box_large"):
-        rows_of(scenes, "random", "student", most=0)
+        run_evaluation(scenes, "random", "student", max_episodes=0)
 
 
-def test_what_hides_nothing_from_the_config_s_camera_is_left_out() -> None:
-    """In the first of the set some object is hidden altogether, in the second there is a glimpse of each."""
+def test_scenes_without_objects_hidden_from_the_camera_are_excluded() -> None:
+    """In the first scene of the set an object is fully hidden, in the second none is."""
     config = world_with("camera.visibility_threshold=1e-6".replace("1e-6", "0.000001"))
     scenes = load_evaluation_scenes("sg_star_10", None)[:2]
-    (row,) = rows_of(scenes, "random", config=config)
+    (row,) = run_evaluation(scenes, "random", config=config)
     assert row["episodes"] == 1
     with pytest.raises(InputError, match="none of 1 scenes has objects that are hidden"):
-        rows_of(scenes[1:], "random", config=config)
+        run_evaluation(scenes[1:], "random", config=config)
 
 
-def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) -> None:
-    """A camera that calls nothing hidden but what it sees nothing of."""
+def test_scenes_are_evaluated_in_their_own_cell(tmp_path: Path) -> None:
+    """One camera counts objects as hidden only if they are fully hidden."""
     scene = random_scene(22)
     cells = [
         cell_with(f"cameras.overhead.visibility_threshold={least}") for least in (0.3, 0.000001)
@@ -96,8 +98,8 @@ def test_scenes_are_played_in_the_cell_that_they_were_made_with(tmp_path: Path) 
             "--out",
             str(out),
         ]
-        told = CliRunner().invoke(app, command)
-        assert told.exit_code == 0, told.output
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
         camera = json.loads(out.read_text())["config"]["cell"]["cameras"]["overhead"]
         assert camera["visibility_threshold"] == cell.camera.visibility_threshold
     mixed = [load_evaluation_scenes(str(tmp_path / str(number)), None)[0] for number in (0, 1)]

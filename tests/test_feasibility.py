@@ -1,4 +1,4 @@
-"""Feasibility studies: what is asked, what is answered, and that a study goes on where it was stopped."""
+"""Feasibility studies: move and reachability results, and resuming a study."""
 
 import csv
 import json
@@ -82,7 +82,7 @@ def test_every_legal_move_has_a_row() -> None:
     ]
 
 
-def test_what_points_up_and_what_lies_below() -> None:
+def test_resting_side_and_objects_below() -> None:
     assert resting_side(resting("sugar_box", Orientation.UPRIGHT_0)) == "upright"
     assert resting_side(resting("sugar_box", Orientation.SIDE_0)) == "side"
     assert resting_side(resting("sugar_box", Orientation.FLAT_0)) == "flat"
@@ -91,7 +91,7 @@ def test_what_points_up_and_what_lies_below() -> None:
     assert objects_below(SCENE["tomato_soup_can"], SCENE.objects) == []
 
 
-def test_what_no_arm_can_do_is_a_reason() -> None:
+def test_infeasible_moves_have_a_reason() -> None:
     place = Pose((0.1, 0.1, SCENE["tomato_soup_can"].X_TO.p[2] + 0.001))
 
     def reason(cell: WorkCell) -> PlanningFailure:
@@ -117,7 +117,7 @@ def test_what_no_arm_can_do_is_a_reason() -> None:
     assert reason(cell_with("robot.payload=1")).reason is PlanningFailureReason.TOO_HEAVY
 
 
-def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
+def test_larger_pose_errors_invalidate_more_plans() -> None:
     it = study()
     rows = it.plan_all_moves("scene", 0, SCENE)
     found = it.test_pose_errors("scene", 0, SCENE, rows)
@@ -131,7 +131,7 @@ def test_errors_of_poses_count_the_more_the_larger_they_are() -> None:
     assert {row.result for row in found} - {"holds", "no plan"}, "some fail, and it is said how"
 
 
-def test_the_map_agrees_with_the_poses() -> None:
+def test_the_reachability_map_agrees_with_single_poses() -> None:
     reachability = ReachabilityAnalysis(DEFAULT_CELL)
     found = reachability.compute_map((0.1, 1.5), 0.3)
     assert found.reachable_fraction.shape == (2, 3, 3)
@@ -158,14 +158,14 @@ def test_the_map_agrees_with_the_poses() -> None:
     assert in_tray == (0.0, 0.0)
 
 
-def test_the_map_covers_the_support_and_no_more() -> None:
+def test_the_reachability_map_covers_exactly_the_support() -> None:
     found = ReachabilityAnalysis(cell_with("support.size=[0.4, 0.8]")).compute_map((0.1,), 0.15)
     assert found.x == pytest.approx([-0.15, 0.0, 0.15])
     assert found.y == pytest.approx(np.linspace(-0.35, 0.35, 6))
     assert found.reachable_fraction.shape == found.manipulability.shape == (1, 3, 6)
 
 
-def test_all_moves_are_in_the_picture_over_the_support() -> None:
+def test_all_moves_are_in_the_plot_over_the_support() -> None:
     row = {"setup": "it", "result": PLANNED}
     moves = [row | {"pick_x": 0.1, "pick_y": 0.45}, row | {"pick_x": -0.14, "pick_y": -0.4}]
     figure = feasibility_report._plot_by_pick_position(
@@ -177,21 +177,21 @@ def test_all_moves_are_in_the_picture_over_the_support() -> None:
     plt.close(figure)
 
 
-def test_another_base_keeps_the_roll_and_pitch_of_the_cell_s() -> None:
+def test_another_base_keeps_the_roll_and_pitch_of_the_cell() -> None:
     hanging = cell_with("robot.base.roll=180")
     (cell,) = command.make_setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
     assert cell.robot.base.translation == (0.1, -0.2, 1.4)
     assert cell.robot.base.rpy_deg == (180.0, 0.0, 30.0)
 
 
-def test_cells_of_one_name_are_refused(scenes: Path, tmp_path: Path) -> None:
+def test_cells_with_the_same_name_are_refused(scenes: Path, tmp_path: Path) -> None:
     paths = [tmp_path / folder / "cell.yaml" for folder in ("a", "b")]
     arguments = ["feasibility", str(scenes / "pile.yaml"), "--out", str(tmp_path / "study")]
     for path in paths:
         arguments += ["--cell", str(path)]
-    told = CliRunner().invoke(app, arguments)
-    assert isinstance(told.exception, InputError)
-    assert "cell is there twice; allowed are unique file names" in str(told.exception)
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError)
+    assert "cell is there twice; allowed are unique file names" in str(result.exception)
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +210,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def reduce_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "BASE_GRID_X", [-0.8, -0.6])
     monkeypatch.setattr(command, "BASE_GRID_Y", [0.0, 0.2])
     monkeypatch.setattr(command, "MAP_SPACING", 0.3)
@@ -226,7 +226,7 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_a_study_from_the_command_line(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick(monkeypatch)
+    reduce_study(monkeypatch)
     small = tmp_path / "small_cup.yaml"
     small.write_text("{suction: {cup_diameter: 0.015}}")
     targets = tmp_path / "targets.yaml"
@@ -242,8 +242,8 @@ def test_a_study_from_the_command_line(
         "--cell-override",
         str(small),
     ]
-    told = CliRunner().invoke(app, [*arguments, "--targets", str(targets), "--json"])
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, [*arguments, "--targets", str(targets), "--json"])
+    assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())
     assert summary["unstable_scenes"] == ["falls"]
     assert list(summary["setups"]) == ["small_cup", "base -0.7, 0, 0.3, 0", "tray 0.65, 0, -0.3, 0"]
@@ -274,22 +274,22 @@ def test_a_study_from_the_command_line(
     assert page.count("data:image/png;base64") >= 10
     assert "http:" not in page
     assert "https:" not in page
-    # What is done is not done again, and what is missing is.
+    # Existing parts are kept, and missing ones are computed.
     monkeypatch.setattr(command, "write_feasibility_report", lambda *_: None)
     before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
     (gone := next(path for path in (out / "parts").iterdir() if "scene_0001" in path.name)).unlink()
-    told = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])
+    assert result.exit_code == 0, result.output
     after = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
     assert {name for name in after if after[name] != before[name]} == {gone.name}
-    told = CliRunner().invoke(app, [*arguments, "--seed", "1"])
-    assert isinstance(told.exception, InputError)
-    assert "holds results of other options" in str(told.exception)
+    result = CliRunner().invoke(app, [*arguments, "--seed", "1"])
+    assert isinstance(result.exception, InputError)
+    assert "holds results of other options" in str(result.exception)
 
 
 def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scene on the small tray that they reach."""
-    quick(monkeypatch)
+    """The scene is on a small tray, which all robots reach."""
+    reduce_study(monkeypatch)
     pile = [resting("pudding_box"), resting("tomato_soup_can", xy=(-0.1, -0.15))]
     scene, out = scene_of(*pile, side=0.5), tmp_path / "study"
     verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 1.0), ())
@@ -299,8 +299,8 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for name in names:
         option = "--cell" if name == names[-1] else "--cell-override"
         arguments += [option, str(resource_path(f"models/cells/{name}.yaml"))]
-    told = CliRunner().invoke(app, arguments)
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
     setups = json.loads((out / "summary.json").read_text())["setups"]
     assert set(setups) == set(names)
     for found in setups.values():
@@ -316,7 +316,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (out / "report.html").stat().st_size > 1e5
 
 
-def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
+def test_the_tray_pose_is_the_inverse_of_the_base_pose() -> None:
     (one,) = command.make_setups([], [[0.4, 0.5, -0.3, 30.0]], [], DEFAULT_CELL).values()
     X_BT = one.robot.X_TB.inverse().GetAsMatrix4()
     assert X_BT[:3, 3] == pytest.approx([0.4, 0.5, -0.3])
@@ -341,7 +341,7 @@ def test_the_tray_seen_from_the_base_is_the_base_seen_from_the_tray() -> None:
         ),
     ],
 )
-def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_targets(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "targets.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
@@ -363,14 +363,14 @@ def test_targets_that_are_none(text: str, message: str, tmp_path: Path) -> None:
         ("{reach: 3}", "reach: is unknown"),
     ],
 )
-def test_arms_that_are_none(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_cell_overrides(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         command.make_setups([], [], [path], DEFAULT_CELL)
 
 
-def test_an_arm_from_a_file(tmp_path: Path) -> None:
+def test_a_cell_override_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
     found: dict[str, Any] = command.make_setups([], [], [path], DEFAULT_CELL)

@@ -1,4 +1,4 @@
-"""The doctor finds this machine fit, and what is broken becomes a finding with a remedy."""
+"""Checks of the installation: a broken component is reported with a remedy."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,13 +10,13 @@ from drake_clutter.installation_check import Check
 
 
 @pytest.fixture
-def torch_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file that takes the place of PyTorch in new processes."""
+def torch_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Path of a module that replaces PyTorch in new processes."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return tmp_path / "torch.py"
 
 
-def test_this_machine_is_fit() -> None:
+def test_all_checks_pass() -> None:
     found = {check.name: check for check in installation_check.run_checks()}
     assert list(found) == ["drake", "rendering", "solvers", "torch", "assets", "machine"]
     assert [check for check in found.values() if not check.ok] == []
@@ -24,29 +24,36 @@ def test_this_machine_is_fit() -> None:
     assert "SNOPT" in found["solvers"].detail
 
 
-def test_a_broken_library_is_a_finding(torch_is: Path) -> None:
-    torch_is.write_text("raise ImportError('broken')")
-    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
-        "torch", False, "ImportError: broken", "mend it"
+def test_a_broken_library_is_reported(torch_module: Path) -> None:
+    torch_module.write_text("raise ImportError('broken')")
+    assert installation_check._run_probe(installation_check.probe_torch, "remedy") == Check(
+        "torch", False, "ImportError: broken", "remedy"
     )
 
 
-def test_a_crash_is_a_finding(torch_is: Path) -> None:
-    torch_is.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
-    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
-        "torch", False, "died of SIGSEGV", "mend it"
+def test_a_probe_error_is_reported_without_its_type(torch_module: Path) -> None:
+    module = installation_check.__name__
+    torch_module.write_text(f"from {module} import ProbeError\nraise ProbeError('too old')")
+    check = installation_check._run_probe(installation_check.probe_torch, "remedy")
+    assert check == Check("torch", False, "too old", "remedy")
+
+
+def test_a_crash_is_reported(torch_module: Path) -> None:
+    torch_module.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
+    assert installation_check._run_probe(installation_check.probe_torch, "remedy") == Check(
+        "torch", False, "died of SIGSEGV", "remedy"
     )
 
 
-def test_a_hang_is_a_finding(torch_is: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch_is.write_text("import time\ntime.sleep(60)")
+def test_a_timeout_is_reported(torch_module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch_module.write_text("import time\ntime.sleep(60)")
     monkeypatch.setattr(installation_check, "_PROBE_TIMEOUT", 1.0)
-    assert installation_check._run_probe(installation_check.probe_torch, "mend it") == Check(
-        "torch", False, "no answer in 1 s", "mend it"
+    assert installation_check._run_probe(installation_check.probe_torch, "remedy") == Check(
+        "torch", False, "no answer in 1 s", "remedy"
     )
 
 
-def test_missing_models_are_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_models_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     catalog = SimpleNamespace(classes={"crate": SimpleNamespace(sdf_path=tmp_path / "model.sdf")})
     monkeypatch.setattr("drake_clutter.catalog.load_catalog", lambda: catalog)
     with pytest.raises(

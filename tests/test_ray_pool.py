@@ -22,7 +22,7 @@ import ray
 from conftest import DEFAULT_CELL
 from numpy.typing import NDArray
 from ray.cluster_utils import Cluster
-from test_cli import ABOVE, BELOW, broken, run, scenes_of
+from test_cli import ABOVE, BELOW, broken, read_scene_files, run
 from test_workers import broken_factory, failing_worker
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
@@ -205,7 +205,7 @@ def test_generate_with_a_killed_worker_writes_the_same_scenes(
         os.kill(wait_for(lambda: processes_at_work(cluster))[0], signal.SIGKILL)
         output, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert scenes_of(tmp_path / "there") == scenes_of(tmp_path / "alone")
+    assert read_scene_files(tmp_path / "there") == read_scene_files(tmp_path / "alone")
     assert json.loads(output)["count"] == 3  # what Ray says of the killed worker is not among it
 
 

@@ -1,4 +1,4 @@
-"""The page of an episode, its pictures and recording; the contact sheet."""
+"""Episode pages with their images and recording, contact sheets and diagram drawings."""
 
 import re
 from dataclasses import replace
@@ -44,7 +44,7 @@ HOSTILE = '<script>alert(1)</script> & "co"'
 
 
 class Page(HTMLParser):
-    """What a page refers to and says."""
+    """References, texts and tags of a page."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def task(config: ClutterConfig) -> ExplorationTask:
-    """An episode of one real move, which uncovers the gelatin box."""
+    """Episode of one move, which uncovers the gelatin box."""
     backend = make_teleport_backend_factory("settle", config, follow_falls=True)(SCENE, rng())
     task = run_episode(backend, lambda *_: Decision(UNCOVER), max_moves=1)
     assert task.found == ("gelatin_box_1",)
@@ -76,7 +76,10 @@ def task(config: ClutterConfig) -> ExplorationTask:
 
 @pytest.fixture(scope="module")
 def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The episode's page; after the real move come one that found no spot and one that made the sugar box fall."""
+    """Folder of the episode's page, to which two invented moves are added.
+
+    The first finds no free placement, the second makes the sugar box fall.
+    """
     out = tmp_path_factory.mktemp("page")
     step = task.transitions[0]
     onto_gelatin = Decision(Move("sugar_box_3", "gelatin_box_1"))
@@ -103,7 +106,7 @@ def folder(task: ExplorationTask, tmp_path_factory: pytest.TempPathFactory) -> P
     return out
 
 
-def test_the_page_refers_only_to_files_that_lie_beside_it(folder: Path) -> None:
+def test_the_page_refers_only_to_files_in_its_folder(folder: Path) -> None:
     source = (folder / "index.html").read_text(encoding="utf-8")
     page = Page(source)
     assert not re.search(r"https?://|@import|url\(", source)
@@ -120,7 +123,7 @@ def test_the_page_refers_only_to_files_that_lie_beside_it(folder: Path) -> None:
     assert all(page.alts)
 
 
-def test_the_page_says_what_happened(folder: Path) -> None:
+def test_the_page_describes_the_moves(folder: Path) -> None:
     text = Page((folder / "index.html").read_text(encoding="utf-8")).text
     assert "Hidden: Gelatin box 1." in text
     assert "1. Cracker box 2 \N{RIGHTWARDS ARROW} tray" in text
@@ -130,13 +133,13 @@ def test_the_page_says_what_happened(folder: Path) -> None:
     assert "Sugar box 3: toppled (moved 100 mm, tilted 86\N{DEGREE SIGN})" in text
 
 
-def test_words_from_outside_are_escaped(folder: Path) -> None:
+def test_texts_from_outside_are_escaped(folder: Path) -> None:
     page = Page((folder / "index.html").read_text(encoding="utf-8"))
     assert "script" not in page.tags
     assert page.text.count(HOSTILE) >= 3  # the document's title, the heading, the key figure
 
 
-def test_pictures_have_their_size_and_show_something(folder: Path) -> None:
+def test_images_have_their_size_and_are_not_empty(folder: Path) -> None:
     for path in (folder / "images").iterdir():
         with Image.open(path) as picture:
             assert picture.size == ((960, 720) if "oblique" in path.name else (720, 720))
@@ -144,7 +147,7 @@ def test_pictures_have_their_size_and_show_something(folder: Path) -> None:
             assert len(picture.getcolors(maxcolors=2**20) or ()) > 1000, path.name
 
 
-def test_hidden_and_found_objects_are_marked(folder: Path) -> None:
+def test_hidden_and_found_objects_are_highlighted(folder: Path) -> None:
     def pixels(name: str, mark: Highlight) -> int:
         color = [int(mark.value[i : i + 2], 16) for i in (1, 3, 5)]
         with Image.open(folder / "images" / name) as picture:
@@ -158,13 +161,13 @@ def test_hidden_and_found_objects_are_marked(folder: Path) -> None:
     assert pixels("move_03_after.png", Highlight.FALLEN) > 500
 
 
-def test_what_fell_is_marked_as_fallen_even_if_it_was_moved() -> None:
+def test_a_moved_object_that_fell_is_highlighted_as_fallen() -> None:
     assert Annotations(fallen=("a",), moved="a").highlight("a") is Highlight.FALLEN
     assert Annotations(found=("a",), moved="a").highlight("a") is Highlight.MOVED
     assert Annotations().highlight("a") is Highlight.VISIBLE
 
 
-def test_the_recording_is_one_file_that_moves(folder: Path, tmp_path: Path) -> None:
+def test_the_recording_is_one_animated_file(folder: Path, tmp_path: Path) -> None:
     source = (folder / "recording.html").read_text(encoding="utf-8")
     assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)\s*=", source)
     assert len(source) < 4_000_000
@@ -195,7 +198,7 @@ def test_frames_lift_carry_and_settle(task: ExplorationTask) -> None:
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.1
 
 
-def test_a_move_that_was_not_carried_out_has_no_frames(task: ExplorationTask) -> None:
+def test_a_move_that_was_not_executed_has_no_frames(task: ExplorationTask) -> None:
     step = replace(task.transitions[0], outcome=Outcome(MoveResult.NO_FREE_PLACEMENT, SCENE))
     assert {frame.poses["cracker_box_2"] for frame in episode_frames(SCENE, [step])} == {
         SCENE["cracker_box_2"].X_TO
@@ -212,7 +215,7 @@ def test_a_page_without_moves(detector: LabelDetector, tmp_path: Path) -> None:
     assert "No move was made." in text
 
 
-def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
+def test_pick_probabilities_are_shown(task: ExplorationTask, tmp_path: Path) -> None:
     (step,) = task.transitions
     other = next(name for name in task.detected if name != step.move.pick)
     decision = Decision(step.move, {other: 0.6, step.move.pick: 0.4}, (other, step.move.pick))
@@ -232,7 +235,7 @@ def test_what_the_agent_believed_is_shown(task: ExplorationTask, tmp_path: Path)
     assert f"Known objects{display_name(other)}, {display_name(step.move.pick)}." in text
 
 
-def test_what_was_recognised_is_shown(task: ExplorationTask, tmp_path: Path) -> None:
+def test_detections_are_shown(task: ExplorationTask, tmp_path: Path) -> None:
     (step,) = task.transitions
     seen = task.initial_perception.observation
     shown = replace(step, decision=Decision(step.move, observation=seen))
@@ -265,14 +268,14 @@ def test_contact_sheet(tmp_path: Path, count: int, columns: int, rows: int) -> N
 
 
 @pytest.mark.parametrize("count", [0, MAX_THUMBNAILS + 1])
-def test_a_contact_sheet_holds_at_least_one_and_not_too_many(tmp_path: Path, count: int) -> None:
+def test_a_contact_sheet_has_1_to_48_thumbnails(tmp_path: Path, count: int) -> None:
     with pytest.raises(ValueError, match="allowed are 1 to 48"):
         write_contact_sheet(
             tmp_path / "sheet.png", [(np.zeros((4, 4, 3), np.uint8), "", True)] * count
         )
 
 
-def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> None:
+def test_the_drawing_of_a_diagram_has_all_its_connections(tmp_path: Path) -> None:
     builder = DiagramBuilder()
     there, back = (
         builder.AddNamedSystem("there", PassThrough(1)),
@@ -291,6 +294,6 @@ def test_the_picture_of_a_diagram_has_all_its_connections(tmp_path: Path) -> Non
     assert {"there", "back", "PassThrough", "ZeroOrderHold", "y → u"} <= set(words)
 
 
-def test_humanised() -> None:
+def test_display_name() -> None:
     assert display_name("sugar_box_3") == "Sugar box 3"
-    assert display_name("hidden_at_start") == "Hidden at start"
+    assert display_name("initially_hidden") == "Initially hidden"

@@ -1,4 +1,4 @@
-"""Every kind of misuse is one short line: the file, the field, the value and what is allowed."""
+"""Validation errors are one short line: the file, the field, the value and what is allowed."""
 
 import importlib
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 
 class Cup(StrictModel):
-    """One member of a union."""
+    """First member of a union."""
 
     kind: Literal["cup"] = "cup"
     radius: Positive = 0.01
@@ -46,14 +46,14 @@ class Cup(StrictModel):
 
 
 class Jaws(StrictModel):
-    """The other one."""
+    """Second member of the union."""
 
     kind: Literal["jaws"] = "jaws"
     width: Annotated[float, InRange(0.01, 0.2)]
 
 
 class Lamp(StrictModel):
-    """An entry of a collection by names."""
+    """Entry of a collection by names."""
 
     pose: PoseSpec = PoseSpec()
     power: NonNegative = 1.0
@@ -61,7 +61,7 @@ class Lamp(StrictModel):
 
 @config_class
 class Room:
-    """A config of every kind of field."""
+    """Config with every kind of field."""
 
     tool: Annotated[Cup | Jaws, Field(discriminator="kind")] = Cup()
     lamps: dict[str, Lamp] = field(default_factory=lambda: {"main": Lamp()})
@@ -142,7 +142,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("text", "message"), REFUSED, ids=[text[:30] for text, _ in REFUSED])
-def test_a_misuse_is_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_an_error_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "room.yaml"
     path.write_text(text + "\n")
     with pytest.raises(InputError) as refused:
@@ -172,14 +172,14 @@ LONG = "x" * 5000
         [[LONG] * 100] * 100,
     ],
 )
-def test_a_long_value_is_cut(given: Any) -> None:
+def test_a_long_value_is_truncated(given: Any) -> None:
     with pytest.raises(InputError, match="room: ") as refused:
         override_config(Room(), given, "room")
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) <= 310
 
 
-def test_what_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"none\.yaml: cannot be read \(No such file.*allowed is a room"
     ):
@@ -206,7 +206,7 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
         ("door.left=1", "door: {'left': 1}; allowed is one of left, right"),
     ],
 )
-def test_a_broken_setting(setting: str, message: str) -> None:
+def test_an_invalid_setting(setting: str, message: str) -> None:
     with pytest.raises(InputError) as refused:
         load_config_as(Room(), settings=[setting])
     assert message in str(refused.value)
@@ -221,24 +221,24 @@ def test_settings_change_one_field_each() -> None:
         "tool.radius=2E-2",
         "name=1e",
     ]
-    made = load_config_as(two, settings=settings)
+    config = load_config_as(two, settings=settings)
     pose = PoseSpec(rpy_deg=(0.0, 0.0, 90.0))
-    assert made.lamps == {"main": Lamp(power=2.0), "side": Lamp(power=0.001, pose=pose)}
-    assert (made.steps, made.tool, made.name) == ((1.0, 5.0), Cup(radius=0.02), "1e")
+    assert config.lamps == {"main": Lamp(power=2.0), "side": Lamp(power=0.001, pose=pose)}
+    assert (config.steps, config.tool, config.name) == ((1.0, 5.0), Cup(radius=0.02), "1e")
 
 
-def test_a_collection_is_replaced_and_its_entries_keep_what_is_not_given() -> None:
+def test_entries_of_a_replaced_collection_keep_fields_that_are_not_given() -> None:
     two = Room(lamps={"main": Lamp(power=2.0), "side": Lamp(power=3.0)})
     given = {"lamps": {"new": {"power": 4.0}, "side": {"pose": {"translation": [1, 2, 3]}}}}
-    made = override_config(two, given, "room")
+    config = override_config(two, given, "room")
     pose = PoseSpec(translation=(1.0, 2.0, 3.0))
-    assert list(made.lamps.items()) == [
+    assert list(config.lamps.items()) == [
         ("new", Lamp(power=4.0)),
         ("side", Lamp(power=3.0, pose=pose)),
     ]
 
 
-def test_another_kind_is_not_merged_with_the_one_before() -> None:
+def test_another_kind_is_not_merged_with_the_previous_one() -> None:
     assert override_config(Room(), {"tool": {"kind": "jaws", "width": 0.1}}, "room").tool == Jaws(
         width=0.1
     )
@@ -248,7 +248,7 @@ def test_another_kind_is_not_merged_with_the_one_before() -> None:
 
 
 @pytest.mark.parametrize("name", ["ur5e", "iiwa14"])
-def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path) -> None:
+def test_another_robot_keeps_no_field_of_the_previous_one(name: str, tmp_path: Path) -> None:
     path = resource_path(f"models/cells/{name}_epick_tray.yaml")
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml({"cell": read_yaml(path, "a cell")}))
@@ -259,7 +259,7 @@ def test_another_robot_keeps_nothing_of_the_one_before(name: str, tmp_path: Path
     assert changed == config.cell.robot.model_copy(update={"model": other})
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_a_written_config_is_read_back(tmp_path: Path) -> None:
     room = Room(
         lamps={"side": Lamp(power=1e-5)}, name="1e-5", tool=Jaws(width=0.1), steps=(1e22, 1e-5)
     )
@@ -285,7 +285,7 @@ def test_merge_keys_may_override() -> None:
 
 
 def schemas() -> list[Any]:
-    """Every model and config class of the package."""
+    """Return every model and config class of the package."""
     root = Path(drake_clutter.__file__).parent
     files = [path.relative_to(root.parent).with_suffix("") for path in root.rglob("*.py")]
     names = [
@@ -300,24 +300,27 @@ def schemas() -> list[Any]:
     return sorted((c for c in classes if "__pydantic_core_schema__" in vars(c)), key=str)
 
 
-def converting(node: Any) -> Iterator[Any]:
-    """The parts of a core schema that take a value of another type, or that name no field in an error."""
+def find_converting_nodes(node: Any) -> Iterator[Any]:
+    """Yield the parts of a core schema that convert values, or whose errors name no field."""
     if isinstance(node, dict):
         if node.get("type") in ("bool", "int", "float", "union") and not node.get("strict"):
             yield node
         for value in node.values():
-            yield from converting(value)
+            yield from find_converting_nodes(value)
     elif isinstance(node, list | tuple):
         for value in node:
-            yield from converting(value)
+            yield from find_converting_nodes(value)
 
 
 def test_no_schema_converts() -> None:
-    """A plain `int`, `float` or `bool` would take "3", true or 1: use `Between`, `Whole` and `Flag`."""
+    """A plain `int`, `float` or `bool` would accept "3", true or 1.
+
+    `InRange`, `Integer` and `Flag` do not.
+    """
     found = [
         (c.__name__, node)
         for c in schemas()
-        for node in converting(vars(c)["__pydantic_core_schema__"])
+        for node in find_converting_nodes(vars(c)["__pydantic_core_schema__"])
     ]
     assert not found
 
