@@ -96,8 +96,9 @@ FidelityOption = Annotated[
     Fidelity,
     typer.Option(
         help="How moves are executed. arm: the simulated arm carries the object. settle: the "
-        "object is teleported, then Drake simulates the scene until it is at rest. fast: the "
-        "object is teleported and static equilibrium decides, or Drake where that is inconclusive."
+        "object is teleported, then Drake simulates the scene until it is at rest. "
+        "static_or_drake: the object is teleported, then static equilibrium decides, or Drake "
+        "where that is inconclusive."
     ),
 ]
 NodesOption = Annotated[
