@@ -118,6 +118,7 @@ def evaluate(
         box=SIMPLE,
         padding=(0, 1, 0, 0),
         caption=EVALUATION_CAPTION,
+        caption_justify="left",
     )
     for cells in table_rows:
         table.add_row(*cells.values())

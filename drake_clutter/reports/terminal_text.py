@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 EVALUATION_CAPTION = (
-    "moves: allowed per episode; all found: fraction of episodes; found: hidden objects found per "
-    "episode; of hidden: fraction of all hidden objects; collapsed: fraction of episodes; moves "
-    "used: mean of the episodes in which all objects were found"
+    "moves: allowed per episode; all found: fraction of episodes (95 % CI); found: hidden objects "
+    "found per episode; of hidden: fraction of all hidden objects; collapsed: fraction of "
+    "episodes; moves used: mean of the episodes in which all objects were found"
 )
 """Meaning of the columns of `evaluation_table_rows`."""
 
@@ -14,7 +14,7 @@ EVALUATION_CAPTION = (
 def evaluation_table_rows(
     row: Mapping[str, Any], move_limits: Sequence[int]
 ) -> list[dict[str, str]]:
-    """Return an agent's row of `summarise_episodes` as one table row per move limit.
+    """Return an agent's row of `summarize_episodes` as one table row per move limit.
 
     Args:
         row: Statistics of an agent.
@@ -29,7 +29,7 @@ def evaluation_table_rows(
         low, high = statistics["success_ci95"]
         cells = {
             "moves": str(limit),
-            "all found (95 % CI)": f"{statistics['success']:.2f} ({low:.2f}-{high:.2f})",
+            "all found": f"{statistics['success']:.2f} ({low:.2f}-{high:.2f})",
             "found": f"{statistics['found']:.2f}",
             "of hidden": f"{statistics['found_of_hidden']:.2f}",
             "collapsed": f"{statistics['collapsed']:.2f}",
