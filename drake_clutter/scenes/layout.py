@@ -215,10 +215,8 @@ def lay_out(
     height = max(float(stack.upper[2]) for stack in stacks)
     if height > config.layout.max_stack_height:
         return LayoutFailure(LayoutFailureReason.TOO_HIGH, height, config.layout.max_stack_height)
-    lower, upper = (
-        np.array([stack.lower[:2] for stack in stacks]),
-        np.array([stack.upper[:2] for stack in stacks]),
-    )
+    lower = np.array([stack.lower[:2] for stack in stacks])
+    upper = np.array([stack.upper[:2] for stack in stacks])
     centers = _sample_positions((upper - lower) / 2, config.cell.support, config.layout, rng)
     if centers is None:
         return LayoutFailure(

@@ -291,12 +291,12 @@ def find_free_placements(
 ) -> FreePlacements | None:
     """Return the equally good placements for a move, or None if no placement is known to be free.
 
-            # A tilted camera may see the space below the topmost level, but not the level.
-    fits. A placement is free where the camera sees through the space that the object will occupy,
-    with its clearance. Shadows and the space where the picked object still stands are not free.
-    On the support, the placements farthest from the center are returned: there the object occludes
-    least and leaves the most room. On an object, the placements nearest to the center of the
-    visible part of its top are returned; the center of mass is over that top.
+    The object keeps its orientation, or is rotated by a quarter turn about the vertical if only
+    that fits. A placement is free where the camera sees through the space that the object will
+    occupy, with its clearance. Shadows and the space where the picked object still stands are not
+    free. On the support, the placements farthest from the center are returned: there the object
+    occludes least and leaves the most room. On an object, the placements nearest to the center of
+    the visible part of its top are returned; the center of mass is over that top.
 
     Args:
         observation: What the camera sees before the pick.

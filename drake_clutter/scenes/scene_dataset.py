@@ -160,13 +160,12 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        entries, digest = document.pop("scenes"), document.pop("sha256")
+        entries = document.pop("scenes")
+        digest = document.pop("sha256")
         was_changed = _digest(document, entries) != digest
-        version, names, objects = (
-            document.pop("version"),
-            document.pop("rules"),
-            document["objects"],
-        )
+        version = document.pop("version")
+        names = document.pop("rules")
+        objects = document["objects"]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:

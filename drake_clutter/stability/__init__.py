@@ -1,0 +1,1 @@
+"""Static stability of scenes and visibility of their objects, without simulation."""

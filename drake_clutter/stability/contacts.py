@@ -1,23 +1,37 @@
-"""Who stands on whom: level contacts between convex objects, as polygons."""
+"""Level contacts between convex objects, as polygons."""
 
 import numpy as np
 from numba import njit
 
 MAX_CONTACT_GAP = 0.002
-"""m; surfaces whose heights differ by less touch each other."""
+"""Faces whose heights differ by less than this are in contact [m]."""
 MAX_OVERLAP = 0.0015
-"""m; objects that overlap further, in height and seen from above, interpenetrate."""
+"""Objects that overlap by more than this, in height and seen from above, interpenetrate [m]."""
 MAX_MISS_DISTANCE = 0.060
-"""m; an object that begins at the height where another one ends, and no further beside it, was put on it and misses it. The gap
-of a standing pair is smaller."""
-# What `find_contacts` says of objects.
+"""Largest horizontal distance at which an object counts as placed beside its support [m].
+
+Such an object begins at the height at which another one ends and misses it. The distance exceeds
+the gap of a standing pair (50 mm).
+"""
+# Faults that `find_contacts` returns.
 NO_FAULT, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
 GROUND = -1
+"""Index of the support's floor in pairs of objects."""
 
 
 @njit(cache=True)
 def _clip(polygon, count, x, y, nx, ny, margin):  # type: ignore[no-untyped-def]
-    """Keeps what lies within `margin` of the line through (x, y) on the side that (nx, ny) points away from; in place."""
+    """Clip a polygon to a half-plane in place, and return its number of corners.
+
+    Args:
+        polygon: Corners, of which the first `count` are used [m]. Shape (V, 2).
+        count: Number of corners.
+        x: Point on the line [m].
+        y: Point on the line [m].
+        nx: Outward unit normal of the line.
+        ny: Outward unit normal of the line.
+        margin: Distance by which the half-plane extends beyond the line [m].
+    """
     kept = np.empty_like(polygon)
     num_kept = 0
     for k in range(count):
@@ -41,7 +55,11 @@ def _clip(polygon, count, x, y, nx, ny, margin):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignore[no-untyped-def]
-    """Clips a polygon to another one that is moved by (dx, dy) and shrunk by the margin; a segment counts as thin."""
+    """Clip a polygon in place to another one, and return its number of corners.
+
+    The other polygon is translated by (dx, dy) and shrunk by the margin [m]. A segment of two
+    points counts as a polygon without width.
+    """
     if other_count == 2:
         ex, ey = other[1, 0] - other[0, 0], other[1, 1] - other[0, 1]
         length = np.hypot(ex, ey)
@@ -64,10 +82,22 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
 
 @njit(cache=True)
 def contact_polygon(records, lower_shape, upper_shape, lower_p, upper_p, margin):  # type: ignore[no-untyped-def]
-    """Corners (V, 2) m in T where an object stands on another one (shape -1: on the tray), shrunk by the margin (m)."""
+    """Return the corners of the contact below an object in T, shrunk by a margin.
+
+    Args:
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        lower_shape: Row of the lower object's shape; -1 for the support's floor.
+        upper_shape: Row of the upper object's shape.
+        lower_p: Origin of the lower object in T [m]. Shape (3,).
+        upper_p: Origin of the upper object in T [m]. Shape (3,).
+        margin: Width by which the contact is shrunk [m].
+
+    Returns:
+        Corners [m]. Shape (V, 2), V may be 0.
+    """
     polygon = np.empty((48, 2))
     bottom, corners = records[upper_shape].bottom, records[upper_shape].bottom_count
-    # Larger than the bottom, so that a negative margin makes it grow.
+    # Start with a square larger than the bottom, so that a negative margin can extend the contact.
     reach = 0.1
     for k in range(corners):
         reach = max(reach, 0.1 + abs(bottom[k, 0]), 0.1 + abs(bottom[k, 1]))
@@ -87,9 +117,10 @@ def contact_polygon(records, lower_shape, upper_shape, lower_p, upper_p, margin)
 
 @njit(cache=True)
 def _overlap(records, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-def]
-    """How deep two outlines overlap seen from above, m (separating axes); not positive: they do not.
+    """Return how deep two footprints overlap seen from above [m], by separating axes.
 
-    With `measure_gap`, a negative value says how far apart they are at least.
+    The result is not positive if they do not overlap. With `measure_gap`, a negative result is a
+    lower bound of their distance.
     """
     gap = (
         np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1])
@@ -101,7 +132,8 @@ def _overlap(records, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-d
     least = np.inf
     for a, b, p_a, p_b in ((i, j, p_i, p_j), (j, i, p_j, p_i)):
         dx, dy = p_b[0] - p_a[0], p_b[1] - p_a[1]
-        sides, corners = records[a].sides, records[b].footprint
+        sides = records[a].sides
+        corners = records[b].footprint
         for k in range(records[a].footprint_count):
             nx, ny, out = sides[k, 0], sides[k, 1], sides[k, 2]
             nearest = np.inf
@@ -115,11 +147,23 @@ def _overlap(records, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
-    """Corners (V, 2) m in T of what an object's top has beside another object that covers some of it, and the margin (m)."""
+    """Return the corners of those parts of an object's top that another object does not cover.
+
+    Args:
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shape: Row of the lower object's shape.
+        above: Row of the upper object's shape.
+        p_T: Origin of the lower object in T [m]. Shape (3,).
+        above_p: Origin of the upper object in T [m]. Shape (3,).
+        margin: Distance to keep from the upper object [m].
+
+    Returns:
+        Corners in T [m]. Shape (V, 2).
+    """
     top, count = records[shape].top, records[shape].top_count
     outline, outline_count = records[above].footprint, records[above].footprint_count
     found = np.empty((0, 2))
-    for k in range(outline_count):  # the part of the top beyond each side of the outline
+    for k in range(outline_count):  # add the part of the top beyond each side of the outline
         after = (k + 1) % outline_count
         ex, ey = outline[after, 0] - outline[k, 0], outline[after, 1] - outline[k, 1]
         length = np.hypot(ex, ey)
@@ -140,7 +184,18 @@ def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[
 
 @njit(cache=True)
 def connected_objects(records, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
-    """(n,) whether each object may touch that of a row, directly or through others: axis-aligned boxes within the margin (m)."""
+    """Return which objects may touch an object, directly or through others.
+
+    Args:
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        row: Index of the object.
+        margin: Largest gap between the axis-aligned boxes of touching objects [m].
+
+    Returns:
+        One bool for each object. Shape (n,).
+    """
     n = len(shapes)
     lower, upper = np.empty((n, 3)), np.empty((n, 3))
     for i in range(n):
@@ -164,23 +219,25 @@ def connected_objects(records, shapes, p_T, row, margin):  # type: ignore[no-unt
 
 @njit(cache=True)
 def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-def]
-    """Who stands on whom.
+    """Find which object stands on which.
 
     Args:
-        records: (N,) of `shapes.POSED`.
-        shapes: (n,) the objects' rows.
-        p_T: (n, 3) m.
-        half_size: (2,) m, of the floor.
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        half_size: Half extents of the support's floor [m]. Shape (2,).
 
     Returns:
-        What is wrong (`SOUND` if nothing is), with which object, the pairs (c, 2) of lower (`GROUND`: the tray) and upper
-        object, and (n,) the number of the stack that each object belongs to.
+        The first fault (`NO_FAULT` if there is none), the index of the object with the fault, the
+        lower (or `GROUND`) and upper object of each contact, shape (c, 2), and the number of each
+        object's stack, shape (n,).
     """
     n = len(shapes)
     pairs = np.empty((n * (n + 1), 2), np.int64)
     count = 0
     stack = np.arange(n)
-    fault, faulty = NO_FAULT, 0
+    fault = NO_FAULT
+    faulty = 0
     for j in range(n):
         shape = shapes[j]
         if records[shape].fault != 0:
@@ -205,7 +262,9 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
             pairs[count, 0], pairs[count, 1] = GROUND, j
             count += 1
             supported = True
-        beside, above = False, False  # or above something that ends where this begins
+        # Whether another object ends at the height of this one's bottom, near it or below it.
+        beside = False
+        above = False
         for i in range(n):
             if i == j:
                 continue
@@ -226,10 +285,9 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
             above |= overlap > 0
             if overlap <= 0:
                 continue
-            whole = (
-                records[upper].flat and records[lower].flat
-            )  # what overlaps seen from above is in contact
-            if whole or len(contact_polygon(records, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
+            # Faces as large as the footprints are in contact where the footprints overlap.
+            both_flat = records[upper].flat and records[lower].flat
+            if both_flat or len(contact_polygon(records, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
                 supported = True

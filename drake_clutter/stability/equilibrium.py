@@ -1,8 +1,10 @@
-"""Quasi-static equilibrium of objects that stand on each other: do non-negative contact forces exist that hold them?
+"""Quasi-static equilibrium of stacked objects: do contact forces exist that hold them?
 
-All contacts are level. A force may act anywhere in a contact polygon, that is, at its corners. Equilibrium under vertical forces
-is a non-negative least-squares problem: three rows per object (force, two moments about its centre of mass) and a column per
-corner. With friction there are six rows, and four columns a corner.
+All contacts are level. A force may act anywhere in a contact polygon, that is, at its corners.
+Equilibrium under vertical forces is a non-negative least-squares problem with three rows for each
+object (force, two moments about its center of mass) and one column for each corner. With friction
+there are six rows for each object and four columns for each corner, the edges of a friction
+pyramid.
 """
 
 import numpy as np
@@ -12,34 +14,35 @@ from drake_clutter.stability.contacts import GROUND, contact_polygon
 from drake_clutter.stability.nnls import nnls
 
 _MOMENT_ARM = 0.05
-"""m, by which moments are divided, so that they count about as much as forces."""
+"""Length by which moments are divided, so that they weigh about as much as forces [m]."""
 _RESIDUAL_TOLERANCE = 1e-6
-"""Of the total weight: the residual that is taken for rounding."""
+"""Residual that counts as zero, as a fraction of the total weight."""
 NO_LOADS = np.empty((0, 4))
+"""The argument `loads` of `equilibrium_residuals` without loads."""
 
 
 @njit(cache=True)
 def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, friction, loads):  # type: ignore[no-untyped-def]
-    """How much of each object's weight and moment no contact forces can hold.
+    """Return how much of each object's weight and moment no contact forces can balance.
 
     Args:
-        records: (N,) of `shapes.POSED`.
-        shapes: (n,) the objects' rows.
-        p_T: (n, 3) m.
-        pairs: (c, 2) lower (`GROUND`: the tray) and upper object of each contact.
-        margins: (n,) m, by which the contacts below each object are shrunk.
-        com_offsets: (n, 2) m, by which the centres of mass are moved.
-        friction: 0, or the coefficient of the pyramids in which the forces lie.
-        loads: (l, 4) points x, y, z, m, at which anything may press straight down, and the object that is pressed; may be empty.
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
+        margins: Width by which the contacts below each object are shrunk [m]. Shape (n,).
+        com_offsets: Horizontal offsets of the centers of mass [m]. Shape (n, 2).
+        friction: Coefficient of friction; 0 for vertical forces only.
+        loads: Points x, y, z [m] at which anything may press straight down, and the index of the
+            object below. Shape (l, 4), l may be 0.
 
     Returns:
-        (n,) norms of what remains, divided by the total weight and, for moments, by 5 cm; all zero in equilibrium.
+        Norms of the residuals of force and moment, relative to the total weight, with moments
+        divided by 5 cm. All are zero in equilibrium. Shape (n,).
     """
     n = len(shapes)
-    points, ends = (
-        np.empty((48 * len(pairs) + len(loads), 3)),
-        np.empty((48 * len(pairs) + len(loads), 2), np.int64),
-    )
+    points = np.empty((48 * len(pairs) + len(loads), 3))
+    ends = np.empty((48 * len(pairs) + len(loads), 2), np.int64)
     count = 0
     for load in loads:
         points[count] = load[:3]
@@ -60,10 +63,8 @@ def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, fri
     for i in range(n):
         total += records[shapes[i]].mass
     rows, sides = (6, 4) if friction > 0 else (3, 1)
-    A, b = (
-        np.zeros((sides * count, rows * n)),
-        np.zeros(rows * n),
-    )  # a row of A is a column of the problem
+    A = np.zeros((sides * count, rows * n))  # transposed: a row is a column of the problem
+    b = np.zeros(rows * n)
     for i in range(n):
         b[rows * i] = records[shapes[i]].mass / total
     for k in range(count):
@@ -98,7 +99,10 @@ def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, fri
 
 @njit(cache=True)
 def _contains(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
-    """Whether a point lies in a convex polygon, moved by p, by at least the margin."""
+    """Return whether a point is in a convex polygon, at least a margin from its sides.
+
+    The polygon is translated by p.
+    """
     for k in range(count):
         after = (k + 1) % count
         ex, ey = corners[after, 0] - corners[k, 0], corners[after, 1] - corners[k, 1]
@@ -110,9 +114,10 @@ def _contains(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
-    """Whether a stack stands in which no object has more than one contact below: then loads simply add up from the top.
+    """Return whether a stack stands in which each object has one contact below.
 
-    False also if there is such an object, or a cylinder that carries: then it takes a solver to know.
+    Then the loads add up from the top. The result is also False if an object has several contacts
+    below, or lies on a cylinder; these cases need the solver.
     """
     n = len(shapes)
     below = np.full(n, -2)
@@ -144,43 +149,49 @@ def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-un
 
 @njit(cache=True)
 def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
-    """The object of a stack that is furthest from equilibrium, and whether it rolls; -1 if the stack stands.
+    """Return the object farthest from equilibrium, or -1, and whether it rolls.
 
-    Vertical forces come first; what they cannot hold, forces with friction may, as in an arch of two boxes that lean on what
-    bridges them. All contacts are shrunk by the margin (m). The line along which a cylinder carries has no width to shrink:
-    instead, what lies on one must also be held with its centre of mass moved by the margin to either side of the line.
+    Vertical forces are tried first, then forces with friction, which hold for example an arch of
+    two boxes that lean on a bridge. Contacts are shrunk by the margin. The line on which a cylinder
+    carries has no width to shrink; instead, the object on it must also balance with its center of
+    mass moved by the margin to either side of the line.
+
+    Args:
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
+        margin: Width by which contacts are shrunk [m].
+        friction: Coefficient of friction.
     """
     if _is_stable_tower(records, shapes, p_T, pairs, margin):
         return -1, False
     n = len(shapes)
-    margins, com_offsets = np.full(n, margin), np.zeros((n, 2))
+    margins = np.full(n, margin)
+    com_offsets = np.zeros((n, 2))
     residual = equilibrium_residuals(
         records, shapes, p_T, pairs, margins, com_offsets, 0.0, NO_LOADS
     )
     needed_friction = 0.0
     if residual.max() > 0:
         needed_friction = friction
-        if (
-            equilibrium_residuals(
-                records, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
-            ).max()
-            > 0
-        ):
-            return np.nonzero(residual > residual.max() - 1e-9)[0][
-                0
-            ], False  # of twins the first, whatever rounding says
+        with_friction = equilibrium_residuals(
+            records, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
+        )
+        if with_friction.max() > 0:
+            # The tolerance makes the first of identical objects the result, despite rounding.
+            largest = np.nonzero(residual > residual.max() - 1e-9)[0]
+            return largest[0], False
     for lower, upper in pairs:
         if lower >= 0 and records[shapes[lower]].rolls:
             line = records[shapes[lower]].top[1] - records[shapes[lower]].top[0]
             for sign in (-1.0, 1.0):
                 com_offsets[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
                 com_offsets[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
-                if (
-                    equilibrium_residuals(
-                        records, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
-                    ).max()
-                    > 0
-                ):
+                residual = equilibrium_residuals(
+                    records, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
+                )
+                if residual.max() > 0:
                     return upper, True
             com_offsets[upper] = 0.0
     return -1, False
@@ -188,31 +199,33 @@ def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type:
 
 @njit(cache=True)
 def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
-    """The same description for objects that stand alike, wherever on the tray.
+    """Return a description of stacks that does not depend on their position on the support.
 
     Args:
-        shapes: (n,) the objects' rows.
-        p_T: (n, 3) m.
-        stack: (n,) number of the stack that each belongs to; those of none, -1, are left out.
-        grid: m; places are rounded to it.
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        stack: Number of each object's stack; objects of stack -1 are left out. Shape (n,).
+        grid: Positions are rounded to multiples of this [m].
 
     Returns:
-        order (m,): the objects by stack, then by height, shape, x and y; first (k + 1,): where a stack begins in it, and the end;
-        and (m, 4) int64, in that order: shape, and place beside the stack's first object, in grids.
+        The m objects by stack, then by height, shape, x and y, shape (m,); the index at which each
+        of the k stacks begins in that order, and the end, shape (k + 1,); and, in the same order,
+        shape, x, y relative to the stack's first object and z, the positions in multiples of the
+        grid, shape (m, 4).
     """
     n = len(shapes)
-    order, count = np.empty(n, np.int64), 0
+    order = np.empty(n, np.int64)
+    count = 0
     key = np.empty((n, 5), np.int64)
     for i in range(n):
         if stack[i] < 0:
             continue
-        key[i, 0], key[i, 2] = stack[i], shapes[i]
-        key[i, 1], key[i, 3], key[i, 4] = (
-            np.rint(p_T[i, 2] / grid),
-            np.rint(p_T[i, 0] / grid),
-            np.rint(p_T[i, 1] / grid),
-        )
-        at = count
+        key[i, 0] = stack[i]
+        key[i, 1] = np.rint(p_T[i, 2] / grid)
+        key[i, 2] = shapes[i]
+        key[i, 3] = np.rint(p_T[i, 0] / grid)
+        key[i, 4] = np.rint(p_T[i, 1] / grid)
+        at = count  # insertion sort
         while at > 0:
             before = order[at - 1]
             column = 0
@@ -224,25 +237,41 @@ def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
             at -= 1
         order[at] = i
         count += 1
-    description, first, stacks = np.empty((count, 4), np.int64), np.empty(count + 1, np.int64), 0
+    description = np.empty((count, 4), np.int64)
+    first = np.empty(count + 1, np.int64)
+    stacks = 0
     for k in range(count):
         i = order[k]
         if k == 0 or stack[i] != stack[order[k - 1]]:
             first[stacks] = k
             stacks += 1
         base = order[first[stacks - 1]]
-        description[k, 0], description[k, 3] = shapes[i], key[i, 1]
-        description[k, 1], description[k, 2] = key[i, 3] - key[base, 3], key[i, 4] - key[base, 4]
+        description[k, 0] = shapes[i]
+        description[k, 1] = key[i, 3] - key[base, 3]
+        description[k, 2] = key[i, 4] - key[base, 4]
+        description[k, 3] = key[i, 1]
     first[stacks] = count
     return order[:count], first[: stacks + 1], description
 
 
 @njit(cache=True)
 def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, margin, friction):  # type: ignore[no-untyped-def]
-    """See `weakest`, for the chosen (k,) of several stacks: the rows of stack i are order[first[i]] up to order[first[i + 1]].
+    """Return the results of `least_stable_object` for several stacks.
+
+    Args:
+        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
+        order: Objects by stack, see `canonical_order`. Shape (m,).
+        first: Index in `order` at which each stack begins, and the end. Shape (s + 1,).
+        selected: Numbers of the stacks to solve. Shape (k,).
+        margin: Width by which contacts are shrunk [m].
+        friction: Coefficient of friction.
 
     Returns:
-        (k, 2) position in its stack of what is furthest from equilibrium, or -1, and whether it rolls.
+        Position in its stack of the object farthest from equilibrium, or -1, and whether it rolls.
+        Shape (k, 2).
     """
     found = np.empty((len(selected), 2), np.int64)
     for k in range(len(selected)):

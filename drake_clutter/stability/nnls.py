@@ -1,6 +1,7 @@
-"""Non-negative least squares for compiled loops (Lawson and Hanson, Solving Least Squares Problems, ch. 23).
+"""Non-negative least squares for functions compiled by numba.
 
-SciPy's solver cannot be called from them; tests hold this one against it.
+Algorithm NNLS of Lawson and Hanson, "Solving Least Squares Problems" (1974), chapter 23. SciPy's
+solver cannot be called from compiled functions; the tests compare the two.
 """
 
 import numpy as np
@@ -17,7 +18,11 @@ def _dot(a, b, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _factor_row(A, members, m, L):  # type: ignore[no-untyped-def]
-    """Writes row m of the Cholesky factor of the members' normal equations; False if that member depends on those before it."""
+    """Write row m of the Cholesky factor of the members' normal equations.
+
+    Returns:
+        False if the member depends linearly on those before it.
+    """
     newest = A[members[m]]
     for q in range(m):
         L[m, q] = (_dot(newest, A[members[q]], len(newest)) - _dot(L[m], L[q], q)) / L[q, q]
@@ -28,15 +33,15 @@ def _factor_row(A, members, m, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
-    """The x >= 0 that minimises |A^T x - b|, by active sets on the normal equations.
+    """Return the x >= 0 that minimizes |A^T x - b|, by active sets on the normal equations.
 
     Args:
-        A: (columns, rows), transposed, so that a column lies in one piece.
-        b: (rows,).
-        tolerance: slopes of the squared residual below this are taken for zero.
+        A: The transposed matrix, so that a column is contiguous. Shape (columns, rows).
+        b: Right-hand side. Shape (rows,).
+        tolerance: Slopes of the squared residual below this count as zero.
 
     Returns:
-        x (columns,) and the residual b - A^T x (rows,).
+        x, shape (columns,), and the residual b - A^T x, shape (rows,).
     """
     columns, rows = A.shape
     x, residual = np.zeros(columns), b.copy()

@@ -1,9 +1,9 @@
-"""Which object each of the camera's rays meets first, by compiled loops over the faces of convex objects.
+"""Casting a camera's rays at convex objects: depth images, masks and visible fractions.
 
-The rays go through the pixels' middles, as `Camera` has them. The rays that meet a face fill a convex
-polygon of the image, row by row, and along a face the inverse depth is linear in the pixel: so a ray
-costs one addition and one comparison. Nothing but the plane of the support's floor is seen beside the
-objects; walls are not cast. An object that reaches behind the camera is out of its sight.
+The rays go through the centers of the pixels. The rays that meet a face fill a convex polygon of
+the image, row by row, and on a face the inverse depth is linear in the pixel, so a ray costs one
+addition and one comparison. Besides the objects, only the plane of the support's floor is cast,
+not its walls. Objects that reach behind the camera are ignored.
 """
 
 import math
@@ -20,13 +20,22 @@ from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shape_table import Floats, Ints, ShapeTable
 
 _MAX_OCCLUDERS = 64
+"""Most objects of a scene for `occluder_sets`: one bit each."""
 
 
 @njit(cache=True, inline="always")
 def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
-    """A plane's inverse depth, 1/m: its slopes along rows and columns, and its value at pixel (0, 0).
+    """Return the coefficients of a plane's inverse depth as a linear function of the pixel.
 
-    The plane: its normal in T, and how far it is along that from the camera, m.
+    Args:
+        camera: `Pinhole` of the camera.
+        nx: Normal of the plane in T.
+        ny: Normal of the plane in T.
+        nz: Normal of the plane in T.
+        k: Distance of the plane from the camera along the normal [m].
+
+    Returns:
+        Slope along a row, slope along a column, and value at pixel (0, 0) [1/m].
     """
     nx, ny, nz = vector_to_camera(camera, nx, ny, nz)
     along, down = nx / camera.focal_length / k, ny / camera.focal_length / k
@@ -35,19 +44,27 @@ def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
-    """Casts all rays that may meet one object; where it is nearer than what is known, it is written down.
+    """Cast all rays that may meet an object, and record those that meet it first.
+
+    Args:
+        table: `ShapeArrays` of the shapes.
+        shape: Row of the object's shape.
+        p_TO: Origin of the object in T [m]. Shape (3,).
+        camera: `Pinhole` of the camera.
+        label: Value to write into `hit`.
+        nearest: Largest inverse depth so far [1/m]. Shape (height, width).
+        hit: Object of the largest inverse depth. Shape (height, width).
 
     Returns:
-        The number of rays that meet it, whatever is before it.
+        Number of rays that meet the object, whatever is in front of it.
     """
     height, width = hit.shape
     p_TC = camera.p_TC
     p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
-    begin, end = (
-        np.zeros(height, np.int64),
-        np.zeros(height, np.int64),
-    )  # columns of a face, row by row
+    # First column, and column after the last, of a face in each row.
+    begin = np.zeros(height, np.int64)
+    end = np.zeros(height, np.int64)
     rays = 0
     for face in range(table.records[shape].first_face, table.records[shape].last_face):
         first, last = table.first_corner[face], table.first_corner[face + 1]
@@ -59,7 +76,7 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
             + nz * (corner[2] + p_TO[2] - p_TC[2])
         )
         if k > -1e-9:
-            continue  # turned away from the camera
+            continue  # the face is turned away from the camera
         count = last - first
         if count > len(u):
             u, v = np.empty(count), np.empty(count)
@@ -73,18 +90,17 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
             )
             u[c], v[c] = project(camera, x + p_x, y + p_y, z + p_z)
             top, bottom = min(top, v[c]), max(bottom, v[c])
-        # Inverse depth: its slope along a row and down a column, and its value at pixel (0, 0).
         along, down, start = _inverse_depth(camera, nx, ny, nz, k)
-        first_row, last_row = max(0, math.ceil(top)), min(height - 1, math.floor(bottom))
+        first_row = max(0, math.ceil(top))
+        last_row = min(height - 1, math.floor(bottom))
         for c in range(count):
             d = c + 1 if c + 1 < count else 0
-            # Downwards, and so the same for both faces at an edge: no ray is counted twice or lost.
+            # The end points are ordered downwards, so that an edge rounds alike for both of its
+            # faces: no ray is counted twice or lost.
             leftmost = v[c] < v[d]
             a, b = (c, d) if leftmost else (d, c)
-            first_below, last_below = (
-                max(first_row, math.ceil(v[a])),
-                min(last_row + 1, math.ceil(v[b])),
-            )
+            first_below = max(first_row, math.ceil(v[a]))
+            last_below = min(last_row + 1, math.ceil(v[b]))
             if first_below >= last_below:
                 continue
             slope = (u[b] - u[a]) / (v[b] - v[a])
@@ -96,12 +112,11 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
             if last_column <= first_column:
                 continue
             rays += last_column - first_column
-            inverse, step = np.float32(start + down * row + along * first_column), np.float32(along)
-            # Both are always written, and counted from 0, so that the compiler can do several pixels at a time.
-            nearest_here, hit_here = (
-                nearest[row, first_column:last_column],
-                hit[row, first_column:last_column],
-            )
+            inverse = np.float32(start + down * row + along * first_column)
+            step = np.float32(along)
+            # Unconditional writes to slices that start at 0 let the compiler vectorize the loop.
+            nearest_here = nearest[row, first_column:last_column]
+            hit_here = hit[row, first_column:last_column]
             for k in range(last_column - first_column):
                 value = inverse + step * np.float32(k)
                 nearer = value > nearest_here[k]
@@ -112,9 +127,10 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
 
 @njit(cache=True)
 def _window(records, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
-    """First and last row, first and last column (ends excluded) of what holds an object's box.
+    """Return the window of the image that contains an object's bounding box.
 
-    All are 0 if nothing of it is in the image.
+    Returns:
+        First row, row end, first column, column end; all 0 if the object is not in the image.
     """
     height, width = image_shape
     p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
@@ -139,7 +155,7 @@ def _window(records, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
-    """Fills in the inverse depth of the floor that is seen at an angle, see `_inverse_depth`."""
+    """Write the inverse depth of the floor of a tilted camera, see `_inverse_depth`."""
     for row in range(nearest.shape[0]):
         inverse, step, here = np.float32(start + down * row), np.float32(along), nearest[row]
         for k in range(len(here)):
@@ -149,20 +165,21 @@ def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible):  # type: ignore[no-untyped-def]
-    """Finds what every ray that may meet an object meets first, and counts.
+    """Find the first object that each ray meets, and count rays.
 
     Args:
-        table: of the shapes.
-        shapes: (n,) rows of the table.
-        p_T: (n, 3) m.
-        camera: a `Pinhole`.
-        nearest: (height, width) float32, becomes the inverse depth of what is seen, 1/m, or 0.
-        hit: (height, width) int16, becomes the index of the object, -1 where no object is.
-        unoccluded: (n,) zeros; becomes the number of rays that meet the object if nothing is before it.
-        visible: (n,) zeros; becomes the number of rays that meet the object first.
+        table: `ShapeArrays` of the shapes.
+        shapes: Row of each object's shape. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        camera: `Pinhole` of the camera.
+        nearest: Output: inverse depth, 0 where nothing is seen [1/m]. Shape (height, width).
+        hit: Output: index of the object, -1 where there is none. Shape (height, width).
+        unoccluded: Output, zeros before: rays that meet the object if nothing is in front of it.
+            Shape (n,).
+        visible: Output, zeros before: rays that meet the object first. Shape (n,).
 
     Returns:
-        The rectangle that was written to, see `_window`.
+        The window of the image that was written, see `_window`.
     """
     windows = np.zeros((len(shapes), 4), np.int64)
     row_begin, row_end, column_begin, column_end = hit.shape[0], 0, hit.shape[1], 0
@@ -185,13 +202,13 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
                 table, shapes[i], p_T[i], camera, np.int16(i), nearest, hit
             )
     for i in range(len(shapes)):
-        label, total = np.int16(i), 0
+        label = np.int16(i)
+        total = 0
         for row in range(windows[i, 0], windows[i, 1]):
-            in_row, here = np.int16(0), hit[row, windows[i, 2] : windows[i, 3]]
+            in_row = np.int16(0)  # 16 bits like the labels, so that the loop vectorizes well
+            here = hit[row, windows[i, 2] : windows[i, 3]]
             for k in range(len(here)):
-                in_row = np.int16(
-                    in_row + (here[k] == label)
-                )  # 16 bits wide: more pixels at a time
+                in_row = np.int16(in_row + (here[k] == label))
             total += int(in_row)
         visible[i] = total
     return min(row_begin, row_end), row_end, min(column_begin, column_end), column_end
@@ -199,7 +216,7 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
 
 @njit(cache=True)
 def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
-    """(rays,) for every ray that would meet the target, the objects before it, as bits."""
+    """Return the objects in front of a target as bits, for every ray that would meet it."""
     window = _window(table.records[shapes[target]], p_T[target], camera, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
@@ -229,10 +246,19 @@ def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type
 
 
 class RayCaster:
-    """Casts a camera's rays at scenes of convex objects."""
+    """Casts a camera's rays at scenes of convex objects.
+
+    Attributes:
+        camera: The camera.
+    """
 
     def __init__(self, camera: Camera, shapes: ShapeTable | None = None) -> None:
-        """Makes a caster; `shapes` may be shared with a judge."""
+        """Create a caster.
+
+        Args:
+            camera: The camera.
+            shapes: Table of shapes to share with a judge.
+        """
         self.camera = camera
         self._pinhole = camera.pinhole
         self._shapes = shapes or ShapeTable()
@@ -240,7 +266,11 @@ class RayCaster:
         self._hit = np.empty((camera.height, camera.width), np.int16)
 
     def _cast(self, shapes: Ints, p_T: Floats) -> tuple[list[float], tuple[slice, slice]]:
-        """Fills the buffers in a rectangle, which it returns after the visible share of each object."""
+        """Fill the buffers in a window of the image.
+
+        Returns:
+            Visible fraction of each object, and the window.
+        """
         if not len(shapes):
             return [], (slice(0, 0), slice(0, 0))
         unoccluded, visible = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
@@ -254,30 +284,46 @@ class RayCaster:
         return fractions, (slice(row, row_end), slice(column, column_end))
 
     def _mask(self, index: int, rectangle: tuple[slice, slice]) -> NDArray[np.bool_]:
-        """The pixels of the last cast that show an object."""
+        """Return the mask of an object in the last cast image."""
         mask = np.zeros(self._hit.shape, np.bool_)
         np.equal(self._hit[rectangle], index, out=mask[rectangle])
         return mask
 
     def visible_fractions_of_rows(self, shapes: Ints, p_T: Floats) -> list[float]:
-        """See `visible_shares`, of the table's shapes at p_T (n, 3) m, in their order."""
+        """Return the visible fractions of shapes, see `visible_fractions`.
+
+        Args:
+            shapes: Rows of the shapes in the table. Shape (n,).
+            p_T: Origins of the objects in T [m]. Shape (n, 3).
+        """
         return self._cast(shapes, p_T)[0]
 
     def visible_fractions(self, objects: Sequence[SceneObject]) -> dict[str, float]:
-        """Of the rays that would meet each object alone on the tray, the share that does, by name; out of the frame, 1.
+        """Return the visible fraction of each object, by name.
+
+        It is the fraction of the rays that would meet the object alone which also meet it in the
+        scene. Objects outside of the image have fraction 1.
 
         Args:
-            objects: convex ones.
+            objects: Convex objects.
         """
         fractions = self.visible_fractions_of_rows(*self._shapes.rows_and_positions(objects))
         return {o.name: share for o, share in zip(objects, fractions, strict=True)}
 
     def occluder_sets(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
-        """Of the rays that would meet the named object alone: how many meet which other objects before it.
+        """Return by which sets of objects an object is occluded, with numbers of rays.
+
+        Args:
+            scene: A scene of at most 64 objects.
+            name: Name of the occluded object.
+
+        Returns:
+            For each set of names, the number of the object's rays that meet exactly these before
+                it.
 
         Raises:
-            KeyError: no such object.
-            ValueError: the scene has more than 64 objects.
+            KeyError: No object has this name.
+            ValueError: The scene has more than 64 objects.
         """
         scene[name]
         if len(scene.objects) > _MAX_OCCLUDERS:
@@ -297,7 +343,10 @@ class RayCaster:
         return dict(zip(members, counts.tolist(), strict=True))
 
     def observe(self, scene: Scene) -> tuple[Observation, dict[str, float]]:
-        """What the camera shows of a scene, and the visible shares; as `LabelDetector` has it, but with the floor all around."""
+        """Return an observation of a scene, and the visible fractions by name.
+
+        It equals that of `LabelDetector`, except that the floor extends beyond the support.
+        """
         fractions, rectangle = self._cast(*self._shapes.rows_and_positions(scene.objects))
         depth = self.camera.floor_depth.copy()
         with np.errstate(divide="ignore"):

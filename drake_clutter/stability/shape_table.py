@@ -1,6 +1,7 @@
-"""What the fast judge knows of an object in an orientation: the faces that it stands on and carries with, and its surface.
+"""Flat tables of oriented object shapes for compiled functions.
 
-Everything lies in flat arrays, so that compiled loops need nothing but a row and a position per object.
+An oriented shape has the faces on which an object stands and carries, and its surface. Compiled
+functions need only a row of the table and a position for each object.
 """
 
 from collections.abc import Sequence
@@ -17,25 +18,36 @@ from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.scenes.scene import SceneObject
 
 Floats = NDArray[np.float64]
+"""An array of floats."""
 Ints = NDArray[np.int64]
+"""An array of integers."""
 
 MAX_LEVEL_ANGLE = np.radians(1.5)
-"""rad; a face or an axis that is further from level is taken to lean."""
+"""A face or axis farther from level than this leans [rad]."""
 RIM_CORNERS = 16
-"""Corners of a can's rim, as in Drake's contact mesh of it; and the most that any face that carries is given."""
+"""Corners of a can's rim, as in its contact mesh in Drake, and the most that a face can have."""
 STRIP_HALF_WIDTH = 0.006
-"""m, half the width of the strip on which a cylinder lies. Its centre of mass and its load are above the strip's middle, so the
-width holds no moment; but a cylinder that lies over the gap of a pair touches both its edges."""
+"""Half the width of the strip on which a lying cylinder rests [m].
+
+Its center of mass and its load are above the strip's center line, so the width supports no moment.
+It makes a cylinder over the gap of a pair touch both edges.
+"""
 _FOOTPRINT_CORNERS = 32
+"""Largest number of corners of a footprint."""
 _SURFACE_SIDES = 48
-"""Sides of a cylinder's surface, as in the mesh that Drake's camera sees."""
+"""Sides of a cylinder's surface, as in the mesh that Drake's camera renders."""
 _COPLANARITY_TOLERANCE = 1e-4
-"""By which normals (and offsets, in sizes of the object) of one face's triangles may differ: files round corners to 0.1 um."""
+"""Largest difference of the normals of triangles that form one face.
+
+Offsets of the planes are compared as a fraction of the object's size. Mesh files round corners to
+0.1 um.
+"""
 _MAX_ROWS = 8192
+"""Number of rows after which the table is emptied."""
 
 
 class Fault(IntEnum):
-    """Why an orientation cannot be judged by equilibrium; NONE if it can."""
+    """Why equilibrium cannot judge an orientation; NONE if it can."""
 
     NONE = 0
     LEANING = 1
@@ -43,13 +55,14 @@ class Fault(IntEnum):
 
 
 class _Surface(NamedTuple):
-    """A class's surface in O.
+    """Surface of a class in O.
 
     Attributes:
-        corner: (V, 3) m, of one convex face after the other, counter-clockwise seen from outside.
-        counts: (F,) corners of each face.
-        normal: (F, 3).
-        p_Ocm: (3,) m, its centre of mass.
+        corner: Corners of the convex faces, face by face, counter-clockwise seen from outside [m].
+            Shape (V, 3).
+        counts: Number of corners of each face. Shape (F,).
+        normal: Outward normals of the faces. Shape (F, 3).
+        p_Ocm: Center of mass [m]. Shape (3,).
     """
 
     corner: Floats
@@ -59,7 +72,7 @@ class _Surface(NamedTuple):
 
 
 def _hull_surface(corners: Floats) -> _Surface:
-    """Of a convex hull of uniform density; triangles of one plane are one face."""
+    """Return the surface of a convex hull of uniform density; coplanar triangles form one face."""
     hull = ConvexHull(corners)
     planes = hull.equations * [1.0, 1.0, 1.0, 1.0 / np.ptp(corners, axis=0).max()]
     member = np.full(len(planes), -1)
@@ -78,7 +91,7 @@ def _hull_surface(corners: Floats) -> _Surface:
         angle = np.arctan2(arms @ np.cross(normal, arms[0]), arms @ arms[0])
         faces.append(points[np.argsort(angle)])
         normals.append(normal)
-    # Tetrahedra from an inner point to every triangle.
+    # The center of mass is that of tetrahedra from an inner point to every triangle.
     inner = corners[hull.vertices].mean(axis=0)
     triangles = corners[hull.simplices] - inner
     volumes = np.abs(np.linalg.det(triangles))
@@ -103,7 +116,10 @@ def _surface(object_class: ObjectClass) -> _Surface:
 
 
 def _convex_outline(points: Floats, max_corners: int) -> Floats:
-    """(C, 2) corners of the points' hull seen from above, counter-clockwise; of too many, evenly chosen ones."""
+    """Return the corners of the convex hull of points seen from above, counter-clockwise [m].
+
+    If there are more than `max_corners`, evenly spaced ones are chosen. Shape (C, 2).
+    """
     corners = points[ConvexHull(points[:, :2]).vertices, :2]
     return (
         corners[np.arange(max_corners) * len(corners) // max_corners]
@@ -113,17 +129,20 @@ def _convex_outline(points: Floats, max_corners: int) -> Floats:
 
 
 class OrientedShape(NamedTuple):
-    """One object class in one orientation; lengths in m, axes those of T, origin the object's.
+    """One object class in one orientation, in the axes of T about the object's origin.
 
     Attributes:
-        fault: see `Fault`.
-        rolls: whether it is a cylinder that lies.
-        com: (3,) its centre of mass.
-        bottom, top: (C, 2) corners of the face that it stands on, and of the one that carries; none if there is no such face. A
-            cylinder that lies has a strip, see `STRIP`, and a line of two points.
-        bottom_z, top_z: heights of these faces' middles; where there is none, of the lowest and the highest point.
-        footprint: (C, 2) corners of its outline seen from above, counter-clockwise.
-        surface: its surface, with axes turned to those of T.
+        fault: Why the orientation cannot be judged.
+        rolls: Whether it is a lying cylinder.
+        com: Center of mass [m]. Shape (3,).
+        bottom: Corners of the face on which it stands [m]; none if there is no such face. A lying
+            cylinder has a strip, see `STRIP_HALF_WIDTH`. Shape (C, 2).
+        top: Corners of the face that can carry [m]; none if there is no such face. A lying cylinder
+            has a line of two points. Shape (C, 2).
+        bottom_z: Height of the bottom face's center, or of the lowest point [m].
+        top_z: Height of the top face's center, or of the highest point [m].
+        footprint: Corners of the outline seen from above, counter-clockwise [m]. Shape (C, 2).
+        surface: The surface, with axes rotated to those of T.
     """
 
     fault: Fault
@@ -138,19 +157,20 @@ class OrientedShape(NamedTuple):
 
 
 def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> OrientedShape:
-    """The class in an orientation, (4,) w, x, y, z."""
+    """Return a class in an orientation, given as a quaternion (w, x, y, z) of R_TO."""
     R_TO = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     surface = _surface(object_class)
-    corner, normal = surface.corner @ R_TO.T, surface.normal @ R_TO.T
+    corner = surface.corner @ R_TO.T
+    normal = surface.normal @ R_TO.T
     empty = np.empty((0, 3))
-    bottom, top, rolls = empty, empty, False
+    bottom = empty
+    top = empty
+    rolls = False
     if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(MAX_LEVEL_ANGLE):
         rolls = True
         up = np.array([0.0, 0.0, object_class.size[0] / 2])
-        axis, half_width = (
-            object_class.size[2] / 2 * R_TO[:, 2],
-            STRIP_HALF_WIDTH * np.cross([0.0, 0.0, 1.0], R_TO[:, 2]),
-        )
+        axis = object_class.size[2] / 2 * R_TO[:, 2]
+        half_width = STRIP_HALF_WIDTH * np.cross([0.0, 0.0, 1.0], R_TO[:, 2])
         top = np.array([axis, -axis]) + up
         bottom = (
             np.array([axis + half_width, half_width - axis, -axis - half_width, axis - half_width])
@@ -208,26 +228,28 @@ SHAPE_DTYPE = np.dtype(
         ("last_face", np.int64),
     ]
 )
-"""A records shape in a record: see `Posed`, and
+"""Record of an `OrientedShape`, with these further fields.
 
-    flat: whether bottom and top are as large as the footprint.
-    lower, upper: (3,) m, of the box along the axes that holds it.
-    mass: kg.
-    reach: m, radius of the circle about the object's origin that holds its footprint.
-    sides: outward normal of each side of the footprint, and m along it from the origin.
-    bottom_count, top_count, footprint_count: corners in use.
-    first_face, last_face: its faces in the table, the end excluded.
+flat: Whether bottom and top are as large as the footprint.
+lower, upper: Corners of the axis-aligned bounding box [m].
+mass: Mass [kg].
+footprint_radius: Radius of the circle about the origin that contains the footprint [m].
+sides: Outward normal of each side of the footprint, and its distance from the origin [m].
+bottom_count, top_count, footprint_count: Numbers of corners in use.
+first_face, last_face: Range of its faces in the table; the end is excluded.
 """
 
 
 class ShapeArrays(NamedTuple):
-    """Posed shapes in few arrays (each costs a compiled function a moment), with room for more.
+    """Oriented shapes in a few arrays with spare capacity.
+
+    Few arrays keep the overhead of calls to compiled functions small.
 
     Attributes:
-        records: (N,) of `POSED`.
-        first_corner: (F + 1,) a face's corners are first_corner[f] up to first_corner[f + 1].
-        normal: (F, 3).
-        corner: (V, 3) m.
+        records: The shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        first_corner: Index of each face's first corner, and the end. Shape (F + 1,).
+        normal: Outward normals of the faces. Shape (F, 3).
+        corner: Corners of the faces [m]. Shape (V, 3).
     """
 
     records: NDArray[np.void]
@@ -237,6 +259,7 @@ class ShapeArrays(NamedTuple):
 
 
 def _allocate(rows: int, faces: int, corners: int) -> ShapeArrays:
+    """Return empty arrays of the given capacities."""
     return ShapeArrays(
         np.zeros(rows, SHAPE_DTYPE),
         np.zeros(faces + 1, np.int64),
@@ -246,11 +269,11 @@ def _allocate(rows: int, faces: int, corners: int) -> ShapeArrays:
 
 
 class ShapeTable:
-    """A table of the records shapes that were asked for, each made once.
+    """A table of oriented shapes, each computed once.
 
     Attributes:
-        arrays: of all rows given out so far.
-        generation: grows whenever the table starts anew, after which earlier rows mean nothing.
+        arrays: The shapes of all rows so far.
+        generation: Number of times the table was emptied, which invalidates earlier rows.
     """
 
     def __init__(self) -> None:
@@ -262,7 +285,7 @@ class ShapeTable:
         self.arrays = _allocate(64, 512, 4096)
 
     def find_rows(self, objects: Sequence[SceneObject]) -> Ints:
-        """(n,) the table's row of each object."""
+        """Return the table's row of each object. Shape (n,)."""
         if len(self._row) > _MAX_ROWS:
             self._start()
             self.generation += 1
@@ -280,7 +303,7 @@ class ShapeTable:
             )
 
     def rows_and_positions(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
-        """The table's row of each object (n,), and p_TO (n, 3) m."""
+        """Return the table's row of each object (n,), and p_TO (n, 3) [m]."""
         return self.find_rows(objects), np.array([o.X_TO.translation for o in objects]).reshape(
             -1, 3
         )
@@ -290,10 +313,8 @@ class ShapeTable:
         row = len(self._row)
         face = int(self.arrays.records["last_face"].max())
         corner = self.arrays.first_corner[face]
-        last_face, last_corner = (
-            face + len(shape.surface.counts),
-            corner + len(shape.surface.corner),
-        )
+        last_face = face + len(shape.surface.counts)
+        last_corner = corner + len(shape.surface.corner)
         if (
             row >= len(self.arrays.records)
             or last_face >= len(self.arrays.normal)
@@ -307,33 +328,34 @@ class ShapeTable:
             )
             for array, earlier in zip(self.arrays, old, strict=True):
                 array[: len(earlier)] = earlier
-        table, records = self.arrays, self.arrays.records[row]
-        records["fault"], records["rolls"], records["com"] = shape.fault, shape.rolls, shape.com
-        records["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
-        records["lower"], records["upper"] = (
-            shape.surface.corner.min(axis=0),
-            shape.surface.corner.max(axis=0),
-        )
-        records["bottom_z"], records["top_z"], records["mass"] = (
-            shape.bottom_z,
-            shape.top_z,
-            scene_object.object_class.mass,
-        )
-        records["footprint_radius"] = np.linalg.norm(shape.footprint, axis=1).max()
+        table = self.arrays
+        record = table.records[row]
+        record["fault"] = shape.fault
+        record["rolls"] = shape.rolls
+        record["com"] = shape.com
+        record["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
+        record["lower"] = shape.surface.corner.min(axis=0)
+        record["upper"] = shape.surface.corner.max(axis=0)
+        record["bottom_z"] = shape.bottom_z
+        record["top_z"] = shape.top_z
+        record["mass"] = scene_object.object_class.mass
+        record["footprint_radius"] = np.linalg.norm(shape.footprint, axis=1).max()
         for name, corners in (
             ("bottom", shape.bottom),
             ("top", shape.top),
             ("footprint", shape.footprint),
         ):
-            records[name][: len(corners)], records[f"{name}_count"] = corners, len(corners)
+            record[name][: len(corners)] = corners
+            record[f"{name}_count"] = len(corners)
         along = np.roll(shape.footprint, -1, axis=0) - shape.footprint
         normal = (
             np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
         )
-        records["sides"][: len(normal)] = np.column_stack(
+        record["sides"][: len(normal)] = np.column_stack(
             [normal, (normal * shape.footprint).sum(axis=1)]
         )
-        records["first_face"], records["last_face"] = face, last_face
+        record["first_face"] = face
+        record["last_face"] = last_face
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal
         table.corner[corner:last_corner] = shape.surface.corner

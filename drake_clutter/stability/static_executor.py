@@ -1,4 +1,4 @@
-"""Moves by teleport, judged without simulating."""
+"""Pick-and-place moves by teleport, judged by static equilibrium."""
 
 import numpy as np
 
@@ -18,21 +18,27 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
 class StaticExecutor:
-    """Carries out a move at fidelity `fast` (a `MoveExecutor`).
+    """Executes moves by teleport and judges them statically (a `MoveExecutor`).
 
-    The picked object appears at its place, at rest on what is below. The scene collapses when an object loses its support as
-    the picked one is taken away, or when what it touches afterwards does not balance; where things fall is not followed, so the
-    scene after a collapse shows the picked object at its place and the others where they were. What the judge cannot judge
-    is a result of its own.
+    The picked object appears at its placement, at rest on what is below. The scene collapses when
+    an object loses its support as the picked one is removed, or when the contact group of the
+    placed object is not in equilibrium. Falls are not simulated: after a collapse, the scene shows
+    the picked object at its placement and the others unmoved. If the static model does not cover
+    the scene, the result is `MoveResult.INCONCLUSIVE`.
     """
 
     def __init__(self, config: ClutterConfig, judge: StaticStabilityJudge | None = None) -> None:
-        """Makes an executor; a judge that is shared remembers more stacks."""
+        """Create an executor.
+
+        Args:
+            config: The simulated world.
+            judge: A judge to share, with its cache of stacks.
+        """
         self._config = config
         self._judge = judge or StaticStabilityJudge(config)
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """See `MoveExecutor.execute`."""
+        """Return the outcome of a command; see `MoveExecutor.execute`."""
         (x, y, _) = sample_offsets(1, self._config.settle.jitter, rng)[0]
         resting = command.X_TO_place.translated((x, y, -self._config.exploration.release_height))
         moved = scene.with_poses({command.move.pick: resting})
@@ -44,10 +50,10 @@ class StaticExecutor:
     def _judge_move(
         self, before: Scene, after: Scene, move: Move
     ) -> Instability | InconclusiveVerdict | None:
-        """What does not stand when the picked object goes from one place to the other; None if everything does.
+        """Return the object that falls during a move, or None if none does.
 
-        As under Drake, what the move does not touch stays at rest. What rests before the move although the judge would let it
-        fall is beyond the judge.
+        As in Drake, objects that the move does not touch stay at rest. If a touched object rests
+        before the move although the static model lets it fall, the verdict is inconclusive.
         """
         for name in (move.pick,) if move.place == TRAY else (move.pick, move.place):
             found = self._judge.find_instability(self._judge.contact_group(before, name))

@@ -1,4 +1,4 @@
-"""The judge that training needs: verdicts from equilibrium and rays, without simulating."""
+"""A judge of scenes that solves static equilibrium and casts rays instead of simulating."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -21,19 +21,28 @@ from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.stability.shape_table import Floats, Ints, ShapeTable
 
 CONSERVATIVE_FRICTION = 0.3
-"""Coefficient of the friction that is relied on, of the 0.5 that there is: bodies at rest do not find every force that could
-hold them."""
+"""Coefficient of friction on which a stable scene may rely.
+
+It is below `SURFACE_FRICTION` (0.5) of the simulation: contact forces that could hold an object do
+not always arise.
+"""
 _ROUNDING_MARGIN = 5e-5
-"""m, added to the margin: stacks that differ from balance by just the offsets' reach are common, since sizes are round."""
+"""Addition to the contact margin [m].
+
+Sizes are round numbers, so stacks whose balance equals the reach of the random offsets are common.
+"""
 _TOUCHING_MARGIN = 0.003
-"""m; objects further apart do not touch."""
+"""Objects farther apart than this do not touch [m]."""
 _CACHE_RESOLUTION = 1e-6
-"""m; stacks whose objects stand alike to within this share their verdict."""
+"""Stacks whose objects have equal relative positions to within this share a result [m]."""
 _MARGIN_RANGE = (-0.030, 0.150)
+"""Range of the margins that `stability_margins` can return [m]."""
 _MARGIN_RESOLUTION = 1e-4
+"""Resolution of the margins that `stability_margins` returns [m]."""
 _MAX_CACHED_STACKS = 100_000
+"""Number of stacks after which the cache is emptied."""
 _KEY_BYTES_PER_OBJECT = 32
-"""Bytes of a row of `equilibrium.canonical_order`."""
+"""Bytes of a row of the description that `equilibrium.canonical_order` returns."""
 _INCONCLUSIVE_REASONS = {
     contacts.LEANING: InconclusiveReason.LEANING,
     contacts.NOT_CONVEX: InconclusiveReason.NOT_CONVEX,
@@ -46,7 +55,14 @@ _INCONCLUSIVE_REASONS = {
 
 
 class _ContactGraph(NamedTuple):
-    """See `contacts.find_contacts`."""
+    """Objects and their contacts, see `contacts.find_contacts`.
+
+    Attributes:
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        pairs: Lower and upper object of each contact. Shape (c, 2).
+        stack: Number of the stack of each object. Shape (n,).
+    """
 
     shapes: Ints
     p_T: Floats
@@ -55,11 +71,15 @@ class _ContactGraph(NamedTuple):
 
 
 class StaticStabilityJudge:
-    """Says whether a scene can stand, by quasi-static equilibrium, and what its camera sees (a `SceneJudge`).
+    """Judges scenes by quasi-static equilibrium and ray casting (a `SceneJudge`).
 
-    Objects must be convex, level and in contact as scenes are laid out or come to rest; of others it says that it cannot
-    judge. Contacts are shrunk by a margin: the most that the random offsets of two objects can take away. Verdicts are
-    remembered by stack, wherever it stands on the tray: after a change, only the stacks that changed are judged again.
+    Objects must be convex, level, and in contact as laid-out or settled scenes are; the verdict on
+    other scenes is inconclusive. Contact areas are shrunk by a margin, the most that the random
+    offsets of two objects can remove. Results are cached by stack, independent of its position on
+    the support, so that after a change only the changed stacks are solved again.
+
+    Attributes:
+        ray_caster: The caster for the camera, which shares the table of shapes.
     """
 
     def __init__(
@@ -68,77 +88,79 @@ class StaticStabilityJudge:
         margin: float | None = None,
         friction: float = CONSERVATIVE_FRICTION,
     ) -> None:
-        """Makes a judge.
+        """Create a judge.
 
         Args:
-            config: the world.
-            margin: m, by which contacts are shrunk; None: twice the radius of the random offsets, and rounding.
-            friction: coefficient that is relied on.
+            config: The simulated world.
+            margin: Width by which contacts are shrunk [m]; by default twice the radius of the
+                random offsets, plus rounding.
+            friction: Coefficient of friction on which a stable scene may rely.
         """
         self._config = config
-        self._margin, self._friction = (
-            2 * config.settle.jitter + _ROUNDING_MARGIN if margin is None else margin,
-            friction,
-        )
+        default_margin = 2 * config.settle.jitter + _ROUNDING_MARGIN
+        self._margin = default_margin if margin is None else margin
+        self._friction = friction
         self._shapes = ShapeTable()
         self.ray_caster = RayCaster(config.cell.camera, self._shapes)
-        self._cache: dict[bytes, tuple[int, int]] = {}  # see `_weakest`
+        self._cache: dict[bytes, tuple[int, int]] = {}
         self._generation = 0
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | InconclusiveVerdict:
-        """See `SceneJudge.judge`. The offsets move what the camera sees; what they do to balance, the margin stands for."""
+        """Return the verdict; see `SceneJudge.judge`.
+
+        The random offsets move what the camera sees. Their effect on the balance is covered by the
+        margin.
+        """
         shapes, p_T = self._arrays(scene.objects)
-        found = self._find_instability(scene, shapes, p_T)
-        if isinstance(found, InconclusiveVerdict):
-            return found
+        instability = self._find_instability(scene, shapes, p_T)
+        if isinstance(instability, InconclusiveVerdict):
+            return instability
         moved = p_T + sample_offsets(len(p_T), self._config.settle.jitter, rng)
         settled = {
             o.name: Pose((x, y, z), o.X_TO.quaternion)
             for o, (x, y, z) in zip(scene.objects, moved.tolist(), strict=True)
         }
-        if found is not None:
-            return Verdict(found, settled, {}, ())
-        shares = dict(
-            zip(settled, self.ray_caster.visible_fractions_of_rows(shapes, moved), strict=True)
-        )
-        below = self._config.cell.camera.visibility_threshold
-        return Verdict(
-            None, settled, shares, tuple(name for name, share in shares.items() if share < below)
-        )
+        if instability is not None:
+            return Verdict(instability, settled, {}, ())
+        visible = self.ray_caster.visible_fractions_of_rows(shapes, moved)
+        fractions = dict(zip(settled, visible, strict=True))
+        threshold = self._config.cell.camera.visibility_threshold
+        hidden = tuple(name for name, fraction in fractions.items() if fraction < threshold)
+        return Verdict(None, settled, fractions, hidden)
 
     def find_instability(self, scene: Scene) -> Instability | InconclusiveVerdict | None:
-        """What does not stand, or None if everything does."""
+        """Return the first object that does not stand, or None if all do."""
         return self._find_instability(scene, *self._arrays(scene.objects))
 
     def _find_instability(
         self, scene: Scene, shapes: Ints, p_T: Floats
     ) -> Instability | InconclusiveVerdict | None:
-        standing = self._contact_graph(scene, shapes, p_T)
-        if isinstance(standing, InconclusiveVerdict):
-            if standing.reason is InconclusiveReason.UNSUPPORTED:
-                return Instability(InstabilityReason.UNSUPPORTED, standing.object)
-            return standing
-        for weakest, rolls in self._least_stable_objects(standing, standing.stack):
-            if weakest >= 0:
+        graph = self._contact_graph(scene, shapes, p_T)
+        if isinstance(graph, InconclusiveVerdict):
+            if graph.reason is InconclusiveReason.UNSUPPORTED:
+                return Instability(InstabilityReason.UNSUPPORTED, graph.object)
+            return graph
+        for least_stable, rolls in self._least_stable_objects(graph, graph.stack):
+            if least_stable >= 0:
                 reason = InstabilityReason.ROLLS if rolls else InstabilityReason.UNBALANCED
-                return Instability(reason, scene.objects[weakest].name)
+                return Instability(reason, scene.objects[least_stable].name)
         return None
 
     def find_supports(self, scene: Scene) -> dict[str, frozenset[str]] | InconclusiveVerdict:
-        """What each object stands on, by name; `TRAY` for the tray."""
-        standing = self._contact_graph(scene, *self._arrays(scene.objects))
-        if isinstance(standing, InconclusiveVerdict):
-            return standing
-        found: dict[str, set[str]] = {name: set() for name in scene.names}
-        for lower, upper in standing.pairs.tolist():
-            found[scene.names[upper]].add(TRAY if lower < 0 else scene.names[lower])
-        return {name: frozenset(below) for name, below in found.items()}
+        """Return what each object stands on, by name; `TRAY` for the support."""
+        graph = self._contact_graph(scene, *self._arrays(scene.objects))
+        if isinstance(graph, InconclusiveVerdict):
+            return graph
+        supports: dict[str, set[str]] = {name: set() for name in scene.names}
+        for lower, upper in graph.pairs.tolist():
+            supports[scene.names[upper]].add(TRAY if lower < 0 else scene.names[lower])
+        return {name: frozenset(below) for name, below in supports.items()}
 
     def contact_group(self, scene: Scene, name: str) -> Scene:
-        """The named object and all that may touch it, directly or through others.
+        """Return the scene of an object and all that it may touch, directly or through others.
 
         Raises:
-            KeyError: no such object.
+            KeyError: No object has this name.
         """
         scene[name]
         shapes, p_T = self._arrays(scene.objects)
@@ -150,18 +172,19 @@ class StaticStabilityJudge:
     def objects_losing_support(
         self, scene: Scene, name: str
     ) -> tuple[str, ...] | InconclusiveVerdict:
-        """The objects, in the scene's order, that would not stay if the named one were taken away; its group alone is looked at.
+        """Return the objects that would fall if an object were removed, in the scene's order.
 
-        Of a stack that loses its balance these are what is furthest from equilibrium, without it the next, and so on.
+        Of an unbalanced stack, the object farthest from equilibrium falls, then the next one
+        without it, until the rest stands. Only the object's contact group is examined.
 
         Raises:
-            KeyError: no such object.
+            KeyError: No object has this name.
         """
         scene = self.contact_group(scene, name)
-        standing = self._contact_graph(scene, *self._arrays(scene.objects))
-        if isinstance(standing, InconclusiveVerdict):
-            return standing
-        shapes, _, pairs, stack = standing
+        graph = self._contact_graph(scene, *self._arrays(scene.objects))
+        if isinstance(graph, InconclusiveVerdict):
+            return graph
+        shapes, _, pairs, stack = graph
         removed = scene.names.index(name)
         remaining = [
             row for row in np.flatnonzero(stack == stack[removed]).tolist() if row != removed
@@ -175,65 +198,67 @@ class StaticStabilityJudge:
             }
             unsupported = [row for row in remaining if row not in supported]
             if not unsupported:
-                ((weakest, _),) = self._least_stable_objects(
-                    standing, _single_stack(remaining, len(shapes))
+                ((least_stable, _),) = self._least_stable_objects(
+                    graph, _single_stack(remaining, len(shapes))
                 )
-                if weakest < 0:
+                if least_stable < 0:
                     break
-                unsupported = [weakest]
+                unsupported = [least_stable]
             falling += unsupported
             remaining = [row for row in remaining if row not in unsupported]
         return tuple(scene.objects[row].name for row in sorted(falling))
 
     def stability_margins(self, scene: Scene) -> dict[str, float] | InconclusiveVerdict:
-        """How much narrower the contacts under each object may become before its stack loses balance, m, by name.
+        """Return by how much the contacts below each object may shrink before its stack tips [m].
 
-        Under vertical forces. Negative: how much wider they would have to be. Known to 0.1 mm, within -30 and 150 mm. What rolls
-        has none.
+        Only vertical forces count. A negative margin is the missing width. Margins are exact to 0.1
+        mm within -30 to 150 mm. An object that can roll has margin 0.
         """
-        standing = self._contact_graph(scene, *self._arrays(scene.objects))
-        if isinstance(standing, InconclusiveVerdict):
-            return standing
-        shapes, p_T, pairs, stack = standing
-        found = {}
+        graph = self._contact_graph(scene, *self._arrays(scene.objects))
+        if isinstance(graph, InconclusiveVerdict):
+            return graph
+        shapes, p_T, pairs, stack = graph
+        margins = {}
         for row, scene_object in enumerate(scene.objects):
             rows = np.flatnonzero(stack == stack[row])
-            own, members = (
-                int(np.flatnonzero(rows == row)[0]),
-                _contacts_among(pairs, rows.tolist()),
-            )
+            own = int(np.flatnonzero(rows == row)[0])
+            members = _contacts_among(pairs, rows.tolist())
             low, high = _MARGIN_RANGE
-            while high - low > _MARGIN_RESOLUTION / 2:
+            while high - low > _MARGIN_RESOLUTION / 2:  # bisection
                 margin = np.zeros(len(rows))
                 margin[own] = (low + high) / 2
-                aside = np.zeros((len(rows), 2))
-                rest = equilibrium.equilibrium_residuals(
+                com_offsets = np.zeros((len(rows), 2))
+                residuals = equilibrium.equilibrium_residuals(
                     self._shapes.arrays.records,
                     shapes[rows],
                     p_T[rows],
                     members,
                     margin,
-                    aside,
+                    com_offsets,
                     0.0,
                     equilibrium.NO_LOADS,
                 )
-                low, high = (low, margin[own]) if rest.max() > 0 else (margin[own], high)
-            found[scene_object.name] = (
+                low, high = (low, margin[own]) if residuals.max() > 0 else (margin[own], high)
+            margins[scene_object.name] = (
                 round((low + high) / 2 / _MARGIN_RESOLUTION) * _MARGIN_RESOLUTION
             )
-            ((weakest, rolls),) = self._least_stable_objects(
-                standing, _single_stack(rows.tolist(), len(shapes))
+            ((least_stable, rolls),) = self._least_stable_objects(
+                graph, _single_stack(rows.tolist(), len(shapes))
             )
-            if rolls and weakest == row:
-                found[scene_object.name] = 0.0
-        return found
+            if rolls and least_stable == row:
+                margins[scene_object.name] = 0.0
+        return margins
 
     def is_disassemblable(self, scene: Scene) -> bool | InconclusiveVerdict:
-        """Whether all objects can be taken away one by one, each with nothing on it, while what is left always stands."""
-        standing = self._contact_graph(scene, *self._arrays(scene.objects))
-        if isinstance(standing, InconclusiveVerdict):
-            return standing
-        pairs, dead_ends = standing.pairs.tolist(), set[frozenset[int]]()
+        """Return whether all objects can be removed one by one while the rest always stands.
+
+        Only objects that carry nothing are removed.
+        """
+        graph = self._contact_graph(scene, *self._arrays(scene.objects))
+        if isinstance(graph, InconclusiveVerdict):
+            return graph
+        pairs = graph.pairs.tolist()
+        dead_ends = set[frozenset[int]]()
 
         def can_be_emptied(rows: frozenset[int]) -> bool:
             if len(rows) < 2:
@@ -242,30 +267,30 @@ class StaticStabilityJudge:
             for row in sorted(rows - loaded):
                 rest = rows - {row}
                 if rest not in dead_ends:
-                    ((weakest, _),) = self._least_stable_objects(
-                        standing, _single_stack(rest, len(standing.shapes))
+                    ((least_stable, _),) = self._least_stable_objects(
+                        graph, _single_stack(rest, len(graph.shapes))
                     )
-                    if weakest < 0 and can_be_emptied(rest):
+                    if least_stable < 0 and can_be_emptied(rest):
                         return True
             dead_ends.add(rows)
             return False
 
         return all(
-            can_be_emptied(frozenset(np.flatnonzero(standing.stack == stack).tolist()))
-            for stack in set(standing.stack.tolist())
+            can_be_emptied(frozenset(np.flatnonzero(graph.stack == stack).tolist()))
+            for stack in set(graph.stack.tolist())
         )
 
     def immovable_objects(self, scene: Scene) -> frozenset[str] | InconclusiveVerdict:
-        """Objects that no sequence of moves can pick without a collapse, whatever is put down on the others before.
+        """Return objects that no sequence of moves can remove without a collapse.
 
-        The largest set of objects of which none can be taken away while the rest of the set stands: not even if the others,
-        which may be gone by then, press straight down wherever the tops are free. (A bridge to another stack that pushes sideways
-        is not thought of.) What is not in the set may still be impossible to move.
+        This is the largest set in which no object can be removed while the rest of the set stands,
+        even if other objects press straight down on free tops. Horizontal forces of bridges to
+        other stacks are ignored. Objects outside of the set may be immovable, too.
         """
-        standing = self._contact_graph(scene, *self._arrays(scene.objects))
-        if isinstance(standing, InconclusiveVerdict):
-            return standing
-        shapes, p_T, pairs, _ = standing
+        graph = self._contact_graph(scene, *self._arrays(scene.objects))
+        if isinstance(graph, InconclusiveVerdict):
+            return graph
+        shapes, p_T, pairs, _ = graph
         fixed = set(range(len(shapes)))
         while True:
             free = [
@@ -280,9 +305,12 @@ class StaticStabilityJudge:
     def _could_be_removed(
         self, shapes: Ints, p_T: Floats, pairs: Ints, fixed: set[int], removed: int
     ) -> bool:
-        """Whether the rest of the fixed objects could stand without one of them, what is not fixed helping."""
+        """Return whether the other fixed objects could stand without one of them.
+
+        Objects that are not fixed may help: they hold like the ground or press on free tops.
+        """
         stack = {removed}
-        while True:  # all fixed objects that it is in contact with, directly or not
+        while True:  # collect all fixed objects in contact with it, directly or not
             more = {
                 row
                 for pair in pairs.tolist()
@@ -297,7 +325,7 @@ class StaticStabilityJudge:
         if not rest:
             return True
         records = self._shapes.arrays.records
-        # What is not fixed holds like the ground does while it is there.
+        # An object that is not fixed holds like the ground while it is present.
         number = {row: k for k, row in enumerate(rest)}
         held_pairs = [
             (number.get(a, contacts.GROUND), number[b])
@@ -325,13 +353,13 @@ class StaticStabilityJudge:
 
     def _contact_graph(
         self, scene: Scene, shapes: Ints, p_T: Floats
-    ) -> "_ContactGraph | InconclusiveVerdict":
-        """Who stands on whom, if all objects are within the model."""
-        fault, culprit, pairs, stack = contacts.find_contacts(
+    ) -> _ContactGraph | InconclusiveVerdict:
+        """Return the objects and their contacts, or why the model does not cover the scene."""
+        fault, faulty, pairs, stack = contacts.find_contacts(
             self._shapes.arrays.records, shapes, p_T, scene.support.half_size
         )
         if fault != contacts.NO_FAULT:
-            return InconclusiveVerdict(_INCONCLUSIVE_REASONS[fault], scene.objects[culprit].name)
+            return InconclusiveVerdict(_INCONCLUSIVE_REASONS[fault], scene.objects[faulty].name)
         return _ContactGraph(shapes, p_T, pairs, stack)
 
     def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
@@ -341,48 +369,54 @@ class StaticStabilityJudge:
             self._generation = self._shapes.generation
         return arrays
 
-    def _least_stable_objects(
-        self, standing: "_ContactGraph", stack: Ints
-    ) -> list[tuple[int, bool]]:
-        """For each stack, the row of what is furthest from equilibrium, or -1, and whether it rolls.
+    def _least_stable_objects(self, graph: _ContactGraph, stack: Ints) -> list[tuple[int, bool]]:
+        """Return the object farthest from equilibrium of each stack.
 
-        `stack`: its number for each object; objects of stack -1 are not there.
+        Args:
+            graph: Objects and contacts.
+            stack: Number of each object's stack; objects of stack -1 are absent. Shape (n,).
+
+        Returns:
+            For each stack the index of the object, or -1 if the stack stands, and whether it rolls.
         """
-        order, first, described = equilibrium.canonical_order(
-            standing.shapes, standing.p_T, stack, _CACHE_RESOLUTION
+        order, first, description = equilibrium.canonical_order(
+            graph.shapes, graph.p_T, stack, _CACHE_RESOLUTION
         )
-        rows, starts, content = order.tolist(), first.tolist(), described.tobytes()
+        rows = order.tolist()
+        starts = first.tolist()
+        content = description.tobytes()
         keys = [
             content[start * _KEY_BYTES_PER_OBJECT : end * _KEY_BYTES_PER_OBJECT]
             for start, end in itertools.pairwise(starts)
         ]
         unknown = [k for k, key in enumerate(keys) if key not in self._cache]
         if unknown:
-            table, options = self._shapes.arrays.records, (self._margin, self._friction)
-            found = equilibrium.least_stable_objects(
-                table, *standing[:3], order, first, np.array(unknown), *options
+            records = self._shapes.arrays.records
+            options = (self._margin, self._friction)
+            solved = equilibrium.least_stable_objects(
+                records, *graph[:3], order, first, np.array(unknown), *options
             )
             self._cache.update(
-                zip((keys[k] for k in unknown), map(tuple, found.tolist()), strict=True)
+                zip((keys[k] for k in unknown), map(tuple, solved.tolist()), strict=True)
             )
-        answers = [self._cache[key] for key in keys]
+        results = [self._cache[key] for key in keys]
         return [
-            (rows[start + at] if at >= 0 else -1, bool(rolls))
-            for start, (at, rolls) in zip(starts, answers, strict=False)
+            (rows[start + position] if position >= 0 else -1, bool(rolls))
+            for start, (position, rolls) in zip(starts, results, strict=False)
         ]
 
 
 def _single_stack(rows: Iterable[int], count: int) -> Ints:
-    """(count,) the number of a stack: 0 for these rows, -1, no stack, for the others."""
+    """Return stack numbers (count,) in which the given objects form stack 0, the others none."""
     stack = np.full(count, -1)
     stack[list(rows)] = 0
     return stack
 
 
 def _contacts_among(pairs: Ints, rows: list[int]) -> Ints:
-    """The contacts among the rows and with the tray, with the rows numbered as they stand in the list."""
+    """Return the contacts among objects and with the ground, renumbered by their position."""
     number = {row: k for k, row in enumerate(rows)} | {contacts.GROUND: contacts.GROUND}
-    chosen = [
+    renumbered = [
         (number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0
     ]
-    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+    return np.array(renumbered, dtype=np.int64).reshape(-1, 2)
