@@ -26,7 +26,7 @@ def standing(name: str, x: float, bottom: float) -> SceneObject:
 def main() -> None:
     config = ClutterConfig()
     judges: dict[str, SceneJudge] = {
-        "fast": StaticStabilityJudge(config),
+        "static": StaticStabilityJudge(config),
         "Drake": DrakeJudge(config),
     }
     box_height = CLASSES["pudding_box"].size[2]

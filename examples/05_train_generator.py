@@ -37,8 +37,8 @@ def main(steps: int, scenes: int, out: Path) -> None:
 
     out.parent.mkdir(parents=True, exist_ok=True)
     network = rule_network_metadata(make_environment().grammar, config.width)
-    about = {"kind": "generator", "network": network, "temperature": config.temperature}
-    save_checkpoint(out, learner.network, about)
+    metadata = {"kind": "generator", "network": network, "temperature": config.temperature}
+    save_checkpoint(out, learner.network, metadata)
     print(f"drake-clutter generate --agent {out} --nodes 15 --count 12 --out out/tutorial/mine")
 
 
