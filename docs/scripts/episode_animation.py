@@ -1,7 +1,7 @@
 """Render the animation of the README from a recorded closed-loop episode.
 
-    drake-clutter demo --seed 0 --out out/demo
-    python docs/scripts/episode_animation.py out/demo/trajectory.h5 docs/images/episode.gif
+drake-clutter demo --seed 0 --out out/demo
+python docs/scripts/episode_animation.py out/demo/trajectory.h5 docs/images/episode.gif
 """
 
 import sys
@@ -40,7 +40,12 @@ def main(trajectory: Path, animation: Path) -> None:
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     durations = [PICTURE_DURATION] * (len(frames) - 1) + [LAST_DURATION]
     frames[0].save(
-        animation, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True
+        animation,
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        optimize=True,
     )
 
 
