@@ -11,6 +11,7 @@ from drake_clutter import ClutterConfig, ClutterGeneration, GenerationTaskConfig
 from drake_clutter.agents.learned_generator import rule_network_metadata
 from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner, sample_episodes
 from drake_clutter.learning.checkpoint import save_checkpoint
+from drake_clutter.validation import to_plain
 
 
 def evaluate(learner: SoftQLearner, make: Callable[[], ClutterGeneration], count: int) -> str:
@@ -24,8 +25,10 @@ def evaluate(learner: SoftQLearner, make: Callable[[], ClutterGeneration], count
 def main(steps: int, scenes: int, out: Path) -> None:
     classes = load_catalog().object_set("ycb7")
 
+    task = GenerationTaskConfig(nodes=15)
+
     def make_environment() -> ClutterGeneration:
-        return ClutterGeneration(classes, GenerationTaskConfig(nodes=15), ClutterConfig())
+        return ClutterGeneration(classes, task, ClutterConfig())
 
     config = SoftQConfig(total_timesteps=steps, learning_starts=min(2000, steps // 4))
     learner = SoftQLearner(make_environment, config, 0, torch.device("cpu"), 2)
@@ -36,10 +39,14 @@ def main(steps: int, scenes: int, out: Path) -> None:
         print(evaluate(learner, make_environment, scenes))
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    network = rule_network_metadata(make_environment().grammar, config.width)
-    metadata = {"kind": "generator", "network": network, "temperature": config.temperature}
+    metadata = {
+        "kind": "generator",
+        "network": rule_network_metadata(make_environment().grammar, config.width),
+        "temperature": config.temperature,
+        "config": {"task": to_plain(task)},
+    }
     save_checkpoint(out, learner.network, metadata)
-    print(f"drake-clutter generate --agent {out} --nodes 15 --count 12 --out out/tutorial/mine")
+    print(f"saved {out}")
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ SMALLER = {"--count": "1", "--max-scenes": "1", "--workers": "1"}
 """Values that options of commands are given instead."""
 ADDED = {
     "05_train_generator": ["--steps", "64", "--scenes", "1"],
-    "evaluate": ["--max-moves", "1"],
+    "evaluate": ["--max-moves", "1", "--max-scenes", "1"],
     "explore": ["--max-moves", "1"],
     "run": ["--set", "max_moves=1"],
     "render_image_dataset": [],
@@ -92,6 +92,16 @@ ADDED = {
     ],
 }
 """Options that are added to a command of `drake-clutter` or a script, by its name."""
+
+PARSED = {
+    "collect_drake_verdicts",
+    "evaluate_closed_loop",
+    "evaluate_detector",
+    "evaluate_explorers",
+    "evaluate_generators",
+    "judge_agreement",
+}
+"""Scripts that take minutes for the smallest case: only their options are looked up."""
 
 
 @dataclass(frozen=True)
@@ -154,10 +164,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ignore = shutil.ignore_patterns("mug", "package.xml")
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=ignore)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(feasibility_job, "BASE_GRID_X", [-0.6])
-    monkeypatch.setattr(feasibility_job, "BASE_GRID_Y", [0.0])
+    monkeypatch.setattr(feasibility_job, "BASE_GRID_X", [-0.8, -0.6])
+    monkeypatch.setattr(feasibility_job, "BASE_GRID_Y", [0.0, 0.2])
     monkeypatch.setattr(feasibility_job, "MAP_SPACING", 0.3)
-    monkeypatch.setattr(feasibility_job, "MAP_HEIGHTS", (0.05,))
+    monkeypatch.setattr(feasibility_job, "MAP_HEIGHTS", (0.05, 0.3))
     monkeypatch.setattr(feasibility_report, "CASES_PER_KIND", 1)
     monkeypatch.setattr(feasibility_study, "MAX_NOISY_MOVES", 1)
     return tmp_path
@@ -242,8 +252,9 @@ def run_command(
             text = Path(script).read_text(encoding="utf-8")
             assert [o for o in options if o.startswith("--") and f'"{o}"' not in text] == []
         case ["python", script, *options]:
-            arguments = [script, *smaller(Path(script).stem, options)]
-            monkeypatch.setattr(sys, "argv", arguments)
+            name = Path(script).stem
+            arguments = [*options, "--help"] if name in PARSED else smaller(name, options)
+            monkeypatch.setattr(sys, "argv", [script, *arguments])
             try:
                 runpy.run_path(script, run_name="__main__")
             except SystemExit as ended:
@@ -257,6 +268,8 @@ def run_command(
             assert {*(extras[1] or "").split(",")} - {""} <= {*known["optional-dependencies"]}
         case ["source", ".venv/bin/activate"] | ["ray", "start", "--head"]:
             pass
+        case ["mkdir", "-p", name]:
+            Path(name).mkdir(exist_ok=True)
         case ["tensorboard", "--logdir", runs]:
             assert list(Path(runs).glob("*/tensorboard"))
         case _:

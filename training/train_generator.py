@@ -96,13 +96,13 @@ def scene_metrics(episodes: Sequence[SampledEpisode], classes: dict[str, Any]) -
     class_counts = Counter(o.object_class.name for info in infos for o in info["scene"].objects)
     graphs = [info["scene"].graph for info in infos]
     forms = {canonical_form(graph, classes) for graph in graphs}
-    balanced = [graph.largest_stack_share() <= MAX_BALANCED_STACK_FRACTION for graph in graphs]
+    balanced = [graph.largest_stack_fraction() <= MAX_BALANCED_STACK_FRACTION for graph in graphs]
     return {
         "score": float(np.mean([episode.episodic_return for episode in episodes])),
         "stable": len(infos) / len(episodes),
         "hidden": float(np.mean(hidden)) if infos else 0.0,
         "distinct": len(forms) / max(1, len(infos)),
-        "stacks": float(np.mean([len(graph.stacks()) for graph in graphs])) if infos else 0.0,
+        "stacks": float(np.mean([len(graph.stack_objects()) for graph in graphs])) if infos else 0.0,
         "balanced": float(np.mean(balanced)) if infos else 0.0,
         "rarest_class": min(class_counts[name] for name in classes) / max(1, class_counts.total()),
     }
