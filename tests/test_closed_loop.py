@@ -1,4 +1,4 @@
-"""The closed loop: the agent's decisions on scripted answers, and a whole episode in Drake."""
+"""Policy and planner systems with scripted inputs, and closed-loop episodes in Drake."""
 
 import json
 from dataclasses import replace
@@ -49,39 +49,41 @@ NO_SEAL = PlanningFailure(PlanningFailureReason.NO_SEAL, "it")
 AFTER = RayCaster(ClutterConfig().cell.camera).observe(ASIDE)[0]
 
 
-def first_allowed(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
-    """The first object in view to the tray, if that has not failed."""
+def first_valid_move(
+    belief: Belief, observation: Observation, rng: np.random.Generator
+) -> Decision:
+    """Move the first visible object to the tray for which that is valid."""
     names = [d.name for d in observation.detections]
     moves = [Move(name) for name in names if Move(name) not in belief.invalid_moves]
     return Decision(moves[0] if moves else None)
 
 
-class Bench:
-    """An agent alone, its inputs given by hand."""
+class PolicyTestBench:
+    """A policy system with scripted inputs."""
 
     def __init__(self) -> None:
-        self.agent = PolicySystem(policy=first_allowed, config=ExplorationConfig(), seed=0)
-        self.simulator = Simulator(self.agent)
+        self.system = PolicySystem(policy=first_valid_move, config=ExplorationConfig(), seed=0)
+        self.simulator = Simulator(self.system)
         self.time = 0.0
-        self.give(BEFORE, PlanResponse(), 0)
+        self.set_inputs(BEFORE, PlanResponse(), 0)
 
-    def give(self, observation: Observation, response: PlanResponse, finished: int) -> None:
+    def set_inputs(self, observation: Observation, response: PlanResponse, finished: int) -> None:
         context = self.simulator.get_mutable_context()
-        self.agent.GetInputPort("observation").FixValue(context, observation)
-        self.agent.GetInputPort("response").FixValue(context, response)
-        self.agent.GetInputPort("finished").FixValue(context, [finished, 0.0])
+        self.system.GetInputPort("observation").FixValue(context, observation)
+        self.system.GetInputPort("response").FixValue(context, response)
+        self.system.GetInputPort("finished").FixValue(context, [finished, 0.0])
 
-    def after(self, seconds: float) -> PolicyState:
+    def advance(self, seconds: float) -> PolicyState:
         self.time += seconds
         self.simulator.AdvanceTo(self.time)
         return self.state(self.simulator.get_context())
 
     def state(self, context: Context) -> PolicyState:
-        state: PolicyState = self.agent.GetOutputPort("state").Eval(context)
+        state: PolicyState = self.system.GetOutputPort("state").Eval(context)
         return state
 
 
-def a_plan() -> PickPlacePlan:
+def make_plan() -> PickPlacePlan:
     made = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False)).plan(
         COVERED.objects,
         "cracker_box",
@@ -91,44 +93,48 @@ def a_plan() -> PickPlacePlan:
     return made
 
 
-def test_it_looks_waits_rests_and_looks_again() -> None:
-    bench = Bench()
-    state = bench.after(0.1)
+def test_the_policy_waits_for_the_move_before_it_observes_again() -> None:
+    bench = PolicyTestBench()
+    state = bench.advance(0.1)
     assert state.phase is PolicyPhase.WAITING
     assert (state.request.number, state.request.move) == (1, Move("cracker_box"))
     assert [o.name for o in state.belief.objects] == ["cracker_box"]
-    bench.give(AFTER, PlanResponse(1, a_plan()), 0)
-    assert bench.after(5.0).phase is PolicyPhase.WAITING, "the arm has not come home"
-    bench.give(AFTER, PlanResponse(1, a_plan()), 1)
-    state = bench.after(0.1)
+    bench.set_inputs(AFTER, PlanResponse(1, make_plan()), 0)
+    assert bench.advance(5.0).phase is PolicyPhase.WAITING, "the plan is not finished"
+    bench.set_inputs(AFTER, PlanResponse(1, make_plan()), 1)
+    state = bench.advance(0.1)
     assert state.phase is PolicyPhase.OBSERVING
     assert state.belief.history == (Move("cracker_box"),)
-    assert [o.name for o in state.belief.objects] == ["cracker_box"], "it has not looked yet"
-    state = bench.after(0.6)
+    assert [o.name for o in state.belief.objects] == ["cracker_box"], (
+        "there is no new observation yet"
+    )
+    state = bench.advance(0.6)
     assert state.request.number == 2
     assert {o.name: o.X_TO for o in state.belief.objects} == ASIDE.poses
 
 
-def test_what_fails_is_not_asked_for_again_and_nothing_left_is_an_end() -> None:
-    bench = Bench()
-    bench.after(0.1)
-    bench.give(BEFORE, PlanResponse(1, NO_SEAL), 0)
-    state = bench.after(0.2)
+def test_failed_moves_are_not_repeated() -> None:
+    bench = PolicyTestBench()
+    bench.advance(0.1)
+    bench.set_inputs(BEFORE, PlanResponse(1, NO_SEAL), 0)
+    state = bench.advance(0.2)
     assert (state.phase, state.belief.invalid_moves) == (PolicyPhase.DONE, (Move("cracker_box"),))
 
 
-def test_what_the_cup_did_not_get_is_left_alone() -> None:
-    bench = Bench()
-    bench.after(0.1)
-    bench.give(BEFORE, PlanResponse(1, a_plan()), 1)
-    state = bench.after(0.8)
+def test_moves_of_an_object_that_was_not_picked_become_invalid() -> None:
+    bench = PolicyTestBench()
+    bench.advance(0.1)
+    bench.set_inputs(BEFORE, PlanResponse(1, make_plan()), 1)
+    state = bench.advance(0.8)
     assert state.belief.history == (Move("cracker_box"),)
-    assert state.belief.invalid_moves == (Move("cracker_box"),), "it is seen where it was"
+    assert state.belief.invalid_moves == (Move("cracker_box"),), (
+        "the object is observed at its previous pose"
+    )
     assert state.phase is PolicyPhase.DONE
 
 
-def test_what_is_lost_is_forgotten() -> None:
-    """And with it what failed: where it is found again, it has another name."""
+def test_lost_objects_are_removed_from_the_belief() -> None:
+    """Their invalid moves are removed, too, because they get new names when detected again."""
     failed = MoveResult.NOT_PLANNED
     belief = Belief().update(AFTER).record(Move("gelatin_box"), failed)
     belief = belief.record(Move("cracker_box"), failed)
@@ -143,12 +149,12 @@ def test_what_is_lost_is_forgotten() -> None:
     assert after.invalid_moves == (Move("cracker_box"),)
 
 
-def test_a_cloned_agent_goes_on_the_same() -> None:
-    bench = Bench()
-    bench.after(0.1)
-    bench.give(AFTER, PlanResponse(1, NO_SEAL), 0)
-    clone = Simulator(bench.agent, bench.simulator.get_context().Clone())
-    state = bench.after(0.3)
+def test_a_cloned_context_continues_identically() -> None:
+    bench = PolicyTestBench()
+    bench.advance(0.1)
+    bench.set_inputs(AFTER, PlanResponse(1, NO_SEAL), 0)
+    clone = Simulator(bench.system, bench.simulator.get_context().Clone())
+    state = bench.advance(0.3)
     clone.AdvanceTo(bench.time)
     other = bench.state(clone.get_context())
     assert other.request.number == state.request.number == 2
@@ -157,23 +163,23 @@ def test_a_cloned_agent_goes_on_the_same() -> None:
     assert other.belief.invalid_moves == state.belief.invalid_moves
 
 
-def test_what_was_seen_stays_known() -> None:
+def test_occluded_objects_stay_in_the_belief() -> None:
     known = Belief().update(AFTER).update(BEFORE).objects
     assert {o.name: o.X_TO for o in known} == COVERED.poses, (
-        "the box under the other one is where it was seen"
+        "the occluded box is where it was observed"
     )
 
 
-def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench, asked, plan = Bench(), list[int](), a_plan()
-    request = bench.after(0.1).request
+def test_each_request_is_planned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, calls, plan = PolicyTestBench(), list[int](), make_plan()
+    request = bench.advance(0.1).request
 
-    def answer(*_: object) -> PickPlacePlan | PlanningFailure:
-        asked.append(1)
-        return plan if len(asked) == 1 else NO_SEAL
+    def plan_once(*_: object) -> PickPlacePlan | PlanningFailure:
+        calls.append(1)
+        return plan if len(calls) == 1 else NO_SEAL
 
     planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
-    monkeypatch.setattr(planner, "plan", answer)
+    monkeypatch.setattr(planner, "plan", plan_once)
     empty = render_empty_depth(DEFAULT_CELL)
     system = PlannerSystem(planner=planner, empty_depth=empty, latency=0.2)
     simulator = Simulator(system)
@@ -181,23 +187,25 @@ def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) 
     response, planned = system.GetOutputPort("response"), system.GetOutputPort("plan")
     system.GetInputPort("request").FixValue(context, PlanRequest())
     simulator.AdvanceTo(0.2)
-    assert asked == []
+    assert calls == []
     assert (response.Eval(context), planned.Eval(context)) == (PlanResponse(), PlannedMove())
     system.GetInputPort("request").FixValue(context, request)
     simulator.AdvanceTo(0.4)
-    assert asked == []
+    assert calls == []
     clone = Simulator(system, context.Clone())
     simulator.AdvanceTo(0.5)
-    assert asked == [1]
+    assert calls == [1]
     assert response.Eval(context) == PlanResponse(1, plan)
     assert planned.Eval(context) == PlannedMove(1, plan)
     system.GetInputPort("request").FixValue(context, replace(request, number=2))
     simulator.AdvanceTo(1.0)
     assert response.Eval(context) == PlanResponse(2, NO_SEAL)
-    assert planned.Eval(context) == PlannedMove(), "the arm has nothing new to do"
-    asked.clear()
+    assert planned.Eval(context) == PlannedMove(), "there is no new plan"
+    calls.clear()
     clone.AdvanceTo(0.5)
-    assert planned.Eval(clone.get_context()) == PlannedMove(1, plan), "the same from a clone"
+    assert planned.Eval(clone.get_context()) == PlannedMove(1, plan), (
+        "a cloned context gives the same plan"
+    )
     system.GetInputPort("request").FixValue(context, replace(request, number=3, command=None))
     simulator.AdvanceTo(1.5)
     found: PlanResponse = response.Eval(context)
@@ -205,8 +213,8 @@ def test_the_planner_answers_each_request_once(monkeypatch: pytest.MonkeyPatch) 
     assert (found.number, found.plan.reason) == (3, PlanningFailureReason.NO_FREE_SPOT)
 
 
-def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
-    """A marker, which no cup can hold, is refused; the cover goes aside, and the box below it is found."""
+def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
+    """The marker cannot be grasped; moving the upper box reveals the lower one."""
     scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.support)
     names = list[str]()
 
@@ -250,7 +258,9 @@ def test_an_episode(config: ClutterConfig, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("robot", "joints"), [("ur5e", 6), ("ur10e", 6), ("iiwa14", 7)])
-def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfig) -> None:
+def test_a_closed_loop_episode_with_another_arm(
+    robot: str, joints: int, config: ClutterConfig
+) -> None:
     cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
     loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record_motion=True)
     task = run_episode(loop, largest_clear, max_moves=1)
@@ -265,16 +275,18 @@ def test_an_episode_of_another_arm(robot: str, joints: int, config: ClutterConfi
     assert arm.q == pytest.approx(cell.robot.home, abs=0.01)
 
 
-def test_the_last_move_that_is_allowed_may_find_everything(config: ClutterConfig) -> None:
+def test_the_last_allowed_move_can_reveal_all_objects(config: ClutterConfig) -> None:
     task, _ = run_closed_loop(Scenario(agent="largest-clear", max_moves=1), COVERED, lambda _: None)
     assert task.termination is TerminationReason.ALL_FOUND
 
 
-def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
+def test_scenario_files_and_invalid_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
     (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
-    told = load_config_as(Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config)
-    cell = told.world.cell
+    scenario = load_config_as(
+        Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config
+    )
+    cell = scenario.world.cell
     assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == (
         (-0.65, 0.0, 0.3),
         5.0,
@@ -288,14 +300,14 @@ def test_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
     assert move == Move("cracker_box")
 
 
-def test_a_random_explorer_plays(config: ClutterConfig) -> None:
+def test_an_episode_of_the_random_explorer(config: ClutterConfig) -> None:
     task, timing = run_closed_loop(Scenario(agent="random", max_moves=1), COVERED, lambda _: None)
     assert len(task.transitions) == 1
     assert timing.simulated > 0
 
 
 @pytest.mark.parametrize("descent", [0.08, 0.0])
-def test_without_room_to_go_down_it_is_let_go_at_its_place(
+def test_without_a_guarded_descent_objects_are_released_at_the_placement_pose(
     descent: float, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -304,7 +316,7 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
         PlannerConfig(max_guarded_descent=descent, descent_start_offset=0.007),
     )
     loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
-    loop.policy_system.policy = first_allowed
+    loop.policy_system.policy = first_valid_move
     request = loop.policy_system.after_observation(PolicyState(), BEFORE).request
     assert request.command is not None
     plan = loop.planner_system._plan(request)
@@ -314,12 +326,12 @@ def test_without_room_to_go_down_it_is_let_go_at_its_place(
     assert (plan.max_descent >= 0.007) == (descent > 0)
 
 
-def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -> None:
-    """No cup holds the marker, the gelatin box carries it, and on neither there is room for the can."""
-    given = list[Belief]()
+def test_infeasible_moves_are_invalid_for_the_policy(config: ClutterConfig) -> None:
+    """The marker cannot be grasped, the box supports it, and neither has room for the can."""
+    beliefs = list[Belief]()
 
     def policy(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
-        given.append(belief)
+        beliefs.append(belief)
         return Decision(None)
 
     box = resting("gelatin_box", xy=(-0.1, 0.0))
@@ -333,5 +345,5 @@ def test_what_is_not_worth_trying_is_said_to_the_policy(config: ClutterConfig) -
     assert (
         loop.policy_system.after_observation(PolicyState(), observation).phase is PolicyPhase.DONE
     )
-    allowed = set(legal_moves(observation)) - set(given[0].invalid_moves)
+    allowed = set(legal_moves(observation)) - set(beliefs[0].invalid_moves)
     assert allowed == {Move(can.name)}

@@ -1,4 +1,4 @@
-"""Files are written whole or not at all; an output folder is new, empty, or resumed."""
+"""Atomic writing of files, and checks of output folders."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from drake_clutter.files import (
 )
 
 
-def test_text_and_json(tmp_path: Path) -> None:
+def test_write_text_and_json(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "eins\nzwölf\n")
     assert (tmp_path / "a.txt").read_bytes() == "eins\nzwölf\n".encode()
     write_json(tmp_path / "a.json", {"b": [1, 0.1], "a": None})
@@ -25,7 +25,9 @@ def test_text_and_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1j}, [object()]])
-def test_what_json_cannot_say_leaves_the_old_file(value: object, tmp_path: Path) -> None:
+def test_a_value_that_json_cannot_represent_leaves_the_file_unchanged(
+    value: object, tmp_path: Path
+) -> None:
     path = tmp_path / "a.json"
     write_json(path, 1)
     with pytest.raises((ValueError, TypeError)):
@@ -34,7 +36,7 @@ def test_what_json_cannot_say_leaves_the_old_file(value: object, tmp_path: Path)
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_failure_midway_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_no_file(tmp_path: Path) -> None:
     def fail() -> None:
         with atomic_write(tmp_path / "a.png") as temporary:
             assert temporary.parent == tmp_path
@@ -47,7 +49,7 @@ def test_a_failure_midway_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+def test_the_old_file_is_kept_until_the_new_one_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     write_text(path, "old")
     with atomic_write(path) as temporary:
@@ -57,7 +59,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_two_writers_do_not_share_a_temporary_file(tmp_path: Path) -> None:
+def test_two_writers_use_different_temporary_files(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     with atomic_write(path) as first, atomic_write(path) as second:
         assert first != second
@@ -66,14 +68,14 @@ def test_two_writers_do_not_share_a_temporary_file(tmp_path: Path) -> None:
     assert path.read_text() == "first"  # the outer block ends last
 
 
-def test_prepare_output_directory_makes_what_is_missing(tmp_path: Path) -> None:
+def test_prepare_output_directory_creates_missing_folders(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b"
     assert prepare_output_directory(path) == path
     assert path.is_dir()
     assert prepare_output_directory(path) == path
 
 
-def test_prepare_output_directory_may_hold_what_an_earlier_run_left(tmp_path: Path) -> None:
+def test_prepare_output_directory_accepts_allowed_entries(tmp_path: Path) -> None:
     (tmp_path / "scenes").mkdir()
     (tmp_path / "summary.json").touch()
     assert (
@@ -88,7 +90,7 @@ def test_prepare_output_directory_may_hold_what_an_earlier_run_left(tmp_path: Pa
         prepare_output_directory(tmp_path)
 
 
-def test_prepare_output_directory_refuses_a_file(tmp_path: Path) -> None:
+def test_prepare_output_directory_rejects_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(InputError, match=f"--out {path}: is a file"):
@@ -96,7 +98,7 @@ def test_prepare_output_directory_refuses_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_prepare_output_directory_refuses_what_may_not_be_written(tmp_path: Path) -> None:
+def test_prepare_output_directory_rejects_a_folder_that_is_not_writable(tmp_path: Path) -> None:
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     with pytest.raises(InputError, match="is not writable"):

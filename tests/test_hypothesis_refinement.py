@@ -1,4 +1,4 @@
-"""Where a detector looks again."""
+"""Segments that are tried after the network's own ones."""
 
 import numpy as np
 
@@ -28,16 +28,16 @@ def test_surfaces_end_at_steps_and_at_the_floor() -> None:
     left, right = surface[10, 8], surface[10, 20]
     assert left != right
     for mask, number in ((LEFT, left), (RIGHT, right)):
-        assert (surface[mask] == number).mean() > 0.95, "the median rounds corners"
+        assert (surface[mask] == number).mean() > 0.95, "the median filter rounds corners"
         assert (surface[~mask] == number).sum() <= 4
     level = label_surfaces(heights(0.10, 0.10))
     assert level[10, 8] == level[10, 20] >= 0
     hole = heights(0.10, 0.10)
     hole[8:11, 6:9] = np.nan
-    assert label_surfaces(hole)[9, 7] == -1, "what is not measured belongs to nothing"
+    assert label_surfaces(hole)[9, 7] == -1, "cells without measurement have no surface"
 
 
-def test_a_surface_is_left_alone_when_a_pose_explains_it() -> None:
+def test_surfaces_that_a_pose_explains_are_not_tried_again() -> None:
     surface = label_surfaces(heights(0.05, 0.10))
     (left,) = find_unexplained_surfaces(surface, [RIGHT])
     assert np.array_equal(left, surface == surface[10, 8])
@@ -49,34 +49,34 @@ def test_a_surface_is_left_alone_when_a_pose_explains_it() -> None:
     assert find_unexplained_surfaces(label_surfaces(small), []) == []
 
 
-def test_a_doubtful_pose_is_widened_over_the_rest_of_its_surface() -> None:
+def test_the_mask_of_an_ambiguous_detection_grows_over_its_surface() -> None:
     surface = label_surfaces(heights(0.10, 0.10))
     part = LEFT.copy()
     part[:, 12:] = False
-    chances = np.zeros((2, *SHAPE), np.float32)
-    chances[0], chances[1] = 0.7, 0.3
-    (wider,) = find_ambiguous_regions(surface, [part], [0], chances)
+    probabilities = np.zeros((2, *SHAPE), np.float32)
+    probabilities[0], probabilities[1] = 0.7, 0.3
+    (wider,) = find_ambiguous_regions(surface, [part], [0], probabilities)
     assert wider[part].all()
     assert wider[10, 12]
     assert wider[10, 15]
     assert not wider[0, 0]
-    of_two = find_ambiguous_regions(surface, [part, RIGHT], [0, 0], chances)
-    assert not (of_two[0] & RIGHT).any(), "not over what another pose explains"
-    chances[1] = 0.1
-    assert find_ambiguous_regions(surface, [part], [0], chances) == []
+    regions = find_ambiguous_regions(surface, [part, RIGHT], [0, 0], probabilities)
+    assert not (regions[0] & RIGHT).any(), "cells of another pose are left out"
+    probabilities[1] = 0.1
+    assert find_ambiguous_regions(surface, [part], [0], probabilities) == []
 
 
-def test_two_objects_side_by_side_are_among_the_halves() -> None:
+def test_halves_include_two_objects_side_by_side() -> None:
     both = LEFT | RIGHT
     votes = np.zeros((*SHAPE, 3), np.float32)
     votes[RIGHT, 0] = 0.05
-    found = split_mask(both, votes)
-    assert len(found) == 6
+    halves = split_mask(both, votes)
+    assert len(halves) == 6
     for one in (LEFT, RIGHT):
-        assert max((one & half).sum() / (one | half).sum() for half in found) > 0.9
+        assert max((one & half).sum() / (one | half).sum() for half in halves) > 0.9
 
 
-def test_the_likely_classes_come_first() -> None:
-    chances = np.zeros((4, *SHAPE), np.float32)
-    chances[:, LEFT] = np.array([0.2, 0.1, 0.5, 0.16])[:, None]
-    assert candidate_classes(LEFT, chances) == [2, 0, 3]
+def test_candidate_classes_are_sorted_by_probability() -> None:
+    probabilities = np.zeros((4, *SHAPE), np.float32)
+    probabilities[:, LEFT] = np.array([0.2, 0.1, 0.5, 0.16])[:, None]
+    assert candidate_classes(LEFT, probabilities) == [2, 0, 3]

@@ -1,4 +1,4 @@
-"""The backend without an arm, with a detector whose every answer is given."""
+"""Backend without an arm, with a scripted detector, and evaluation of its episodes."""
 
 import json
 from dataclasses import replace
@@ -28,47 +28,49 @@ COVERED = scene_of(
 )
 
 
-def seen_but_shifted(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
-    """What the perfect detector sees, every pose off by some m along x, and names that mean nothing."""
+def shifted_observation(scene: Scene, config: ClutterConfig, shift: float) -> Observation:
+    """Return the true detections, shifted along x [m], with arbitrary names."""
     observation = LabelDetector(config.cell.camera).perceive(scene).observation
     shifted = [
-        replace(d, name=f"thing {k}", X_TO=d.X_TO.translated((shift, 0, 0)))
+        replace(d, name=f"detection {k}", X_TO=d.X_TO.translated((shift, 0, 0)))
         for k, d in enumerate(observation.detections)
     ]
     return replace(observation, detections=tuple(shifted))
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.004])
-def test_what_is_picked_is_what_is_really_there(config: ClutterConfig, shift: float) -> None:
-    """And it lands as far off as it was seen."""
-    sees, names = seen_but_shifted(COVERED, config, shift), list[str]()
+def test_the_true_object_nearest_to_the_detection_is_picked(
+    config: ClutterConfig, shift: float
+) -> None:
+    """The placement has the pose error of the detection."""
+    observation, names = shifted_observation(COVERED, config, shift), list[str]()
 
     def policy(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
         names.extend(o.name for o in belief.objects)
         return largest_clear(belief, observation, rng)
 
-    backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
+    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, world=config)
     task = run_episode(backend, policy, max_moves=3)
     known = backend.belief.objects
     (step,) = task.transitions
-    assert names == ["cracker_box_1"], "a name of its own"
+    assert names == ["cracker_box_1"], "the belief has names of its own"
     assert (step.move.pick, task.termination) == ("cracker_box", TerminationReason.ALL_FOUND)
     assert step.outcome.X_TO_released is not None
     off = task.scene["cracker_box"].X_TO.p - step.outcome.X_TO_released.p
     assert off[:2] == pytest.approx([-shift, 0.0], abs=1.5e-3)
     assert match_to_ground_truth(known, COVERED.objects) == ("cracker_box",), (
-        "it has looked again, and was shown the same"
+        "the scripted observation is the same after the move"
     )
 
 
-def test_nothing_to_do_is_an_end(config: ClutterConfig) -> None:
-    sees = seen_but_shifted(COVERED, config, 0.0)
-    backend = ImageBackend(COVERED, lambda *_: sees, seed=0, world=config)
+def test_an_episode_ends_without_a_move(config: ClutterConfig) -> None:
+    observation = shifted_observation(COVERED, config, 0.0)
+    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, world=config)
     task = run_episode(backend, lambda *_: Decision(None), max_moves=3)
     assert (task.transitions, task.termination) == ([], None)
 
 
-def test_rows_of_the_results() -> None:
+def test_summary_of_closed_loop_episodes() -> None:
     script = training_script("evaluate_closed_loop")
     episode = {
         "hidden": 2,
@@ -113,8 +115,10 @@ def test_rows_of_the_results() -> None:
     assert script.table_row(nothing)["moves"] == ""
 
 
-def test_an_episode_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The record of an episode with other networks is not taken for it."""
+def test_recorded_episodes_are_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Records of an episode with other networks are rejected."""
     script, path = training_script("evaluate_closed_loop"), tmp_path / "row.jsonl.gz"
     numbers = list[int]()
 
@@ -136,8 +140,8 @@ def test_an_episode_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         script.collect_episodes(replace(evaluation, agent="student-dagger"), 3, 1, path)
 
 
-def test_what_the_arm_can() -> None:
-    """A marker that lies on a box keeps what is below it hidden for ever: no cup holds it."""
+def test_objects_below_an_ungraspable_one_are_unrevealable() -> None:
+    """No cup can hold the marker on the upper box, so the lower box stays hidden."""
     ceiling = ArmReachabilityBound(ClutterConfig())
     on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
     assert ceiling.find_unrevealable(COVERED) == ()

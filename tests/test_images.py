@@ -1,4 +1,4 @@
-"""Labelled images on disk, and a stereo camera's noise."""
+"""Datasets of labeled images, and the noise of a stereo camera."""
 
 import json
 from pathlib import Path
@@ -29,15 +29,15 @@ SCENE = scene_of(
 )
 
 
-def decoded(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The mask (H, W) of COCO's uncompressed counts, as their definition says."""
+def decode_run_lengths(counts: list[int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the mask of COCO's uncompressed counts by their definition."""
     pixels = [k % 2 == 1 for k, count in enumerate(counts) for _ in range(count)]
     return np.reshape(pixels, shape, order="F")
 
 
 @pytest.fixture(scope="module")
 def images(camera: CameraRenderer) -> list[LabeledImage]:
-    """Two images of the scene, the second without what lies on top."""
+    """Return images of the scene with and without the upper box."""
     known: dict[SceneObject, int] = {}
     render_image = training_script("render_image_dataset").render_image
     generator = rng()
@@ -48,18 +48,18 @@ def images(camera: CameraRenderer) -> list[LabeledImage]:
 @pytest.mark.parametrize(("distance", "expected"), [(1.0, 0.0010), (1.6, 0.0025)])
 def test_noise_grows_with_the_square_of_the_distance(distance: float, expected: float) -> None:
     measured = add_depth_noise(np.full((480, 640), distance, np.float32), rng())
-    held = measured[measured > 0]
+    valid = measured[measured > 0]
     assert measured.dtype == np.float32
-    assert held.size > 0.995 * measured.size
-    assert held.mean() == pytest.approx(distance, abs=0.0003)
-    assert held.std() == pytest.approx(expected, rel=0.08)
-    beside = (measured[:, 1:] > 0) & (measured[:, :-1] > 0)
-    assert np.corrcoef(measured[:, 1:][beside], measured[:, :-1][beside])[0, 1] > 0.4, (
-        "of neighbours"
+    assert valid.size > 0.995 * measured.size
+    assert valid.mean() == pytest.approx(distance, abs=0.0003)
+    assert valid.std() == pytest.approx(expected, rel=0.08)
+    both_valid = (measured[:, 1:] > 0) & (measured[:, :-1] > 0)
+    assert np.corrcoef(measured[:, 1:][both_valid], measured[:, :-1][both_valid])[0, 1] > 0.4, (
+        "neighboring pixels are correlated"
     )
 
 
-def test_disparity_comes_in_steps() -> None:
+def test_disparity_is_quantized() -> None:
     measured = add_depth_noise(np.full((48, 64), 1.2, np.float32), rng())
     steps = (
         D435_DEPTH_NOISE.focal_length
@@ -71,7 +71,7 @@ def test_disparity_comes_in_steps() -> None:
 
 
 def test_holes_are_shadows_and_speckles() -> None:
-    """A wall 0.3 m before the floor: its shadow falls to the left, as wide as the two disparities differ, 3.6 px."""
+    """The shadow of a wall 0.3 m above the floor is as wide as the disparities differ, 3.6 px."""
     depth = np.full((480, 640), 1.6, np.float32)
     depth[100:300, 200:400] = 1.3
     depth[400:] = np.inf
@@ -80,7 +80,7 @@ def test_holes_are_shadows_and_speckles() -> None:
     rows, columns = np.nonzero(holes[:400])
     assert 100 <= rows.min() <= rows.max() < 300
     assert 196 <= columns.min() <= columns.max() == 199
-    assert 200 * 2 < rows.size < 200 * 4, "ragged"
+    assert 200 * 2 < rows.size < 200 * 4, "the edge of the shadow is noisy"
     speckled = add_depth_noise(depth, rng()) == 0
     extra = np.count_nonzero(speckled & ~holes)
     assert (
@@ -91,8 +91,8 @@ def test_holes_are_shadows_and_speckles() -> None:
     assert np.array_equal(add_depth_noise(depth, rng(1)), add_depth_noise(depth, rng(1)))
 
 
-def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabeledImage]) -> None:
-    (tmp_path / ".000000").mkdir()  # of an interrupted run
+def test_images_are_read_as_they_were_written(tmp_path: Path, images: list[LabeledImage]) -> None:
+    (tmp_path / ".000000").mkdir()  # Left by an interrupted run.
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     assert [path.name for path in tmp_path.iterdir()] == ["000000"]
     read = ImageDataset(tmp_path)
@@ -113,20 +113,22 @@ def test_an_item_is_read_as_it_was_written(tmp_path: Path, images: list[LabeledI
         ImageDataset(tmp_path / "000000")
 
 
-def test_shares_are_the_cameras(camera: CameraRenderer, images: list[LabeledImage]) -> None:
+def test_visible_fractions_are_those_of_the_renderer(
+    camera: CameraRenderer, images: list[LabeledImage]
+) -> None:
     assert dict(
         zip(SCENE.names, images[0].visible_fractions, strict=True)
     ) == camera.visible_fractions(SCENE)
 
 
-def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[LabeledImage]) -> None:
+def test_files_conform_to_bop_and_coco(tmp_path: Path, images: list[LabeledImage]) -> None:
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
-    gt, info, eye, coco = (
+    gt, info, camera_entries, coco = (
         json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text())
         for name in ("gt", "gt_info", "camera", "gt_coco")
     )
     names = {category["id"]: category["name"] for category in coco["categories"]}
-    K = np.reshape(eye["0"]["cam_K"], (3, 3))
+    K = np.reshape(camera_entries["0"]["cam_K"], (3, 3))
     for number, instance in enumerate(gt["0"]):
         assert names[instance["obj_id"]] == images[0].classes[number]
         R_CO, p_CO = np.reshape(instance["cam_R_m2c"], (3, 3)), np.array(instance["cam_t_m2c"])
@@ -143,22 +145,24 @@ def test_the_files_say_what_bop_and_coco_say(tmp_path: Path, images: list[Labele
     } | {"bbox_visib": [-1, -1, -1, -1]}
     annotated = [a for a in coco["annotations"] if a["image_id"] == 0]
     assert [names[a["category_id"]] for a in annotated] == list(images[0].classes[1:]), (
-        "the hidden one has no mask"
+        "the hidden instance has no mask"
     )
     for instance, annotation in enumerate(annotated, start=1):
-        mask = decoded(annotation["segmentation"]["counts"], annotation["segmentation"]["size"])
+        mask = decode_run_lengths(
+            annotation["segmentation"]["counts"], annotation["segmentation"]["size"]
+        )
         assert np.array_equal(mask, images[0].label == instance)
         assert annotation["area"] == mask.sum()
 
 
-def test_run_lengths() -> None:
-    """By hand: they run down the columns, and begin with what is outside."""
+def test_encode_run_lengths() -> None:
+    """Counts run down the columns and begin with pixels outside of the mask."""
     assert encode_run_lengths(np.array([[False, True], [True, True]])) == [1, 3]
     assert encode_run_lengths(np.array([[True, False], [False, False]])) == [0, 1, 3]
     assert encode_run_lengths(np.zeros((2, 3), bool)) == [6]
 
 
-def test_a_heap() -> None:
+def test_dropped_objects_start_apart_and_end_on_the_tray() -> None:
     classes = [CLASSES[name] for name in ("gelatin_box", "tomato_soup_can", "pudding_box")]
     start = sample_drop_scene(classes, TRAY, rng(2))
     for k, one in enumerate(start.objects):
@@ -168,14 +172,16 @@ def test_a_heap() -> None:
                 < np.maximum(one.bounds_T[0], o.bounds_T[0])
             ).any()
             for o in start.objects[:k]
-        ), "nothing begins within another"
+        ), "no objects overlap at the start"
     early, late = simulate_drop(start, 0.002, (0.1, 0.5))
     assert len(early.objects) == 3
     assert all(late[o.name].X_TO.p[2] < o.X_TO.p[2] for o in start.objects if o.name in late.names)
     assert all(o.bounds_T[0][2] > -0.002 for o in late.objects)
 
 
-def test_the_same_seed_makes_the_same_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_seed_generates_the_same_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     script = training_script("render_image_dataset")
     monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
     monkeypatch.setattr(script, "NODES", 10)

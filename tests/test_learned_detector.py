@@ -1,4 +1,4 @@
-"""The shipped networks in images that nobody has learned from."""
+"""Shipped detectors on images that are not part of the training data."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ def detector(request: pytest.FixtureRequest, config: ClutterConfig) -> LearnedDe
     )
 
 
-def heap() -> Scene:
-    """Two small boxes side by side, whose tops together look like a larger one's, and other things about them."""
+def cluttered_scene() -> Scene:
+    """Return a scene with two adjacent small boxes, which together look like a larger one."""
     boxes = [
         resting("gelatin_box", Orientation.FLAT_0, (0.0, y), name=f"gelatin_box_{y}")
         for y in (-0.0375, 0.0375)
@@ -35,22 +35,24 @@ def heap() -> Scene:
     return scene_of(*boxes, *others, resting("cracker_box", Orientation.FLAT_0, (0.2, -0.2)))
 
 
-def test_it_sees_what_is_there_and_is_sure_of_it(
+def test_all_objects_are_detected_with_confidence(
     detector: LearnedDetector, config: ClutterConfig
 ) -> None:
-    scene = heap()
+    scene = cluttered_scene()
     images = CameraRenderer(config.cell.camera).render(scene)
-    seen = detector.detect(images.depth, images.color)
-    assert sorted(d.object_class.name for d in seen.detections) == sorted(
+    observation = detector.detect(images.depth, images.color)
+    assert sorted(d.object_class.name for d in observation.detections) == sorted(
         o.object_class.name for o in scene.objects
     )
     for o in scene.objects:
-        nearest = min(seen.detections, key=lambda d: float(np.linalg.norm(d.X_TO.p - o.X_TO.p)))
+        nearest = min(
+            observation.detections, key=lambda d: float(np.linalg.norm(d.X_TO.p - o.X_TO.p))
+        )
         assert nearest.object_class.name == o.object_class.name
         assert np.linalg.norm(nearest.X_TO.p - o.X_TO.p) < 0.005
-    assert sum(d.is_confident for d in seen.detections) >= len(scene.objects) - 1
+    assert sum(d.is_confident for d in observation.detections) >= len(scene.objects) - 1
 
 
-def test_an_empty_tray_is_empty(detector: LearnedDetector, config: ClutterConfig) -> None:
+def test_an_empty_tray_has_no_detections(detector: LearnedDetector, config: ClutterConfig) -> None:
     images = CameraRenderer(config.cell.camera).render(scene_of())
     assert detector.detect(images.depth, images.color).detections == ()

@@ -1,4 +1,4 @@
-"""Of many poses those that are really there, in rendered depth."""
+"""Selection of consistent poses in rendered depth images."""
 
 from dataclasses import replace
 
@@ -16,49 +16,49 @@ ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top_height)
 BESIDE = resting("gelatin_box", xy=(0.2, 0.1))
 
 
-def found(
-    there: list[SceneObject], said: list[SceneObject], scores: list[float] | None = None
+def select(
+    true: list[SceneObject], hypotheses: list[SceneObject], scores: list[float] | None = None
 ) -> list[int]:
-    depth = LabelDetector(CAMERA).perceive(scene_of(*there)).observation.depth
-    explained = [evaluate_pose(o.object_class, o.X_TO, depth, CAMERA) for o in said]
-    return sorted(select_consistent_poses(explained, scores or [0.8] * len(said), depth.shape, 0.2))
-
-
-def test_what_is_there_is_found() -> None:
-    assert found([BOX, ON_TOP, BESIDE], [BOX, ON_TOP, BESIDE]) == [0, 1, 2]
-
-
-def test_an_explanation_counts_pixels_as_the_label_image_does() -> None:
-    look = LabelDetector(CAMERA).perceive(scene_of(BOX, ON_TOP))
-    by_name = {d.name: d.mask for d in look.observation.detections}
-    for o in (BOX, ON_TOP):
-        e = evaluate_pose(o.object_class, o.X_TO, look.observation.depth, CAMERA)
-        mask = np.zeros(look.observation.depth.shape, bool)
-        mask[e.window] = e.consistent
-        either = np.count_nonzero(mask | by_name[o.name])
-        assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * either
-    assert e.unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), (
-        "nothing stands before the can"
+    depth = LabelDetector(CAMERA).perceive(scene_of(*true)).observation.depth
+    evidence = [evaluate_pose(o.object_class, o.X_TO, depth, CAMERA) for o in hypotheses]
+    return sorted(
+        select_consistent_poses(evidence, scores or [0.8] * len(hypotheses), depth.shape, 0.2)
     )
 
 
-def test_an_object_that_is_fitted_twice_is_one() -> None:
+def test_all_true_poses_are_selected() -> None:
+    assert select([BOX, ON_TOP, BESIDE], [BOX, ON_TOP, BESIDE]) == [0, 1, 2]
+
+
+def test_evidence_agrees_with_the_label_image() -> None:
+    observation = LabelDetector(CAMERA).perceive(scene_of(BOX, ON_TOP)).observation
+    by_name = {d.name: d.mask for d in observation.detections}
+    for o in (BOX, ON_TOP):
+        e = evaluate_pose(o.object_class, o.X_TO, observation.depth, CAMERA)
+        mask = np.zeros(observation.depth.shape, bool)
+        mask[e.window] = e.consistent
+        either = np.count_nonzero(mask | by_name[o.name])
+        assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * either
+    assert e.unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), "nothing occludes the can"
+
+
+def test_an_object_with_two_hypotheses_is_selected_once() -> None:
     again = replace(BOX, X_TO=BOX.X_TO.translated((0.002, -0.001, 0.001)))
-    assert found([BOX], [again, BOX], [0.7, 0.9]) == [1]
+    assert select([BOX], [again, BOX], [0.7, 0.9]) == [1]
 
 
-def test_a_smaller_class_on_the_face_of_a_larger_is_none() -> None:
+def test_a_smaller_class_on_the_face_of_a_larger_object_is_rejected() -> None:
     part = SceneObject("part", CLASSES["gelatin_box"], Pose((0.03, 0.0, BOX.top_height - 0.014)))
-    assert found([BOX], [part, BOX]) == [1]
+    assert select([BOX], [part, BOX]) == [1]
 
 
-def test_what_the_camera_sees_past_is_not_there() -> None:
+def test_poses_with_free_space_violations_are_rejected() -> None:
     aside = replace(BESIDE, X_TO=BESIDE.X_TO.translated((0.05, 0.0, 0.0)))
-    in_the_air = replace(BESIDE, X_TO=BESIDE.X_TO.translated((0.0, 0.0, 0.05)))
-    assert found([BOX, BESIDE], [aside, in_the_air]) == []
+    floating = replace(BESIDE, X_TO=BESIDE.X_TO.translated((0.0, 0.0, 0.05)))
+    assert select([BOX, BESIDE], [aside, floating]) == []
 
 
-def test_what_is_hardly_seen_is_left_out() -> None:
+def test_a_mostly_occluded_object_is_not_selected() -> None:
     covered = resting("pudding_box", floor=0.0)
     cover = resting("cracker_box", Orientation.FLAT_0, xy=(0.01, 0.0), floor=covered.top_height)
-    assert found([covered, cover], [covered, cover]) == [1]
+    assert select([covered, cover], [covered, cover]) == [1]

@@ -1,4 +1,4 @@
-"""The runner on a Ray cluster of two nodes, all on this machine: the results of one worker here, whatever dies on the way."""
+"""Parallel map on a local Ray cluster of two nodes: the same results when workers die."""
 
 import json
 import os
@@ -32,34 +32,35 @@ from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.workers.parallel_map import map_ordered
 
-Drawn = tuple[int, NDArray[np.float64]]
+ItemNumbers = tuple[int, NDArray[np.float64]]
 Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
-class Draws:
-    """Draws numbers for an item, so many that Ray sends them by its shared memory; some items take longer than others.
+class RandomNumbers:
+    """Return so many random numbers that Ray transfers them in shared memory.
 
     Attributes:
-        begun: a folder that gets a file for every item that was begun.
-        deadly: items that kill their process at the first try.
-        deadliest: the item that kills its process at every try.
-        trap: the node on which an item takes a minute; from then on "sprung" is in the folder. The other node waits for that.
+        started: Folder that gets a file for every item that was started.
+        deadly: Items that kill their process at the first attempt.
+        deadliest: Item that kills its process at every attempt.
+        trap: Node on which an item takes a minute; then the folder contains the file "sprung". The
+            other node waits for that.
     """
 
-    begun: Path
+    started: Path
     deadly: tuple[int, ...] = ()
     deadliest: int | None = None
     trap: str | None = None
 
-    def __call__(self, item: int) -> Drawn:
-        first_try = not (self.begun / f"{item}").exists()
-        (self.begun / f"{item}").touch()
+    def __call__(self, item: int) -> ItemNumbers:
+        is_first_attempt = not (self.started / f"{item}").exists()
+        (self.started / f"{item}").touch()
         time.sleep(0.1 if item % 4 == 0 else 0.0)
-        if (item in self.deadly and first_try) or item == self.deadliest:
+        if (item in self.deadly and is_first_attempt) or item == self.deadliest:
             os.kill(os.getpid(), signal.SIGKILL)
         if self.trap is not None:
-            sprung = self.begun / "sprung"
+            sprung = self.started / "sprung"
             if ray.get_runtime_context().get_node_id() == self.trap:
                 sprung.touch()
                 time.sleep(60.0)
@@ -67,16 +68,16 @@ class Draws:
         return item, item_rng(7, item).normal(size=20_000)
 
 
-def bits(results: Iterable[Drawn]) -> list[tuple[int, bytes]]:
+def to_bytes(results: Iterable[ItemNumbers]) -> list[tuple[int, bytes]]:
     return [(item, numbers.tobytes()) for item, numbers in results]
 
 
-def look_around(file: str) -> tuple[int, str, str | None]:
+def read_environment(file: str) -> tuple[int, str, str | None]:
     return os.getpid(), Path(file).read_text(), os.environ.get("OPENBLAS_NUM_THREADS")
 
 
-def make_look_around() -> Callable[[str], tuple[int, str, str | None]]:
-    return look_around
+def make_environment_reader() -> Callable[[str], tuple[int, str, str | None]]:
+    return read_environment
 
 
 def sleep(seconds: float) -> int:
@@ -89,19 +90,19 @@ def make_sleeper() -> Callable[[float], int]:
 
 
 def wait_for(condition: Callable[[], Found]) -> Found:
-    deadline = time.monotonic() + 240  # a busy machine takes a minute to start a worker
+    deadline = time.monotonic() + 240  # Starting a worker may take a minute.
     while not (found := condition()):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     return found
 
 
-def processes_at_work(cluster: Cluster) -> list[int]:
-    """The actors' processes that work on an item: Ray says so in their titles; their parents are the cluster's nodes."""
+def busy_worker_processes(cluster: Cluster) -> list[int]:
+    """Return the actors that process an item, by the process titles that Ray sets."""
     nodes = {node.all_processes["raylet"][0].process.pid for node in cluster.list_all_nodes()}
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # The process has ended.
             parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
             if parent in nodes and (folder / "cmdline").read_text().startswith("ray::_Actor.work"):
                 found.append(int(folder.name))
@@ -110,7 +111,7 @@ def processes_at_work(cluster: Cluster) -> list[int]:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """Two nodes with room for one worker each, whose processes find this module. This process is connected to the first."""
+    """Return a cluster of two nodes with one CPU each; this process is connected to it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
         nodes = Cluster()
@@ -125,37 +126,42 @@ def cluster() -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, bytes]]:
-    """What one worker here makes of the first items."""
-    return bits(map_ordered(partial(Draws, tmp_path_factory.mktemp("alone")), range(12), workers=1))
+def local_results(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, bytes]]:
+    """Return the results of one local worker for the first items."""
+    return to_bytes(
+        map_ordered(partial(RandomNumbers, tmp_path_factory.mktemp("local")), range(12), workers=1)
+    )
 
 
-def test_results_and_their_order_are_those_of_one_worker_here(
-    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+def test_results_and_order_are_those_of_one_local_worker(
+    cluster: Cluster, tmp_path: Path, local_results: list[tuple[int, bytes]]
 ) -> None:
     """One of the three finds no room, and holds nothing up."""
     there = list(
         map_ordered(
-            partial(Draws, tmp_path), iter(range(12)), workers=3, ray_address=cluster.address
+            partial(RandomNumbers, tmp_path),
+            iter(range(12)),
+            workers=3,
+            ray_address=cluster.address,
         )
     )
     assert [item for item, _ in there] == list(range(12))
-    assert bits(there) == alone
+    assert to_bytes(there) == local_results
     assert all(numbers.flags.writeable for _, numbers in there)
 
 
-def test_items_of_killed_workers_are_done_again_but_not_for_ever(
-    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+def test_items_of_killed_workers_are_repeated_a_limited_number_of_times(
+    cluster: Cluster, tmp_path: Path, local_results: list[tuple[int, bytes]]
 ) -> None:
-    make_worker = partial(Draws, tmp_path, deadly=(0, 5), deadliest=12)
+    make_worker = partial(RandomNumbers, tmp_path, deadly=(0, 5), deadliest=12)
     results = map_ordered(make_worker, range(20), workers=2, ray_address=cluster.address)
-    assert bits(islice(results, 12)) == alone
+    assert to_bytes(islice(results, 12)) == local_results
     with pytest.raises(BrokenProcessPool, match="an item ended 3 worker processes"):
         next(results)
 
 
-def test_items_of_a_lost_node_are_done_again(
-    cluster: Cluster, tmp_path: Path, alone: list[tuple[int, bytes]]
+def test_items_of_a_lost_node_are_repeated(
+    cluster: Cluster, tmp_path: Path, local_results: list[tuple[int, bytes]]
 ) -> None:
     """By the worker on the other node, where there is no room for the lost one."""
     node = next(iter(cluster.worker_nodes))
@@ -167,10 +173,10 @@ def test_items_of_a_lost_node_are_done_again(
     loser = threading.Thread(target=lose)
     loser.start()
     try:
-        make_worker = partial(Draws, tmp_path, trap=node.node_id)
+        make_worker = partial(RandomNumbers, tmp_path, trap=node.node_id)
         assert (
-            bits(map_ordered(make_worker, range(12), workers=2, ray_address=cluster.address))
-            == alone
+            to_bytes(map_ordered(make_worker, range(12), workers=2, ray_address=cluster.address))
+            == local_results
         )
     finally:
         loser.join()
@@ -178,14 +184,17 @@ def test_items_of_a_lost_node_are_done_again(
     assert node not in cluster.list_all_nodes()
 
 
-def test_generate_with_a_killed_worker_writes_the_same_scenes(
+def test_generate_writes_the_same_scenes_when_a_worker_is_killed(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     job = GenerationJob("random", "ycb7", None, nodes=5, seed=5, config=ClutterConfig())
-    (tmp_path / "alone/scenes").mkdir(parents=True)
+    (tmp_path / "local/scenes").mkdir(parents=True)
     for index, made in enumerate(map_ordered(partial(SceneGenerator, job), range(3), workers=1)):
         save_scene(
-            tmp_path / f"alone/scenes/{index:04d}.yaml", made.scene, DEFAULT_CELL, made.verdict
+            tmp_path / f"local/scenes/{index:04d}.yaml",
+            made.scene,
+            DEFAULT_CELL,
+            made.verdict,
         )
     command = [sys.executable, "-c", "from drake_clutter.cli import main; main()"]
     command += [
@@ -202,14 +211,14 @@ def test_generate_with_a_killed_worker_writes_the_same_scenes(
     ]
     command += ["--workers", "2", "--ray", cluster.address]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        os.kill(wait_for(lambda: processes_at_work(cluster))[0], signal.SIGKILL)
+        os.kill(wait_for(lambda: busy_worker_processes(cluster))[0], signal.SIGKILL)
         output, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert read_scene_files(tmp_path / "there") == read_scene_files(tmp_path / "alone")
+    assert read_scene_files(tmp_path / "there") == read_scene_files(tmp_path / "local")
     assert json.loads(output)["count"] == 3  # what Ray says of the killed worker is not among it
 
 
-def test_exceptions_come_in_their_place_and_as_themselves(cluster: Cluster) -> None:
+def test_exceptions_are_raised_unchanged_in_the_order_of_items(cluster: Cluster) -> None:
     results = map_ordered(
         partial(failing_worker, 3), range(10), workers=2, ray_address=cluster.address
     )
@@ -220,14 +229,16 @@ def test_exceptions_come_in_their_place_and_as_themselves(cluster: Cluster) -> N
         next(map_ordered(broken_factory, range(3), workers=1, ray_address=cluster.address))
 
 
-def test_workers_are_like_local_ones(
+def test_workers_have_the_folder_and_environment_of_local_ones(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Processes of their own, which start in this folder and are told to use one thread."""
     monkeypatch.chdir(tmp_path)
     Path("here.txt").write_text("found")
     seen = list(
-        map_ordered(make_look_around, ["here.txt"] * 6, workers=2, ray_address=cluster.address)
+        map_ordered(
+            make_environment_reader, ["here.txt"] * 6, workers=2, ray_address=cluster.address
+        )
     )
     pids = {pid for pid, _, _ in seen}
     assert len(pids) <= 2
@@ -235,7 +246,7 @@ def test_workers_are_like_local_ones(
     assert {(text, threads) for _, text, threads in seen} == {("found", "1")}
 
 
-def test_closing_midway_ends_the_workers(cluster: Cluster) -> None:
+def test_closing_early_ends_the_workers(cluster: Cluster) -> None:
     read: list[float] = []
 
     def endless() -> Iterator[float]:
@@ -257,8 +268,10 @@ def test_ctrl_c_ends_the_workers(cluster: Cluster) -> None:
     code = f"""
 import signal
 from test_ray_pool import make_sleeper, map_ordered
-signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
-for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_address="{cluster.address}"):
+# A background process of a shell ignores SIGINT by default.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+address = "{cluster.address}"
+for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_address=address):
     print(result, flush=True)
 """
     with subprocess.Popen(
@@ -266,20 +279,20 @@ for result in map_ordered(make_sleeper, [0.0, 60.0, 60.0], workers=2, ray_addres
     ) as process:
         assert process.stdout is not None
         assert int(process.stdout.readline()) > 0
-        workers = wait_for(lambda: processes_at_work(cluster))
+        workers = wait_for(lambda: busy_worker_processes(cluster))
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=20)
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
     assert errors.rstrip().endswith(b"KeyboardInterrupt")
 
 
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r'--ray auto: .* pip install "drake-clutter\[scale\]"'):
         next(map_ordered(make_sleeper, [0.0], workers=1, ray_address="auto"))
 
 
-def test_a_cluster_that_is_not_there_is_not_waited_for(tmp_path: Path) -> None:
+def test_an_absent_cluster_is_reported_quickly(tmp_path: Path) -> None:
     settled = {"below": BELOW["X_TO"], "above": ABOVE["X_TO"]}
     verdict = {
         "stable": True,

@@ -8,7 +8,7 @@ import pytest
 from drake_clutter import resources
 
 
-def test_results_do_not_make_a_commit_dirty_and_code_does(
+def test_modified_code_makes_a_commit_dirty_and_modified_results_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def git(*arguments: str) -> None:

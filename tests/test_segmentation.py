@@ -1,4 +1,4 @@
-"""The segmentation network: what it is given, how votes become objects, and that it learns and can be interrupted."""
+"""Segmentation network: its input, clusters of votes, training and checkpoints."""
 
 from pathlib import Path
 
@@ -38,13 +38,13 @@ WINDOW = ImageWindow.around_support(CAMERA, TRAY)
 CLASSES = ("gelatin_box", "sugar_box")
 
 
-def picture(number: int) -> LabeledImage:
-    """Two boxes of different heights on the floor, told by nothing but that."""
-    draw = rng(number)
+def labeled_image(number: int) -> LabeledImage:
+    """Return an image of two boxes, which differ only in height and size."""
+    generator = rng(number)
     depth, label = np.full((120, 160), 1.6, np.float32), np.full((120, 160), -1)
     poses = []
     for k, (height, half) in enumerate(((0.05, 6), (0.15, 9))):
-        row, column = int(draw.integers(20, 100)), int(draw.integers(45, 75)) + 40 * k
+        row, column = int(generator.integers(20, 100)), int(generator.integers(45, 75)) + 40 * k
         patch = slice(row - half, row + half), slice(column - half, column + half)
         depth[patch], label[patch] = 1.6 - height, k
         pixel = (1.6 - height) / CAMERA.focal_length
@@ -58,7 +58,7 @@ def picture(number: int) -> LabeledImage:
     )
 
 
-def test_the_window_holds_the_tray() -> None:
+def test_the_window_contains_the_space_above_the_tray() -> None:
     corner = np.array([[0.35, 0.35, 0.5], [-0.35, -0.35, 0.5]])
     for camera in (DEFAULT_CELL.camera, CAMERA):
         window = ImageWindow.around_support(camera, TRAY)
@@ -68,8 +68,8 @@ def test_the_window_holds_the_tray() -> None:
         assert window.rows.start <= top < bottom < window.rows.stop
 
 
-def test_points_are_what_the_camera_projects() -> None:
-    image = picture(0)
+def test_backprojection_inverts_projection() -> None:
+    image = labeled_image(0)
     p_TP = backproject_window(image.depth, CAMERA, WINDOW)
     row, column = 40, 31
     assert CAMERA.project(p_TP[row, column][None]) == pytest.approx(
@@ -77,69 +77,70 @@ def test_points_are_what_the_camera_projects() -> None:
     )
     image.depth[WINDOW.rows.start, WINDOW.columns.start] = 0.0
     assert np.isnan(backproject_window(image.depth, CAMERA, WINDOW)[0, 0]).all()
-    given = make_network_input(backproject_window(image.depth, CAMERA, WINDOW), None)
-    assert given.shape == (4, WINDOW.side, WINDOW.side)
-    assert given[:2, 0, 0] == pytest.approx([0.0, 0.0])
+    network_input = make_network_input(backproject_window(image.depth, CAMERA, WINDOW), None)
+    assert network_input.shape == (4, WINDOW.side, WINDOW.side)
+    assert network_input[:2, 0, 0] == pytest.approx([0.0, 0.0])
 
 
-def test_slopes_are_given_and_holes_are_as_high_as_what_is_beside_them() -> None:
+def test_network_input_contains_slopes_and_filled_holes() -> None:
     x, y = np.meshgrid(np.arange(40) * 0.0025, np.arange(40) * 0.0025)
-    points_T = np.stack([x, y, 0.5 * x], axis=-1)
-    points_T[10:14, 20:24, 2] = np.nan
-    height, known, along_rows, along_columns = make_network_input(points_T, None)
-    assert not known[12, 22]
+    p_TP = np.stack([x, y, 0.5 * x], axis=-1)
+    p_TP[10:14, 20:24, 2] = np.nan
+    height, is_measured, along_rows, along_columns = make_network_input(p_TP, None)
+    assert not is_measured[12, 22]
     assert height[12, 22] == pytest.approx(0.5 * 22 * 0.0025 / 0.25), (
-        "of the row two below, which is nearest"
+        "the nearest measurement is two rows below"
     )
     assert along_columns[30, 20] == pytest.approx(np.arctan(0.5), abs=1e-3)
     assert along_rows[30, 20] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_what_is_rare_weighs_more_and_the_mean_pixel_one() -> None:
-    kind = np.array([0] * 81 + [1] * 9 + [2] + [-1] * 7)
-    weights = class_weights([kind], 2).numpy()
+def test_rare_classes_have_larger_weights_with_a_mean_of_one() -> None:
+    class_map = np.array([0] * 81 + [1] * 9 + [2] + [-1] * 7)
+    weights = class_weights([class_map], 2).numpy()
     assert weights[1] / weights[0] == pytest.approx(3.0)
     assert weights[2] / weights[0] == pytest.approx(9.0)
-    assert weights[kind[kind >= 0]].mean() == pytest.approx(1.0)
+    assert weights[class_map[class_map >= 0]].mean() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_turned_and_mirrored_examples_vote_for_the_same_middles(seed: int) -> None:
-    image = picture(1)
+def test_augmented_examples_have_consistent_center_offsets(seed: int) -> None:
+    image = labeled_image(1)
     plain = make_example(image, CLASSES, CAMERA, WINDOW, None, False)
     turned = make_example(image, CLASSES, CAMERA, WINDOW, rng(seed), False)
-    for kind in (1, 2):
+    for label in (1, 2):
         lengths = [
-            np.linalg.norm(e.center_offsets[:, e.class_map == kind], axis=0)
+            np.linalg.norm(e.center_offsets[:, e.class_map == label], axis=0)
             for e in (plain, turned)
         ]
         assert np.nanmedian(lengths[1]) == pytest.approx(np.nanmedian(lengths[0]), abs=0.01)
     p_TP = downsample(backproject_window(image.depth, CAMERA, WINDOW))
-    voted = p_TP + np.moveaxis(plain.center_offsets, 0, 2)
+    centers = p_TP + np.moveaxis(plain.center_offsets, 0, 2)
     for k, pose in enumerate(image.X_TO):
-        of_one = voted[plain.class_map == k + 1]
-        assert of_one == pytest.approx(np.broadcast_to(pose.translation, of_one.shape), abs=1e-6)
+        centers_of_object = centers[plain.class_map == k + 1]
+        assert centers_of_object == pytest.approx(
+            np.broadcast_to(pose.translation, centers_of_object.shape), abs=1e-6
+        )
 
 
-def test_votes_for_one_place_are_one_object() -> None:
-    draw = rng(3)
-    centres = np.array(
-        [[0.0, 0.0, 0.02], [0.0, 0.0, 0.06], [0.2, 0.1, 0.02]]
-    )  # two lie across each other
+def test_votes_for_one_center_form_one_cluster() -> None:
+    generator = rng(3)
+    # The first two objects are one above the other.
+    centers = np.array([[0.0, 0.0, 0.02], [0.0, 0.0, 0.06], [0.2, 0.1, 0.02]])
     votes = np.vstack(
         [
-            centre + draw.normal(0, 0.003, (count, 3))
-            for centre, count in zip(centres, (900, 300, 40), strict=True)
+            center + generator.normal(0, 0.003, (count, 3))
+            for center, count in zip(centers, (900, 300, 40), strict=True)
         ]
     )
     number = cluster_votes(np.vstack([votes, [[0.5, 0.5, 0.5]]]), 0.015, 8)
-    assert number[-1] < 0, "one vote is no object"
+    assert number[-1] < 0, "a single vote is not an object"
     assert [len(set(part)) for part in np.split(number[:-1], [900, 1200])] == [1, 1, 1]
     assert len(set(number[:-1])) == 3
 
 
-def test_segments_are_masks_in_the_image() -> None:
-    image = picture(2)
+def test_extracted_segments_match_the_true_masks() -> None:
+    image = labeled_image(2)
     plain = make_example(image, CLASSES, CAMERA, WINDOW, None, False)
     votes = downsample(backproject_window(image.depth, CAMERA, WINDOW)) + np.moveaxis(
         plain.center_offsets, 0, 2
@@ -155,19 +156,21 @@ def test_segments_are_masks_in_the_image() -> None:
 
 
 @pytest.mark.parametrize("use_color", [False, True])
-def test_shapes(use_color: bool, tmp_path: Path) -> None:
+def test_output_shapes_and_checkpoint(use_color: bool, tmp_path: Path) -> None:
     network = SegmentationNetwork(CLASSES, use_color).eval()
-    given = torch.randn(2, 7 if use_color else 4, 64, 64)
-    logits, votes = network(given)
+    network_input = torch.randn(2, 7 if use_color else 4, 64, 64)
+    logits, votes = network(network_input)
     assert (logits.shape, votes.shape) == ((2, 3, 32, 32), (2, 3, 32, 32))
-    assert torch.allclose(network(given[:1])[0], logits[:1], atol=1e-5), "one by one as in a batch"
-    about = {"kind": CHECKPOINT_KIND, "classes": list(CLASSES), "use_color": use_color}
-    save_checkpoint(tmp_path / "d.safetensors", network, about)
-    again = SegmentationNetwork.load(tmp_path / "d.safetensors")
-    assert torch.equal(again(given)[1], votes)
+    assert torch.allclose(network(network_input[:1])[0], logits[:1], atol=1e-5), (
+        "the same without batching"
+    )
+    metadata = {"kind": CHECKPOINT_KIND, "classes": list(CLASSES), "use_color": use_color}
+    save_checkpoint(tmp_path / "d.safetensors", network, metadata)
+    loaded = SegmentationNetwork.load(tmp_path / "d.safetensors")
+    assert torch.equal(loaded(network_input)[1], votes)
 
 
-def test_a_checkpoint_of_something_else_is_refused() -> None:
+def test_a_checkpoint_of_another_kind_is_rejected() -> None:
     student = resource_path("training/checkpoints/student.safetensors")
     with pytest.raises(
         InputError,
@@ -176,39 +179,42 @@ def test_a_checkpoint_of_something_else_is_refused() -> None:
         SegmentationNetwork.load(student)
 
 
-def test_a_warm_start_answers_as_what_it_begins_with_whatever_the_colours_and_other_classes_are() -> (
-    None
-):
-    learned = SegmentationNetwork(CLASSES, False).eval()
+def test_a_warm_started_network_has_the_outputs_of_the_pretrained_one() -> None:
+    pretrained = SegmentationNetwork(CLASSES, False).eval()
     network = SegmentationNetwork(("mug", *reversed(CLASSES)), True).eval()
-    network.warm_start(learned)
-    given = torch.randn(2, 7, 64, 64)
-    (logits, votes), (expected, expected_votes) = network(given), learned(given[:, :4])
+    network.warm_start(pretrained)
+    network_input = torch.randn(2, 7, 64, 64)
+    (logits, votes), (expected, expected_votes) = (
+        network(network_input),
+        pretrained(network_input[:, :4]),
+    )
     assert torch.allclose(logits[:, [0, 3, 2]], expected, atol=1e-5)
     assert torch.allclose(votes, expected_votes, atol=1e-6)
     assert not torch.allclose(logits[:, 1], expected[:, 1])
 
 
-def test_the_loss_leaves_out_what_is_not_known() -> None:
-    kind = torch.tensor([[[1, 0], [2, 0]]])
-    to_middle = torch.full((1, 3, 2, 2), torch.nan)
-    to_middle[0, :, 0, 0] = 0.1
-    logits = torch.nn.functional.one_hot(kind, 3).permute(0, 3, 1, 2) * 50.0
-    of_classes, of_votes = segmentation_loss(
-        logits, torch.zeros(1, 3, 2, 2), kind, to_middle, torch.ones(3)
+def test_the_loss_ignores_unknown_targets() -> None:
+    class_map = torch.tensor([[[1, 0], [2, 0]]])
+    center_offsets = torch.full((1, 3, 2, 2), torch.nan)
+    center_offsets[0, :, 0, 0] = 0.1
+    logits = torch.nn.functional.one_hot(class_map, 3).permute(0, 3, 1, 2) * 50.0
+    class_loss, vote_loss = segmentation_loss(
+        logits, torch.zeros(1, 3, 2, 2), class_map, center_offsets, torch.ones(3)
     )
-    assert float(of_classes) == pytest.approx(0.0, abs=1e-6)
-    assert float(of_votes) == pytest.approx(0.3)
+    assert float(class_loss) == pytest.approx(0.0, abs=1e-6)
+    assert float(vote_loss) == pytest.approx(0.3)
 
 
 def learner() -> SegmentationLearner:
     torch.manual_seed(0)
     config = SegmentationConfig(steps=40, batch_size=4)
     network = SegmentationNetwork(CLASSES, False)
-    return SegmentationLearner(network, picture, 20, config, CAMERA, TRAY, 0, torch.device("cpu"))
+    return SegmentationLearner(
+        network, labeled_image, 20, config, CAMERA, TRAY, 0, torch.device("cpu")
+    )
 
 
-def test_it_learns_and_ends_with_the_same_weights_after_an_interruption(tmp_path: Path) -> None:
+def test_training_reduces_the_loss_and_resumes_with_identical_weights(tmp_path: Path) -> None:
     whole = learner()
     losses = []
     for step in range(40):

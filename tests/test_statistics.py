@@ -12,7 +12,7 @@ from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wi
 @pytest.mark.parametrize(
     ("successes", "count", "low", "high"),
     [
-        # Published examples of the score interval (Newcombe 1998, table I, method 3) and the closed forms at the ends.
+        # Newcombe 1998, Table I, method 3, and the closed forms for extreme proportions.
         (81, 263, 0.2553, 0.3662),
         (15, 148, 0.0624, 0.1605),
         (0, 20, 0.0, 0.1611),
@@ -26,7 +26,7 @@ def test_wilson_interval(successes: int, count: int, low: float, high: float) ->
 
 
 def test_mean_interval() -> None:
-    """Standard deviation 2, so the mean of four is known to 1.96 * 2 / 2."""
+    """The standard deviation is 2, so the half width for four values is 1.96 * 2 / 2."""
     assert mean_interval([1.0, 1.0, 4.4641016, 4.4641016]) == pytest.approx(
         (2.7320508 - 1.959964, 2.7320508 + 1.959964)
     )
@@ -35,7 +35,7 @@ def test_mean_interval() -> None:
 
 
 def test_bootstrap_ratio_interval() -> None:
-    """A ratio that is the same in every scene is known for sure; else it lies within."""
+    """The interval of a constant ratio has no width; other intervals contain the ratio."""
     assert bootstrap_ratio_interval([1, 2, 3], [2, 4, 6]) == (0.5, 0.5)
     low, high = bootstrap_ratio_interval([1, 2, 3, 0], [2, 2, 3, 2])
     assert 0 < low < 6 / 9 < high <= 1

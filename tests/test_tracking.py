@@ -1,4 +1,4 @@
-"""Names that last from image to image."""
+"""Association of detections with known objects."""
 
 from dataclasses import replace
 
@@ -23,21 +23,22 @@ def at(x: float, y: float, name: str = CAN) -> SceneObject:
 
 
 def image(*objects: SceneObject, top: float = 0.1) -> Observation:
-    """Of objects whose names say nothing; everywhere is seen what is `top` high, m."""
+    """Return detections with arbitrary names in an image of a surface at height `top` [m]."""
     depth = np.full((CAMERA.height, CAMERA.width), CAMERA.X_TC.translation()[2] - top, np.float32)
-    nothing = np.zeros(depth.shape, bool)
+    empty_mask = np.zeros(depth.shape, bool)
     detections = [
-        Detection(f"seen {k}", o.object_class, o.X_TO, nothing) for k, o in enumerate(objects)
+        Detection(f"detection {k}", o.object_class, o.X_TO, empty_mask)
+        for k, o in enumerate(objects)
     ]
     return Observation(depth, tuple(detections), CAMERA, TRAY)
 
 
 def names(known: list[SceneObject], observation: Observation) -> dict[str, tuple[float, float]]:
-    found, _ = associate_detections(known, observation)
-    return {d.name: d.X_TO.translation[:2] for d in found.detections}
+    result, _ = associate_detections(known, observation)
+    return {d.name: d.X_TO.translation[:2] for d in result.detections}
 
 
-def test_what_is_new_gets_a_name_of_its_own() -> None:
+def test_new_objects_get_new_names() -> None:
     assert names([], image(at(0, 0), at(0.1, 0))) == {f"{CAN}_1": (0, 0), f"{CAN}_2": (0.1, 0)}
     assert names([at(0, 0, f"{CAN}_1")], image(at(0.01, 0), at(0.2, 0))) == {
         f"{CAN}_1": (0.01, 0),
@@ -45,7 +46,7 @@ def test_what_is_new_gets_a_name_of_its_own() -> None:
     }
 
 
-def test_the_names_of_what_was_lost_are_given_again_but_never_twice() -> None:
+def test_names_of_lost_objects_are_reused_only_once() -> None:
     assert names([at(0, 0, f"{CAN}_2")], image(at(0, 0), at(0.2, 0), at(0.2, 0.2))) == {
         f"{CAN}_1": (0.2, 0),
         f"{CAN}_2": (0, 0),
@@ -53,7 +54,7 @@ def test_the_names_of_what_was_lost_are_given_again_but_never_twice() -> None:
     }
 
 
-def test_two_of_a_class_are_not_exchanged() -> None:
+def test_two_objects_of_a_class_keep_their_names() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.03, 0, f"{CAN}_2")]
     assert names(known, image(at(0.035, 0), at(0.012, 0))) == {
         f"{CAN}_1": (0.012, 0),
@@ -61,59 +62,59 @@ def test_two_of_a_class_are_not_exchanged() -> None:
     }
 
 
-def test_classes_are_told_apart() -> None:
+def test_objects_of_different_classes_are_not_associated() -> None:
     box = replace(at(0, 0), name="sugar_box_1", object_class=CLASSES["sugar_box"])
     assert set(names([box], image(at(0, 0)))) == {f"{CAN}_1"}
 
 
-def test_what_is_gone_from_its_place_and_seen_elsewhere_has_moved() -> None:
+def test_an_object_detected_at_another_position_keeps_its_name() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
     floor = image(at(-0.2, 0), at(0.2, 0.2), top=0.0)
     assert names(known, floor) == {f"{CAN}_1": (-0.2, 0), f"{CAN}_2": (0.2, 0.2)}
     covered = image(at(-0.2, 0), at(0.2, 0.2), top=0.1)
     assert names(known, covered)[f"{CAN}_3"] == (-0.2, 0), (
-        "the first may still be where it was, below something"
+        "the first one may still be there, occluded"
     )
 
 
-def test_what_is_gone_and_not_in_view_is_lost() -> None:
+def test_an_object_that_is_gone_and_undetected_is_lost() -> None:
     known = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
     assert associate_detections(known, image(at(0.2, 0.2), top=0.0)).lost == (f"{CAN}_1",)
     assert associate_detections(known, image(at(0.2, 0.2), top=0.1)).lost == ()
 
 
-def test_each_object_is_recognised_once_and_as_what_it_is() -> None:
+def test_each_true_object_is_matched_once_within_its_class() -> None:
     there = [at(0, 0, f"{CAN}_1"), at(0.2, 0.2, f"{CAN}_2")]
     box = replace(at(0.2, 0.2), name="box", object_class=CLASSES["sugar_box"])
     assert match_to_ground_truth([at(0.01, 0), at(0.02, 0), box], there) == (f"{CAN}_1",)
     assert match_to_ground_truth([], there) == ()
 
 
-def test_what_was_taken_for_something_else_is_lost() -> None:
-    """A box known where a can is now recognised, by its pixels; without that, it may only have been missed."""
+def test_an_object_whose_pixels_belong_to_another_detection_is_lost() -> None:
+    """Without the pixels of the can, the box may only have been missed."""
     box = SceneObject("sugar_box_1", CLASSES["sugar_box"], Pose((0.0, 0.0, 0.1 - 0.175 / 2)))
-    seen = image(at(0.0, 0.0))
-    assert associate_detections([box], seen).lost == ()
-    (can,) = seen.detections
-    claimed = np.zeros(seen.depth.shape, bool)
+    observed = image(at(0.0, 0.0))
+    assert associate_detections([box], observed).lost == ()
+    (can,) = observed.detections
+    claimed = np.zeros(observed.depth.shape, bool)
     claimed[200:280, 280:360] = True
     assert associate_detections(
-        [box], replace(seen, detections=(replace(can, mask=claimed),))
+        [box], replace(observed, detections=(replace(can, mask=claimed),))
     ).lost == ("sugar_box_1",)
 
 
 def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
-    """Two boxes, what is seen of them, and what is seen if they are taken for two that lie across them."""
+    """Return two boxes, a correct observation, and one with two boxes across them."""
     apart = CLASSES["sugar_box"].size[1] / 2 + 0.001
     first = [
         resting("sugar_box", Orientation.FLAT_0, (0.0, y), name=f"sugar_box_{k}")
         for k, y in ((1, -apart), (2, apart))
     ]
-    seen = LabelDetector(CAMERA).perceive(scene_of(*first)).observation
-    both = np.any([d.mask for d in seen.detections], axis=0)
+    observed = LabelDetector(CAMERA).perceive(scene_of(*first)).observation
+    both = np.any([d.mask for d in observed.detections], axis=0)
     west = both & (np.arange(both.shape[1]) < np.nonzero(both)[1].mean())
     across = [
-        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=f"seen {x}")
+        resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=f"detection {x}")
         for x in (-apart, apart)
     ]
     masks = (west, both & ~west)
@@ -121,10 +122,10 @@ def side_by_side() -> tuple[list[SceneObject], Observation, Observation]:
         Detection(o.name, o.object_class, o.X_TO, mask)
         for o, mask in zip(across, masks, strict=True)
     )
-    return first, seen, replace(seen, detections=wrong)
+    return first, observed, replace(observed, detections=wrong)
 
 
-def test_what_is_known_stands_until_something_explains_more() -> None:
+def test_known_objects_are_kept_unless_a_detection_explains_more_pixels() -> None:
     known, _, across = side_by_side()
     observation, lost = associate_detections(known, across)
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
@@ -140,30 +141,35 @@ def test_what_is_known_stands_until_something_explains_more() -> None:
     assert lost == ("sugar_box_1",)
 
 
-def test_what_is_known_gives_way_to_what_a_detector_is_sure_of() -> None:
+def test_confident_detections_replace_known_objects() -> None:
     known, _, across = side_by_side()
-    sure = replace(
+    confident = replace(
         across, detections=tuple(replace(d, is_confident=True) for d in across.detections)
     )
-    observation, lost = associate_detections(known, sure)
+    observation, lost = associate_detections(known, confident)
     assert {d.X_TO for d in observation.detections} == {d.X_TO for d in across.detections}
     assert lost == ()
 
 
-def test_what_was_missed_once_but_looks_the_same_is_still_in_view() -> None:
-    known, seen, _ = side_by_side()
-    observation, _ = associate_detections(known, replace(seen, detections=seen.detections[:1]))
+def test_a_missed_object_with_unchanged_depth_is_restored() -> None:
+    known, observed, _ = side_by_side()
+    observation, _ = associate_detections(
+        known, replace(observed, detections=observed.detections[:1])
+    )
     assert {d.name: d.X_TO for d in observation.detections} == {o.name: o.X_TO for o in known}
     second = next(d for d in observation.detections if d.name == "sugar_box_2")
-    assert (second.mask & seen.detections[1].mask).sum() > 0.9 * seen.detections[1].mask.sum()
+    assert (second.mask & observed.detections[1].mask).sum() > 0.9 * observed.detections[
+        1
+    ].mask.sum()
 
 
-def test_what_is_in_the_place_of_something_seen_is_lost() -> None:
-    known, seen, _ = side_by_side()
+def test_an_object_out_of_view_that_penetrates_a_detection_is_lost() -> None:
+    known, observed, _ = side_by_side()
     ghost = resting("gelatin_box", xy=known[0].X_TO.translation[:2], name="gelatin_box_1")
     hidden = resting("gelatin_box", xy=(0.25, 0.25), name="gelatin_box_2")
     observation, lost = associate_detections(
-        [*known, ghost, hidden], replace(seen, depth=np.where(seen.depth > 0, np.float32(1.0), 0))
+        [*known, ghost, hidden],
+        replace(observed, depth=np.where(observed.depth > 0, np.float32(1.0), 0)),
     )
     assert len(observation.detections) == 2
     assert lost == ("gelatin_box_1",)

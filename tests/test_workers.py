@@ -1,4 +1,4 @@
-"""Mapping over processes: order, equality for any number of workers, and every way of ending early."""
+"""Parallel map: order, independence of the number of workers, and early termination."""
 
 import os
 import signal
@@ -17,16 +17,16 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.workers.parallel_map import map_ordered
 
 
-class Noisy:
-    """Draws a number for an item; the first items take longest, so that later ones overtake them."""
+class RandomNumbers:
+    """Return a random number for an item; later items may overtake earlier ones."""
 
     def __call__(self, item: int) -> tuple[int, float]:
         time.sleep(0.02 if item % 4 == 0 else 0.0)
         return item, item_rng(7, item).normal()
 
 
-class CountsFactories:
-    """Leaves a file per worker made, named by its process."""
+class WorkerCounter:
+    """Create a file named after the process of each new worker."""
 
     def __init__(self, folder: Path) -> None:
         (folder / f"{os.getpid()}").touch(exist_ok=False)
@@ -69,10 +69,10 @@ def make_thread_setting() -> Callable[[int], str | None]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_processes_are_replaced_by_fresh_ones(workers: int, tmp_path: Path) -> None:
+def test_processes_are_replaced_after_a_number_of_items(workers: int, tmp_path: Path) -> None:
     done = list(
         map_ordered(
-            partial(CountsFactories, tmp_path), range(5), workers=workers, max_items_per_process=2
+            partial(WorkerCounter, tmp_path), range(5), workers=workers, max_items_per_process=2
         )
     )
     first, last = done[: 2 * workers], done[2 * workers :]
@@ -82,15 +82,15 @@ def test_processes_are_replaced_by_fresh_ones(workers: int, tmp_path: Path) -> N
 
 
 def test_order_and_results_do_not_depend_on_the_number_of_workers() -> None:
-    alone = list(map_ordered(Noisy, range(30), workers=1))
+    alone = list(map_ordered(RandomNumbers, range(30), workers=1))
     assert [item for item, _ in alone] == list(range(30))
-    assert list(map_ordered(Noisy, range(30), workers=2)) == alone
-    assert list(map_ordered(Noisy, iter(range(30)), workers=3)) == alone
+    assert list(map_ordered(RandomNumbers, range(30), workers=2)) == alone
+    assert list(map_ordered(RandomNumbers, iter(range(30)), workers=3)) == alone
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_worker_is_made_per_process(workers: int, tmp_path: Path) -> None:
-    used = set(map_ordered(partial(CountsFactories, tmp_path), range(20), workers=workers))
+    used = set(map_ordered(partial(WorkerCounter, tmp_path), range(20), workers=workers))
     assert {int(file.name) for file in tmp_path.iterdir()} == used
     assert 1 <= len(used) <= workers
     assert (os.getpid() in used) == (workers == 1)
@@ -102,7 +102,7 @@ def test_no_items(workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_an_exception_comes_in_its_place(workers: int) -> None:
+def test_an_exception_is_raised_in_the_order_of_items(workers: int) -> None:
     results = map_ordered(partial(failing_worker, 3), range(10), workers=workers)
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(LookupError, match="item 3"):
@@ -111,12 +111,12 @@ def test_an_exception_comes_in_its_place(workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_an_exception_in_the_factory_is_told(workers: int) -> None:
+def test_an_exception_of_the_factory_is_raised(workers: int) -> None:
     with pytest.raises(LookupError, match="no worker"):
         next(map_ordered(broken_factory, range(3), workers=workers))
 
 
-def test_closing_midway_does_not_wait() -> None:
+def test_closing_early_does_not_wait_for_workers() -> None:
     results = map_ordered(make_sleeper, [0.0, *[60.0] * 100], workers=2)
     assert next(results) == 0.0
     start = time.monotonic()
@@ -126,11 +126,12 @@ def test_closing_midway_does_not_wait() -> None:
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_ending_the_first_process_ends_the_others(signal_number: signal.Signals) -> None:
+def test_workers_end_with_their_parent_process(signal_number: signal.Signals) -> None:
     code = """
 import signal
 from test_workers import make_sleeper, map_ordered
-signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process that a shell put in the background lacks
+# A background process of a shell ignores SIGINT by default.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
     print(result, flush=True)
 """
@@ -144,16 +145,15 @@ for result in map_ordered(make_sleeper, [0.0, 60.0], workers=2):
         assert process.stdout is not None
         assert process.stdout.readline() == b"0.0\n"
         if signal_number == signal.SIGINT:
-            os.killpg(process.pid, signal_number)  # as a terminal does
+            os.killpg(process.pid, signal_number)  # Like a terminal.
         else:
             process.send_signal(signal_number)
-        _, errors = process.communicate(
-            timeout=10
-        )  # returns when the last process that holds the pipes has ended
+        # This returns when the last process that holds the pipes has ended.
+        _, errors = process.communicate(timeout=10)
     assert (signal_number == signal.SIGINT) == errors.rstrip().endswith(b"KeyboardInterrupt")
 
 
-def test_a_killed_process_is_an_error() -> None:
+def test_a_killed_worker_is_an_error() -> None:
     with pytest.raises(BrokenProcessPool, match=r"was killed after [01] results.*fewer workers"):
         list(map_ordered(make_sleeper, [0.0, -1.0, 0.0, 60.0], workers=2))
     assert not active_children()
@@ -169,14 +169,14 @@ def test_reads_only_a_few_items_ahead() -> None:
             yield item
             item += 1
 
-    results = map_ordered(Noisy, endless(), workers=2)
+    results = map_ordered(RandomNumbers, endless(), workers=2)
     for _ in range(5):
         next(results)
     results.close()
     assert len(read) <= 5 + 8
 
 
-def test_processes_get_one_thread_each_and_this_one_keeps_its_setting(
+def test_workers_have_one_thread_and_the_parent_is_unchanged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
@@ -184,15 +184,15 @@ def test_processes_get_one_thread_each_and_this_one_keeps_its_setting(
     assert "OMP_NUM_THREADS" not in os.environ
 
 
-def test_workers_below_one_are_refused_at_once() -> None:
+def test_zero_workers_are_rejected_immediately() -> None:
     with pytest.raises(ValueError, match="workers: 0"):
-        map_ordered(Noisy, [], workers=0)
+        map_ordered(RandomNumbers, [], workers=0)
 
 
-def test_item_rng() -> None:
-    draws = {
+def test_item_rng_depends_on_the_whole_path() -> None:
+    numbers = {
         item_rng(*path).integers(2**62)
         for path in [(0,), (0, 0), (0, 1), (0, 0, 0), (1,), (1, 0), (0, 1, 0)]
     }
-    assert len(draws) == 7
+    assert len(numbers) == 7
     assert item_rng(3, 4).normal() == item_rng(3, 4).normal()
