@@ -188,4 +188,4 @@ def detector(config: ClutterConfig) -> LabelDetector:
 @pytest.fixture(scope="session")
 def camera(detector: LabelDetector) -> CameraRenderer:
     """The detector's camera."""
-    return detector.camera
+    return detector.renderer

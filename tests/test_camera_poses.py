@@ -134,7 +134,7 @@ def test_the_floor_s_depth_and_its_horizon() -> None:
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: LabelDetector) -> None:
     """As `test_rays.py` has it for a vertical one, by the same tolerances."""
-    look, rendered = tilted.perceive(scene), tilted.camera.render_label(scene)
+    look, rendered = tilted.perceive(scene), tilted.renderer.render_label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == pytest.approx(look.visible_fractions, abs=0.003)
     assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
@@ -153,7 +153,7 @@ def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: Labe
 
 
 def test_the_floor_of_a_tilted_camera_is_the_rendered_one(tilted: LabelDetector) -> None:
-    rendered = tilted.camera.render(scene_of()).depth
+    rendered = tilted.renderer.render(scene_of()).depth
     pixels = pixel_grid(rendered.shape)
     inside = (np.abs(CAMERA.backproject(pixels, CAMERA.floor_depth)[..., :2]) < 0.30).all(axis=-1)
     assert rendered[inside] == pytest.approx(CAMERA.floor_depth[inside], abs=2e-6)
@@ -176,9 +176,9 @@ def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]
 
 def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDetector) -> None:
     """As `test_camera.py` has it; where a corner comes to a tip, no pixel's middle may be in it."""
-    label, shifts = tilted.camera.render_label(SCATTERED), []
+    label, shifts = tilted.renderer.render_label(SCATTERED), []
     for index, o in enumerate(SCATTERED.objects):
-        corners, centroid = outline(tilted.camera, o)
+        corners, centroid = outline(tilted.renderer, o)
         rows, columns = np.nonzero(label == index)
         assert np.array([columns.mean(), rows.mean()]) == pytest.approx(centroid, abs=1.0)
         assert np.array([columns.min(), rows.min()]) == pytest.approx(corners.min(axis=0), abs=1.5)
@@ -218,7 +218,7 @@ def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelD
         resting(name, Orientation.FLAT_30, (-0.15, 0.1), name="it"),
         resting("pudding_box", xy=(0.2, -0.1), name="another"),
     )
-    depth, label = tilted.camera.render_depth_and_label(scene)
+    depth, label = tilted.renderer.render_depth_and_label(scene)
     true = scene["it"]
     guess = true.X_TO.p + np.array([0.006, -0.006, 0.005])
     found = PoseFitter(CAMERA).fit(true.object_class, label == 0, depth, guess)

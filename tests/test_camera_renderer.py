@@ -236,7 +236,7 @@ def test_the_detector_reports_what_is_not_hidden(detector: LabelDetector) -> Non
         ),
         resting("large_marker", Orientation.FLAT_90, (0.2, 0.1), name="marker"),
     )
-    look, images = detector.perceive(scene), detector.camera.render(scene)
+    look, images = detector.perceive(scene), detector.renderer.render(scene)
     observation = look.observation
     assert [d.name for d in observation.detections] == ["cover", "marker"]
     assert look.visible_fractions == {"gelatin": 0.0, "cover": 1.0, "marker": 1.0}

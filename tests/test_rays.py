@@ -81,7 +81,7 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
     scene: Scene, detector: LabelDetector
 ) -> None:
     """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
-    look, rendered = detector.perceive(scene), detector.camera.render_label(scene)
+    look, rendered = detector.perceive(scene), detector.renderer.render_label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == RAYS.visible_fractions(scene.objects)
     assert shares == pytest.approx(look.visible_fractions, abs=0.003)
@@ -107,7 +107,7 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
     look = detector.perceive(scene)
     observation, _ = RAYS.observe(scene)
-    rendered, cast = detector.camera.render_label(scene), labels(scene)
+    rendered, cast = detector.renderer.render_label(scene), labels(scene)
     assert observation.depth.dtype == look.observation.depth.dtype == np.float32
     errors = []
     for index in range(len(scene.objects)):

@@ -26,17 +26,17 @@ class LabelDetector:
     """Detect every object that is in the image and not hidden, with its true class and pose."""
 
     def __init__(self, camera: Camera) -> None:
-        self.camera = CameraRenderer(camera)
+        self.renderer = CameraRenderer(camera)
 
     def perceive(self, scene: Scene) -> PerceptionResult:
         """Return the observation of a scene and the visible fraction of each object."""
-        depth, label = self.camera.render_depth_and_label(scene)
-        visible_fractions = self.camera.visible_fractions(scene, label)
-        hidden = self.camera.hidden_objects(visible_fractions)
+        depth, label = self.renderer.render_depth_and_label(scene)
+        visible_fractions = self.renderer.visible_fractions(scene, label)
+        hidden = self.renderer.hidden_objects(visible_fractions)
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
             for index, o in enumerate(scene.objects)
             if o.name not in hidden and (mask := label == index).any()
         )
-        observation = Observation(depth, detections, self.camera.camera, scene.support)
+        observation = Observation(depth, detections, self.renderer.camera, scene.support)
         return PerceptionResult(observation, visible_fractions)
