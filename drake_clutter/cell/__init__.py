@@ -1,0 +1,1 @@
+"""Work cell as data: robot, gripper, support, cameras and fixtures."""

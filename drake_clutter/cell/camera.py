@@ -1,6 +1,7 @@
-"""A depth camera of the cell: where it stands, and the pinhole model of its images.
+"""Depth camera of a work cell: pose and pinhole model.
 
-Frames: T the support's frame; C the camera, z along the optical axis, x to the right of the image, y down.
+Frames: T is the support; C is the camera, z along the optical axis, x to the right of the image, y
+down.
 """
 
 import math
@@ -20,36 +21,37 @@ from drake_clutter.validation import Flag, InRange, StrictModel
 D435_FOV_Y_DEG = 42.5
 """Vertical field of view of the color stream of an Intel RealSense D435 [deg] (data sheet)."""
 D435_FOCAL_LENGTH = 480 / 2 / math.tan(math.radians(D435_FOV_Y_DEG) / 2)
-"""Its focal length at 640 x 480 [px]."""
+"""Focal length of the same stream at 640 x 480 [px]."""
 _MIN_RAY_SLOPE = 1e-3
-"""A ray that falls by less, for 1 m along the optical axis, is taken to be parallel to the floor [m]."""
+"""Slope of a ray towards the floor below which it counts as parallel to the floor."""
 
 
 def pixel_grid(shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return column and row of each pixel of an image.
 
     Args:
-        shape: Of the image (height, width).
+        shape: Shape (height, width) of the image.
 
     Returns:
-        Whole numbers [px]. Shape (height, width, 2).
+        Column and row [px]. Shape (height, width, 2).
     """
     row, column = np.indices(shape)
     return np.stack([column, row], axis=-1)
 
 
 class Camera(StrictModel):
-    """A pinhole camera at a pose.
+    """Pinhole depth camera.
 
-    The defaults are the color stream of an Intel RealSense D435 at 640 x 480 (vertical field of view 42.5 deg, data sheet).
+    The defaults are the color stream of an Intel RealSense D435 at 640 x 480 pixels.
 
     Attributes:
-        pose: X_TC.
-        width: Columns of an image.
-        height: Rows of an image.
+        pose: Pose X_TC.
+        width: Width of an image [px].
+        height: Height of an image [px].
         fov_y_deg: Vertical field of view [deg].
-        visibility_threshold: An object is hidden when the camera sees less than this share of its unoccluded pixels.
-        depth_noise: Whether what a trained detector is given has the noise of a stereo camera.
+        visibility_threshold: An object is hidden if less than this fraction of its unoccluded
+            pixels is visible.
+        depth_noise: Whether depth images for trained detectors have the noise of a stereo camera.
     """
 
     pose: PoseSpec
@@ -61,11 +63,13 @@ class Camera(StrictModel):
 
     @staticmethod
     def overhead(altitude: float, **fields: Any) -> "Camera":
-        """Return a camera above the support's center that looks straight down, x along the support's x.
+        """Return a camera above the center of the support that looks straight down.
+
+        Its x axis is parallel to that of the support.
 
         Args:
             altitude: Height above the floor [m].
-            **fields: Other fields.
+            **fields: Other fields of the camera.
         """
         return Camera(
             pose=PoseSpec(translation=(0.0, 0.0, altitude), rpy_deg=(180.0, 0.0, 0.0)), **fields
@@ -73,96 +77,95 @@ class Camera(StrictModel):
 
     @property
     def X_TC(self) -> RigidTransform:
-        """Pose of the camera."""
+        """Pose of the camera in T."""
         return self.pose.transform
 
     @property
     def focal_length(self) -> float:
-        """Focal length, the same along rows and columns [px]."""
+        """Focal length along rows and columns [px]."""
         return self.height / 2 / math.tan(math.radians(self.fov_y_deg) / 2)
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Column and row on the optical axis; whole numbers are the middles of pixels.
+        """Column and row of the principal point; integers are centers of pixels.
 
-        Drake's VTK engine draws half a pixel left of and above the principal point that it is given, (width - 1) / 2,
-        (height - 1) / 2: measured in tests/test_camera_renderer.py.
+        Drake's VTK render engine draws half a pixel to the left of and above the principal point
+        of its camera model, ((width - 1) / 2, (height - 1) / 2), see tests/test_camera_renderer.py.
         """
         return self.width / 2 - 1, self.height / 2 - 1
 
     @property
     def is_vertical(self) -> bool:
-        """Whether the optical axis is."""
+        """Whether the optical axis is vertical."""
         return self.pinhole.X_CT[8:10] == (0.0, 0.0)
 
     @property
     def pinhole(self) -> Pinhole:
-        """The same model for compiled loops."""
+        """Pinhole model for compiled loops."""
         return _pinhole(self)
 
     def to_camera(self, p_T: Floats) -> Floats:
-        """Return points given in T [m] in C [m]. Shapes (N, 3)."""
+        """Transform points from T to C [m]. Shapes (m, 3)."""
         X_CT = _X_CT(self)
         return np.asarray(p_T @ X_CT[:, :3].T + X_CT[:, 3])
 
     def depth(self, p_T: Floats) -> Floats:
-        """Return how far points (N, 3) [m] are along the optical axis [m]. Shape (N,)."""
+        """Return the depth of points in T, shape (m, 3) [m]. Shape (m,)."""
         return self.to_camera(p_T)[:, 2]
 
     def project(self, p_T: Floats) -> Floats:
-        """Return column and row of the pixels on which points fall. Shapes (N, 3) [m] to (N, 2) [px]."""
+        """Return the pixels, shape (m, 2) [px], of points in T, shape (m, 3) [m]."""
         return self.project_with_depth(p_T)[0]
 
     def project_with_depth(self, p_T: Floats) -> tuple[Floats, Floats]:
-        """Return what `project` and `depth` do."""
+        """Return pixels and depth of points in T, see `project` and `depth`."""
         p_C = self.to_camera(p_T)
-        return np.asarray(
-            self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point)
-        ), p_C[:, 2]
+        pixels = self.focal_length * p_C[:, :2] / p_C[:, 2:] + np.array(self.principal_point)
+        return np.asarray(pixels), p_C[:, 2]
 
     def backproject(self, pixels: NDArray[Any], depth: NDArray[Any]) -> NDArray[Any]:
-        """Return the points at pixels and depths, in the images' type.
+        """Return the points in T at pixels with a depth.
 
         Args:
             pixels: Column and row [px]. Shape (..., 2).
-            depth: Along the optical axis [m]. Shape (...).
+            depth: Depth along the optical axis [m]. Shape (...).
 
         Returns:
-            p_T [m]. Shape (..., 3).
+            Points in T [m], with the data type of the images. Shape (..., 3).
         """
         u0, v0 = self.principal_point
         x = (pixels[..., 0] - u0) * depth / self.focal_length
         y = (pixels[..., 1] - v0) * depth / self.focal_length
-        R_TC, p_TC = self.X_TC.rotation().matrix().tolist(), self.X_TC.translation().tolist()
+        R_TC = self.X_TC.rotation().matrix().tolist()
+        p_TC = self.X_TC.translation().tolist()
         return np.stack(
             [_rotate_component(row, (x, y, depth)) + p for row, p in zip(R_TC, p_TC, strict=True)],
             axis=-1,
         )
 
     def rays(self, pixels: NDArray[Any]) -> Floats:
-        """Return directions in C through pixels (..., 2) [px], with z = 1. Shape (..., 3)."""
-        along = (np.asarray(pixels, float) - np.array(self.principal_point)) / self.focal_length
-        return np.concatenate([along, np.ones((*along.shape[:-1], 1))], axis=-1)
+        """Return directions in C with z = 1, shape (..., 3), through pixels (..., 2)."""
+        slopes = (np.asarray(pixels, float) - np.array(self.principal_point)) / self.focal_length
+        return np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
 
     @property
     def floor_depth(self) -> NDArray[np.float32]:
-        """What the camera would see of the plane of the support's floor alone.
+        """Depth image of the plane of the support's floor [m], read-only.
 
-        Along the optical axis [m], infinite where the plane is not met; not to be written to.
-        Shape (height, width).
+        It is infinite where rays do not meet the plane. Shape (height, width).
         """
         return _floor_depth(self)
 
     def support_bounds(self, support: Support, height: float) -> tuple[Floats, float] | None:
-        """Return where the support is in the image, with all that stands on it.
+        """Return a square around the image of a support and of the space above it.
 
         Args:
-            support: What the objects stand on; it is taken to be as wide as long.
-            height: Of what stands on it [m].
+            support: Support; a rectangular one is treated as the square of its larger side.
+            height: Height of the space above the floor [m].
 
         Returns:
-            Column and row of the middle (2,) and side [px] of the upright square that holds it;
-            None if a part of it is not before the camera.
+            Center (column, row), shape (2,), and side [px] of the square; None if a part of the
+            space is not in front of the camera.
         """
         half = max(support.half_size)
         corners = np.array(
@@ -175,7 +178,7 @@ class Camera(StrictModel):
         return (low + high) / 2, float((high - low).max())
 
     def sees_support(self, support: Support) -> bool:
-        """Return whether any part of the support's floor is in the image, and near enough."""
+        """Return whether a part of the support's floor is in the image and within range."""
         x, y = (np.linspace(-half, half, 41) for half in support.half_size)
         p_T = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
         depth = self.depth(p_T)
@@ -189,9 +192,9 @@ class Camera(StrictModel):
 
 
 def _rotate_component(row: Sequence[float], components: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the sum of components by a row of a rotation.
+    """Return the product of a row of a rotation matrix and vector components.
 
-    What counts for nothing is left out, also where it is infinite.
+    Terms with a factor 0 are left out, so that infinite components do not become NaN.
     """
     terms = [
         factor * component for factor, component in zip(row, components, strict=True) if factor
@@ -222,6 +225,6 @@ def _floor_depth(camera: Camera) -> NDArray[np.float32]:
     height = camera.X_TC.translation()[2]
     depth = np.full(down.shape, np.inf)
     np.divide(-height, down, out=depth, where=down * height < -_MIN_RAY_SLOPE * abs(height))
-    found = depth.astype(np.float32)
-    found.setflags(write=False)
-    return found
+    image = depth.astype(np.float32)
+    image.setflags(write=False)
+    return image

@@ -1,8 +1,9 @@
-"""The EPick vacuum gripper with tube and cup as a model.
+"""SDF model of the Robotiq EPick vacuum gripper with tube and suction cup.
 
-Frames: F the flange that it is screwed to, z out of the arm; G the cup, see `suction`.
+Frames: F is the flange, z out of the arm; G is the gripper, its origin at the center of the lip.
 
-Sources: see `suction`; the masses of tube and cup are assumed.
+Sources: Dimensions of the body as in PickNik's `epick_description` (BSD). The masses of tube and
+cup are assumptions.
 """
 
 import numpy as np
@@ -11,16 +12,24 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.cell.primitives import LinkPrimitive, sdf_link, sdf_pose
 
 EPICK_LENGTH = 0.1023
+"""Length of the body [m]."""
 EPICK_RADIUS = 0.044
+"""Radius of the body [m]."""
 EPICK_MASS = 0.71
-"""Of the gripper's body [m, m, kg]."""
-TUBE_RADIUS, TUBE_MASS, CUP_MASS = 0.010, 0.05, 0.02
-"""m, kg, kg."""
-_BODY, _METAL, _RUBBER = "0.20 0.21 0.23 1", "0.70 0.71 0.73 1", "0.12 0.12 0.13 1"
+"""Mass of the body [kg]."""
+TUBE_RADIUS = 0.010
+"""Radius of the extension tube [m]."""
+TUBE_MASS = 0.05
+"""Mass of the extension tube [kg]; an assumption."""
+CUP_MASS = 0.02
+"""Mass of the suction cup [kg]; an assumption."""
+_BODY_COLOR = "0.20 0.21 0.23 1"
+_METAL_COLOR = "0.70 0.71 0.73 1"
+_RUBBER_COLOR = "0.12 0.12 0.13 1"
 _DAMPING_RATIO = 2.0
-"""Damping of the bellows, in units of what a load of `_LOAD` would need not to swing."""
+"""Damping ratio of the bellows with `_REFERENCE_LOAD`: overdamped, as rubber is."""
 _REFERENCE_LOAD = 0.5
-"""kg."""
+"""Load for which the damping ratio holds [kg]; about that of a sugar box."""
 
 
 def epick_sdf(
@@ -32,26 +41,28 @@ def epick_sdf(
     stiffness: float,
     compliant: bool,
 ) -> str:
-    """Return the SDF model: link `body` has frame F, link `cup` has frame G.
+    """Return the SDF model; link `body` has frame F, link `cup` has frame G.
 
     Args:
         extension: Length of the tube between body and cup [m].
-        cup_diameter: Of the lip [m].
-        cup_length: Of the cup without a load [m].
-        stroke: By which the joint `bellows` between body and cup moves, either way [m].
-        stiffness: Of that joint [N/m].
-        compliant: False for a cup that is fixed to the body, as planning uses it.
+        cup_diameter: Diameter of the lip [m].
+        cup_length: Length of the cup without load [m].
+        stroke: Range of the joint `bellows` between body and cup, in either direction [m].
+        stiffness: Stiffness of that joint [N/m].
+        compliant: Whether the cup can move; else it is fixed to the body.
     """
-    body = LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, EPICK_LENGTH), EPICK_RADIUS, _BODY)
+    body = LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, EPICK_LENGTH), EPICK_RADIUS, _BODY_COLOR)
     tube = EPICK_LENGTH + extension
-    stem = LinkPrimitive((0.0, 0.0, EPICK_LENGTH), (0.0, 0.0, tube), TUBE_RADIUS, _METAL)
-    bellows = LinkPrimitive((0.0, 0.0, -cup_length), (0.0, 0.0, 0.0), cup_diameter / 2, _RUBBER)
-    rods = (body, stem) if extension else (body,)
+    stem = LinkPrimitive((0.0, 0.0, EPICK_LENGTH), (0.0, 0.0, tube), TUBE_RADIUS, _METAL_COLOR)
+    bellows = LinkPrimitive(
+        (0.0, 0.0, -cup_length), (0.0, 0.0, 0.0), cup_diameter / 2, _RUBBER_COLOR
+    )
+    parts = (body, stem) if extension else (body,)
     mass = EPICK_MASS + TUBE_MASS
     moment = EPICK_MASS * EPICK_LENGTH / 2 + TUBE_MASS * (EPICK_LENGTH + tube) / 2
     p_FCm = np.array([0.0, 0.0, moment / mass])
     p_GCm = np.array([0.0, 0.0, -cup_length / 2])
-    body_link = sdf_link("body", "", mass, p_FCm, rods, rods, "cylinder")
+    body_link = sdf_link("body", "", mass, p_FCm, parts, parts, "cylinder")
     cup = (bellows,)
     p_FG = np.array([0.0, 0.0, tube + cup_length])
     cup_pose = "\n      " + sdf_pose(p_FG, Rotation.identity(), "body")

@@ -1,4 +1,4 @@
-"""What stands in the cell beside robot and support, and counts as an obstacle."""
+"""Fixture of a work cell: a fixed obstacle besides robot and support."""
 
 from typing import Annotated, Self
 
@@ -9,17 +9,18 @@ from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.validation import Fraction, InRange, NonEmptyText, StrictModel, allowed_error
 
 Extent = Annotated[float, InRange(0.001, 10.0)]
+"""Extent of a box [m]."""
 
 
 class Fixture(StrictModel):
-    """A box, or a model of a file, that does not move.
+    """Box, or rigid model of a file, that is welded to the world.
 
     Attributes:
-        name: As it is called in reasons and pictures; unique in the cell.
-        pose: X_TF, of the box's center, or of the model's frame.
-        box: Extents of a box [m]; or None.
-        model: File of an SDF or URDF model; "" for a box.
-        color: Red, green, blue and opacity, 0 to 1; None: it is not drawn.
+        name: Unique name, used in failure reasons and images.
+        pose: Pose in T of the center of the box, or of the frame of the model.
+        box: Extents of the box along x, y and z [m]; None for a model.
+        model: SDF or URDF file; "" for a box.
+        color: Red, green, blue and opacity, 0 to 1; None for an invisible box.
     """
 
     name: NonEmptyText

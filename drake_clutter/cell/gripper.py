@@ -1,7 +1,7 @@
-"""What a gripper of a cell is asked: where it grasps, what it holds, and how it looks in a plant.
+"""Protocol of grippers: grasps, load capacity and SDF model.
 
-Frames: T the support; F the robot's flange; G the gripper, origin where it touches an object, z out
-of the tool, into the object; O the object.
+Frames: T is the support; F is the robot's flange; G is the gripper, its origin at the contact with
+the object, z out of the tool, into the object; O is the object.
 """
 
 import math
@@ -20,12 +20,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Payload:
-    """What a gripper carries.
+    """Load of a gripper.
 
     Attributes:
-        mass: [kg].
-        p_GCm: Center of mass, rounded, so that plants can be kept [m]. Shape (3,).
-        max_acceleration: Greatest of G, in any direction; infinite without a load [m/s^2].
+        mass: Mass [kg].
+        p_GCm: Center of mass [m], rounded, so that cached plants can be reused. Shape (3,).
+        max_acceleration: Largest acceleration of G in any direction [m/s^2]; infinite without a
+            load.
     """
 
     mass: float = 0.0
@@ -34,17 +35,17 @@ class Payload:
 
     @property
     def max_axis_acceleration(self) -> float:
-        """Greatest acceleration along each axis, so that the vector is within the limit [m/s^2]."""
+        """Limit of each component that keeps the vector within its limit [m/s^2]."""
         return self.max_acceleration / math.sqrt(3)
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """Where a gripper that points down takes an object, at any yaw.
+    """Grasp of a gripper that points down, at any yaw.
 
     Attributes:
-        p_TG: On the object's top [m]. Shape (3,).
-        payload: What is carried then.
+        p_TG: Position on the top of the object [m]. Shape (3,).
+        payload: Load after the grasp.
     """
 
     p_TG: Floats
@@ -52,7 +53,7 @@ class Grasp:
 
 
 class GraspFailureReason(Enum):
-    """Why a gripper offers no grasp."""
+    """Reasons why a gripper has no grasp."""
 
     NO_SEAL = "no seal"
     TOO_HEAVY = "too heavy"
@@ -60,11 +61,12 @@ class GraspFailureReason(Enum):
 
 @dataclass(frozen=True)
 class GraspFailure:
-    """No grasp, and the number behind the reason.
+    """Reason why a gripper has no grasp on an object.
 
     Attributes:
-        reason: Of the grasp that came furthest.
-        value: Deviation from a plane under the best grasp [m], or the object's mass [kg].
+        reason: Failure of the sampled grasp that came closest to being feasible.
+        value: Flatness deviation under the best grasp [m] if no grasp seals, or mass of the object
+            [kg] if it is too heavy.
     """
 
     reason: GraspFailureReason
@@ -73,12 +75,12 @@ class GraspFailure:
 
 @dataclass(frozen=True)
 class GraspSampling:
-    """How densely grasps are sampled.
+    """Parameters of grasp sampling.
 
     Attributes:
-        spacing: Between neighboring points of a face [m].
+        spacing: Distance of neighboring grasp points [m].
         max_grasps: Largest number of grasps.
-        min_payload_acceleration: That a grasp must bear [m/s^2].
+        min_payload_acceleration: A grasp must hold the object at this acceleration [m/s^2].
     """
 
     spacing: float
@@ -87,29 +89,29 @@ class GraspSampling:
 
 
 class Gripper(Protocol):
-    """A gripper as data. How it acts in a simulation is the station's."""
+    """Model of a gripper; `GripperActuator` is its counterpart in a simulation."""
 
     @property
     def kind(self) -> str:
-        """Name of its kind in a cell's file."""
+        """Kind of the gripper in a cell file."""
 
     @property
     def mass(self) -> float:
-        """Counts towards the robot's payload [kg]."""
+        """Mass that counts towards the payload of the robot [kg]."""
 
     @property
     def X_FG(self) -> RigidTransform:
-        """Frame G without a load."""
+        """Pose of G in the flange without load."""
 
     @property
     def contact_links(self) -> tuple[str, ...]:
-        """Links of its model that touch what it holds."""
+        """Names of the links that touch a grasped object."""
 
     def model_sdf(self, *, compliant: bool) -> str:
-        """Return its model: link `body` has frame F, link `cup` has frame G.
+        """Return the SDF model; link `body` has frame F, link `cup` has frame G.
 
         Args:
-            compliant: False for a rigid model, as planning uses it.
+            compliant: Whether compliant parts can move; planning uses the rigid model.
         """
 
     def sample_grasps(
@@ -118,26 +120,40 @@ class Gripper(Protocol):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> tuple[Grasp, ...] | GraspFailure:
-        """Return where it grasps an object from above, the nearest to its middle first."""
-
-    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
-        """Return whether it takes hold of an object at a pose."""
-
-    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
-        """Return with which acceleration it may move a load in any direction [m/s^2].
+        """Return feasible grasps of an object from above, the closest to its center first.
 
         Args:
-            mass: [kg].
-            p_GCm: Center of mass [m]. Shape (3,).
+            object_class: Class of the object.
+            X_TO: Pose of the object.
+            sampling: Parameters of the sampling.
+        """
+
+    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+        """Return whether the gripper can attach to an object at a pose.
+
+        Args:
+            object_class: Class of the object.
+            X_OG: Pose of the gripper in the object.
+        """
+
+    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
+        """Return the largest acceleration of a load in any direction.
+
+        Args:
+            mass: Mass of the load [kg].
+            p_GCm: Center of mass of the load [m]. Shape (3,).
 
         Returns:
-            Safety included; negative if it cannot hold the load.
+            Acceleration including the safety factor [m/s^2]; negative if the load cannot be held.
         """
 
     def load_ratio(self, force: Floats, moment: Floats) -> Floats:
-        """Return which share of what it bears a load takes up; above 1 the object comes off.
+        """Return the ratio of a load to the load capacity; the object comes off above 1.
 
         Args:
-            force: Of the object on the gripper, in G [N]. Shape (..., 3).
-            moment: About G [N m]. Shape (..., 3).
+            force: Force of the object on the gripper, in G [N]. Shape (..., 3).
+            moment: Moment of the object about G, in G [N m]. Shape (..., 3).
+
+        Returns:
+            Load ratio. Shape (...).
         """

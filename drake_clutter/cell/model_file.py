@@ -1,4 +1,4 @@
-"""Where a model of a cell is."""
+"""Types of fields of a cell file that name a model file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +13,6 @@ def _absolute(model: str) -> str:
 
 
 ModelFile = Annotated[NonEmptyText, AfterValidator(_absolute)]
-"""SDF or URDF file: a path, which becomes absolute, or package://..."""
+"""SDF or URDF file: a path, which becomes absolute, or a `package://` URI."""
 MaybeModelFile = Annotated[str, Field(strict=True), AfterValidator(_absolute)]
-"""The same, or "" for none."""
+"""Optional `ModelFile`; "" for none."""

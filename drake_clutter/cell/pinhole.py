@@ -1,7 +1,8 @@
-"""The projection of `Camera` for compiled loops.
+"""Pinhole projection of `Camera` for compiled loops.
 
-With a camera whose axes are parallel to those of T all rotations are exact, so that every sum is
-rounded as if it were written for that camera alone.
+Frames: T is the support; C is the camera, z along the optical axis, x to the right of the image, y
+down. If the axes of C are parallel to those of T, the rotation matrix has only entries 0, 1 and -1,
+and all products with it are exact.
 """
 
 from typing import NamedTuple
@@ -13,21 +14,21 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MIN_DEPTH = 0.01
-"""What is not so far before the camera is out of its sight [m]."""
+"""Near clipping distance along the optical axis [m]."""
 MAX_DEPTH = 10.0
-"""What is farther has no depth in a rendered image [m]."""
+"""Far clipping distance: rendered images have no depth beyond it [m]."""
 
 
 class Pinhole(NamedTuple):
-    """What compiled loops need of a camera.
+    """Pinhole camera as a tuple of numbers.
 
     Attributes:
         focal_length: Focal length [px].
-        u0: Column on the optical axis [px].
-        v0: Row on the optical axis [px].
-        X_CT: The three rows of rotation matrix and translation [m]. Shape (12,); a tuple, as each
-            use of an array in a loop costs counting its references.
-        p_TC: Position [m].
+        u0: Column of the principal point [px].
+        v0: Row of the principal point [px].
+        X_CT: Rows of the 3 x 4 matrix of rotation and translation [m]. Shape (12,). It is a tuple,
+            because numba counts references of arrays in loops.
+        p_TC: Position [m]. Shape (3,).
     """
 
     focal_length: float
@@ -39,7 +40,7 @@ class Pinhole(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def point_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
-    """Return a point of T [m] in C [m]."""
+    """Transform a point from T to C [m]."""
     X = camera.X_CT
     return (
         X[0] * x + X[1] * y + X[2] * z + X[3],
@@ -50,7 +51,7 @@ def point_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def vector_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
-    """Return a vector of T in C."""
+    """Rotate a vector from T to C."""
     X = camera.X_CT
     return (
         X[0] * x + X[1] * y + X[2] * z,
@@ -61,16 +62,18 @@ def vector_to_camera(camera, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def project(camera, x, y, z):  # type: ignore[no-untyped-def]
-    """Return column and row [px] of the pixel on which a point of C [m] falls."""
+    """Project a point in C [m] and return its column and row [px]."""
     scale = camera.focal_length / z
     return camera.u0 + scale * x, camera.v0 + scale * y
 
 
 @njit(cache=True, nogil=True, inline="always")
 def backproject(camera, u, v, z):  # type: ignore[no-untyped-def]
-    """Return the point of T [m] at a pixel [px] and a depth [m]."""
-    X, p = camera.X_CT, camera.p_TC
-    x, y = (u - camera.u0) / camera.focal_length * z, (v - camera.v0) / camera.focal_length * z
+    """Return the point in T [m] at a pixel [px] and a depth [m]."""
+    X = camera.X_CT
+    p = camera.p_TC
+    x = (u - camera.u0) / camera.focal_length * z
+    y = (v - camera.v0) / camera.focal_length * z
     return (
         X[0] * x + X[4] * y + X[8] * z + p[0],
         X[1] * x + X[5] * y + X[9] * z + p[1],
@@ -80,7 +83,7 @@ def backproject(camera, u, v, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def pose_to_camera(camera, R, p):  # type: ignore[no-untyped-def]
-    """Return R_CO (3, 3) and p_CO [m] of a pose R_TO (3, 3), p_TO (3,) [m]."""
+    """Transform a pose R_TO (3, 3), p_TO (3,) [m] to R_CO (3, 3), p_CO (3,) [m]."""
     R_CO = np.empty((3, 3))
     for column in range(3):
         x, y, z = vector_to_camera(camera, R[0, column], R[1, column], R[2, column])

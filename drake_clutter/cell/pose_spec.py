@@ -1,4 +1,4 @@
-"""A rigid pose as it stands in a cell's file."""
+"""Rigid pose in a cell file."""
 
 import math
 from functools import lru_cache
@@ -10,11 +10,11 @@ from drake_clutter.validation import StrictModel, Vector3
 
 
 class PoseSpec(StrictModel):
-    """A pose X_AB.
+    """Pose X_AB of a frame B in a frame A.
 
     Attributes:
-        translation: p_AB [m]. Shape (3,).
-        rpy_deg: Roll, pitch and yaw of R_AB = Rz(yaw) Ry(pitch) Rx(roll) [deg]. Shape (3,).
+        translation: Position p_AB [m]. Shape (3,).
+        rpy_deg: Roll, pitch and yaw angles of R_AB = Rz(yaw) Ry(pitch) Rx(roll) [deg]. Shape (3,).
     """
 
     translation: Vector3 = (0.0, 0.0, 0.0)
@@ -22,7 +22,7 @@ class PoseSpec(StrictModel):
 
     @property
     def transform(self) -> RigidTransform:
-        """X_AB; angles that are multiples of 90 deg are exact."""
+        """X_AB; the rotation matrix is exact for multiples of 90 degrees."""
         return _transform(self)
 
 
@@ -33,7 +33,11 @@ def _transform(pose: PoseSpec) -> RigidTransform:
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
         if angle % 90 == 0:
             c, s = float(round(c)), float(round(s))
-        turn, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
-        turn[j, j], turn[j, k], turn[k, j], turn[k, k] = c, -s, s, c
-        R = turn @ R + 0.0
+        R_axis = np.eye(3)
+        j = (axis + 1) % 3
+        k = (axis + 2) % 3
+        R_axis[[j, k], [j, k]] = c
+        R_axis[j, k] = -s
+        R_axis[k, j] = s
+        R = R_axis @ R + 0.0  # -0.0 + 0.0 is 0.0
     return RigidTransform(RotationMatrix(R), pose.translation)

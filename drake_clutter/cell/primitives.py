@@ -1,4 +1,4 @@
-"""Links made of cylinders and capsules, as SDF."""
+"""SDF elements of links made of cylinders and capsules."""
 
 import math
 from dataclasses import dataclass
@@ -9,16 +9,18 @@ from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
+"""Position (x, y, z) [m]."""
 
 
 @dataclass(frozen=True)
 class LinkPrimitive:
-    """A cylinder, or with round ends a capsule.
+    """Cylinder or capsule of a link.
 
     Attributes:
-        start, end: (3,) m, ends of its axis, in the link's frame.
-        radius: m.
-        color: of a visual one.
+        start: Start of the axis in the frame of the link [m].
+        end: End of the axis in the frame of the link [m].
+        radius: Radius [m].
+        color: Color of a visual as "red green blue alpha", 0 to 1; "" for none.
     """
 
     start: Point
@@ -28,42 +30,62 @@ class LinkPrimitive:
 
 
 def sdf_pose(p: Floats, rotation: Rotation, relative_to: str = "") -> str:
-    """SDF pose of a position (3,) m and a rotation."""
+    """Return an SDF pose element.
+
+    Args:
+        p: Position [m]. Shape (3,).
+        rotation: Orientation.
+        relative_to: Name of the frame; "" for the default of SDF.
+    """
     numbers = " ".join(f"{value:.12g}" for value in (*p, *rotation.as_quat(canonical=True)))
     frame = f' relative_to="{relative_to}"' if relative_to else ""
     return f'<pose rotation_format="quat_xyzw"{frame}>{numbers}</pose>'
 
 
 def sdf_geometry(element: str, name: str, primitive: LinkPrimitive, shape: str) -> str:
-    """A visual or collision element: the rod as a cylinder or capsule."""
-    start, end = np.array(primitive.start), np.array(primitive.end)
+    """Return an SDF visual or collision element of a primitive.
+
+    Args:
+        element: `visual` or `collision`.
+        name: Name of the element.
+        primitive: Primitive.
+        shape: `cylinder` or `capsule`.
+    """
+    start = np.array(primitive.start)
+    end = np.array(primitive.end)
     length = math.dist(start, end)
-    turn, _ = Rotation.align_vectors((end - start)[None], np.array([[0.0, 0.0, 1.0]]))
+    rotation, _ = Rotation.align_vectors((end - start)[None], np.array([[0.0, 0.0, 1.0]]))
     material = (
         f"\n        <material><diffuse>{primitive.color}</diffuse></material>"
         if element == "visual" and primitive.color
         else ""
     )
+    size = f"<radius>{primitive.radius:.6g}</radius><length>{length:.6g}</length>"
     return f"""
       <{element} name="{name}">
-        {sdf_pose((start + end) / 2, turn)}
-        <geometry><{shape}><radius>{primitive.radius:.6g}</radius><length>{length:.6g}</length></{shape}></geometry>{material}
+        {sdf_pose((start + end) / 2, rotation)}
+        <geometry><{shape}>{size}</{shape}></geometry>{material}
       </{element}>"""
 
 
 def sdf_inertial(mass: float, p_LCm: Floats, primitive: LinkPrimitive) -> str:
-    """Of a solid cylinder of the mass that is as long and as thick as the link's longest part, about the centre of mass."""
-    start, end = np.array(primitive.start), np.array(primitive.end)
+    """Return an SDF inertial element with the inertia of a solid cylinder.
+
+    Args:
+        mass: Mass [kg].
+        p_LCm: Center of mass in the frame of the link [m]. Shape (3,).
+        primitive: Cylinder.
+    """
+    start = np.array(primitive.start)
+    end = np.array(primitive.end)
     length = max(float(np.linalg.norm(end - start)), 1e-3)
     axis = (end - start) / length
-    along, across = (
-        mass * primitive.radius**2 / 2,
-        mass * (3 * primitive.radius**2 + length**2) / 12,
-    )
-    tensor = across * np.eye(3) + (along - across) * np.outer(axis, axis)
-    parts = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    axial = mass * primitive.radius**2 / 2
+    transverse = mass * (3 * primitive.radius**2 + length**2) / 12
+    tensor = transverse * np.eye(3) + (axial - transverse) * np.outer(axis, axis)
+    indices = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     entries = "".join(
-        f"<i{'xyz'[i]}{'xyz'[j]}>{tensor[i, j]:.6g}</i{'xyz'[i]}{'xyz'[j]}>" for i, j in parts
+        f"<i{'xyz'[i]}{'xyz'[j]}>{tensor[i, j]:.6g}</i{'xyz'[i]}{'xyz'[j]}>" for i, j in indices
     )
     return f"""
       <inertial>
@@ -82,16 +104,26 @@ def sdf_link(
     visual_geometry: tuple[LinkPrimitive, ...],
     shape: str = "capsule",
 ) -> str:
-    """A link; its outline consists of capsules or cylinders, the inertia is that of its longest visible part."""
-    spine = max(visual_geometry, key=lambda rod: math.dist(rod.start, rod.end))
-    shapes = [
-        sdf_geometry("collision", f"outline_{k}", rod, shape)
-        for k, rod in enumerate(collision_geometry)
+    """Return an SDF link element.
+
+    Args:
+        name: Name of the link.
+        pose: SDF pose element; "" for none.
+        mass: Mass [kg].
+        p_LCm: Center of mass in the frame of the link [m]. Shape (3,).
+        collision_geometry: Primitives of the collision geometry.
+        visual_geometry: Cylinders of the visual geometry. The longest one determines the inertia.
+        shape: Shape of the collision geometry, `capsule` or `cylinder`.
+    """
+    longest = max(visual_geometry, key=lambda cylinder: math.dist(cylinder.start, cylinder.end))
+    elements = [
+        sdf_geometry("collision", f"outline_{k}", primitive, shape)
+        for k, primitive in enumerate(collision_geometry)
     ]
-    shapes += [
-        sdf_geometry("visual", f"part_{k}", rod, "cylinder")
-        for k, rod in enumerate(visual_geometry)
+    elements += [
+        sdf_geometry("visual", f"part_{k}", cylinder, "cylinder")
+        for k, cylinder in enumerate(visual_geometry)
     ]
     return f"""
-    <link name="{name}">{pose}{sdf_inertial(mass, p_LCm, spine)}{"".join(shapes)}
+    <link name="{name}">{pose}{sdf_inertial(mass, p_LCm, longest)}{"".join(elements)}
     </link>"""

@@ -1,4 +1,7 @@
-"""The robot of a cell as data. Frames: T the support; B the robot's base; F its tool flange, z out of the arm."""
+"""Robot of a work cell as data.
+
+Frames: T is the support, B is the robot's base, F is its flange, z out of the arm.
+"""
 
 from typing import Annotated, Literal
 
@@ -18,14 +21,14 @@ from drake_clutter.validation import (
 
 
 class JointLimits(StrictModel):
-    """Limits of each joint, in the order of the joints; None: as the model file has them.
+    """Limits of the joints, in their order; None for the limits of the model file.
 
     Attributes:
-        position: Least and greatest [rad].
-        velocity: [rad/s].
-        acceleration: [rad/s^2].
-        jerk: [rad/s^3].
-        torque: [N m].
+        position: Lower and upper position limits [rad].
+        velocity: Velocity limits [rad/s].
+        acceleration: Acceleration limits [rad/s^2].
+        jerk: Jerk limits [rad/s^3].
+        torque: Torque limits [N m].
     """
 
     position: tuple[tuple[Finite, Finite], ...] | None = None
@@ -36,18 +39,20 @@ class JointLimits(StrictModel):
 
 
 class RobotSpec(StrictModel):
-    """Which robot, and where.
+    """Robot with its mounting, limits and payload.
 
     Attributes:
-        model: SDF or URDF file: a path relative to the cell's file, or package://drake_clutter_models/...
-        base_link: The link that is fixed to the base pose.
-        tool_frame: The frame or link F on which the gripper is mounted.
-        base: X_TB.
-        home: Where moves begin and end; the cameras see the support then [rad].
-        limits: Of the joints.
-        ik: Inverse kinematics: closed form of the UR family, or numerical for any arm.
+        model: SDF or URDF file: a path relative to the cell file, or a path in `models/` that
+            starts with `package://drake_clutter_models/`.
+        base_link: Name of the link that is welded to the base pose.
+        tool_frame: Name of the frame or link F on which the gripper is mounted.
+        base: Pose X_TB.
+        home: Configuration in which moves start and end, and in which the arm does not occlude the
+            support [rad].
+        limits: Limits of the joints.
+        ik: Inverse kinematics: `ur` for the closed form of the UR family, or `numerical`.
         payload: Largest mass of gripper and object together [kg].
-        pedestal_side: Of the pedestal's square section, from the table to the base [m]; 0 for none.
+        pedestal_side: Side of the square pedestal between table and base [m]; 0 for no pedestal.
     """
 
     model: ModelFile
@@ -63,7 +68,7 @@ class RobotSpec(StrictModel):
     @field_validator("limits")
     @classmethod
     def _check_limit_lengths(cls, limits: JointLimits, info: ValidationInfo) -> JointLimits:
-        """Refuse limits of another number of joints than `home` has."""
+        """Raise an error unless there are as many limits as joints in `home`."""
         joints = len(info.data.get("home", ()))
         for name, values in limits:
             if joints and values is not None and len(values) != joints:
@@ -73,5 +78,5 @@ class RobotSpec(StrictModel):
 
     @property
     def X_TB(self) -> RigidTransform:
-        """Pose of the base."""
+        """Pose of the base in T."""
         return self.base.transform

@@ -1,6 +1,7 @@
-"""What the objects stand on: a rectangular floor with walls on some of its sides.
+"""Support of the objects: a rectangular floor with walls on some of its sides.
 
-Frame T: origin at the center of the floor's upper surface, z up. It is the world frame of every plant.
+Frame T: origin at the center of the floor's upper surface, z up. It is the world frame of all
+plants.
 """
 
 from typing import Annotated, Literal
@@ -11,18 +12,19 @@ from numpy.typing import NDArray
 from drake_clutter.validation import InRange, StrictModel
 
 Side = Annotated[float, InRange(0.1, 2.0)]
+"""Inner side of a support [m]."""
 
 
 class Support(StrictModel):
-    """A tray, or a shelf board.
+    """Tray or shelf board.
 
     Attributes:
         size: Inner extents along x and y [m].
-        wall_height: Of the walls above the floor [m].
-        wall_thickness: Of the walls [m].
-        walls: The sides that have a wall.
-        floor_thickness: Of the floor [m].
-        floor_height: Of the floor's lower surface above the table [m].
+        wall_height: Height of the walls above the floor [m].
+        wall_thickness: Thickness of the walls [m].
+        walls: Sides with a wall.
+        floor_thickness: Thickness of the floor [m].
+        floor_height: Height of the floor's lower surface above the table [m].
     """
 
     size: tuple[Side, Side]
@@ -38,10 +40,10 @@ class Support(StrictModel):
         return np.array(self.size) / 2
 
     def contains(self, x: float, y: float) -> bool:
-        """Return whether a point (x, y) [m] is above the floor."""
+        """Return whether a point (x, y) [m] is within the inner extents."""
         return bool(abs(x) <= self.size[0] / 2 and abs(y) <= self.size[1] / 2)
 
     @property
     def area(self) -> float:
-        """Of the floor [m^2]."""
+        """Area of the floor [m^2]."""
         return self.size[0] * self.size[1]

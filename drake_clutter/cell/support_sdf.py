@@ -1,10 +1,15 @@
-"""The support as a model. Frame T, the link `tray`: origin at the center of the floor's upper surface, z up."""
+"""SDF model of a support.
+
+Frame T, the link `tray`: origin at the center of the floor's upper surface, z up.
+"""
 
 from drake_clutter.assets.contact_properties import proximity_properties_sdf
 from drake_clutter.cell.support import Support
 
-_FLOOR_COLOR, _WALL_COLOR = "0.72 0.60 0.46 1", "0.55 0.42 0.30 1"
+_FLOOR_COLOR = "0.72 0.60 0.46 1"
+_WALL_COLOR = "0.55 0.42 0.30 1"
 _WALL_NAMES = {"+x": "rim_front", "-x": "rim_back", "+y": "rim_left", "-y": "rim_right"}
+"""Name of the geometry of each wall."""
 
 _Vector = tuple[float, float, float]
 
@@ -28,15 +33,16 @@ def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
 
 
 def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
-    """Return name, size [m] and center p_TG [m] of the floor and of each wall."""
-    (x, y), thickness = support.size, support.wall_thickness
+    """Return name, size [m] and center in T [m] of the floor and of each wall."""
+    x, y = support.size
+    thickness = support.wall_thickness
     height = support.wall_height + support.floor_thickness
-    middle = (support.wall_height - support.floor_thickness) / 2
+    z = (support.wall_height - support.floor_thickness) / 2
     walls: dict[str, tuple[_Vector, _Vector]] = {
-        "+x": ((thickness, y + 2 * thickness, height), ((x + thickness) / 2, 0, middle)),
-        "-x": ((thickness, y + 2 * thickness, height), (-(x + thickness) / 2, 0, middle)),
-        "+y": ((x, thickness, height), (0, (y + thickness) / 2, middle)),
-        "-y": ((x, thickness, height), (0, -(y + thickness) / 2, middle)),
+        "+x": ((thickness, y + 2 * thickness, height), ((x + thickness) / 2, 0, z)),
+        "-x": ((thickness, y + 2 * thickness, height), (-(x + thickness) / 2, 0, z)),
+        "+y": ((x, thickness, height), (0, (y + thickness) / 2, z)),
+        "-y": ((x, thickness, height), (0, -(y + thickness) / 2, z)),
     }
     floor = ("floor", (x, y, support.floor_thickness), (0.0, 0.0, -support.floor_thickness / 2))
     return [
@@ -52,7 +58,7 @@ def support_sdf(support: Support) -> str:
         for name, size, p_TG in support_boxes(support)
     ]
     return f"""<?xml version="1.0"?>
-<!-- Written by drake_clutter.cell.support_sdf. Frame T: origin at the centre of the floor's upper surface, z up. -->
+<!-- Written by drake_clutter.cell.support_sdf. Origin: center of the floor's upper surface. -->
 <sdf version="1.10" xmlns:drake="drake.mit.edu">
   <model name="tray">
     <link name="tray">{"".join(boxes)}

@@ -1,4 +1,7 @@
-"""The work cell as data: robot, gripper, support, cameras and fixtures, in one file."""
+"""Work cell: robot, gripper, support, cameras and fixtures of one YAML file.
+
+Frames: T is the support and the world, B is the robot's base.
+"""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -26,22 +29,23 @@ from drake_clutter.validation import (
 from drake_clutter.yaml_io import read_yaml
 
 GripperSpec = SuctionGripper
-"""Gripper of a cell's file. With a second kind it is the union of both, by `kind`:
-`Annotated[SuctionGripper | Other, Field(discriminator="kind")]`; each satisfies `Gripper`."""
+"""Gripper of a cell file. To add a second kind, make it a union of models that satisfy `Gripper`:
+`Annotated[SuctionGripper | OtherGripper, Field(discriminator="kind")]`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
+"""Resource path of the default cell file."""
 _RESERVED_NAMES = ("tray", "camera", "pedestal", "robot", "gripper")
-"""Names of what stands in a cell besides fixtures."""
+"""Names that fixtures may not have: those of the other parts of a cell."""
 
 
 class WorkCell(StrictModel):
-    """Everything that stands in the cell but the objects.
+    """Work cell without objects.
 
     Attributes:
-        robot: Which arm, and where.
-        gripper: Its tool.
-        support: What the objects stand on.
-        cameras: By name; the explorer sees through the first.
-        fixtures: Obstacles.
+        robot: Robot with its mounting and limits.
+        gripper: Gripper of the robot.
+        support: Tray or shelf board on which the objects stand.
+        cameras: Cameras by name; explorers observe the scene with the first one.
+        fixtures: Fixed obstacles.
     """
 
     robot: RobotSpec
@@ -56,44 +60,50 @@ class WorkCell(StrictModel):
         taken = [*_RESERVED_NAMES, *info.data.get("cameras", ())]
         for fixture in fixtures:
             if fixture.name in taken:
-                what = f"names that differ, also from {', '.join(taken)}"
-                raise rejected_error(f"{fixture.name}: is taken; allowed are {what}")
+                others = ", ".join(taken)
+                raise rejected_error(
+                    f"{fixture.name}: is taken; allowed are names that differ, also from {others}"
+                )
             taken.append(fixture.name)
         return fixtures
 
     @field_validator("cameras")
     @classmethod
     def _check_cameras(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
-        if unfit := [name for name in cameras if not name.isidentifier()]:
-            raise rejected_error(f"{unfit[0]}: a camera's name; allowed are letters, digits and _")
-        if taken := [name for name in cameras if name in _RESERVED_NAMES and name != "camera"]:
+        invalid = [name for name in cameras if not name.isidentifier()]
+        if invalid:
             raise rejected_error(
-                f"{taken[0]}: a camera's name; allowed are names that differ from {', '.join(_RESERVED_NAMES)}"
+                f"{invalid[0]}: a camera's name; allowed are letters, digits and _"
+            )
+        if taken := [name for name in cameras if name in _RESERVED_NAMES and name != "camera"]:
+            reserved = ", ".join(_RESERVED_NAMES)
+            raise rejected_error(
+                f"{taken[0]}: a camera's name; allowed are names that differ from {reserved}"
             )
         name, camera = next(iter(cameras.items()))
         if "support" in info.data and not camera.sees_support(info.data["support"]):
-            raise rejected_error(
-                f"{name}: sees nothing of the support; allowed is a pose from which its floor is in the image"
-            )
+            allowed = "a pose from which its floor is in the image"
+            raise rejected_error(f"{name}: sees nothing of the support; allowed is {allowed}")
         return cameras
 
     @property
     def camera(self) -> Camera:
-        """The camera that the explorer sees through."""
+        """First camera, with which explorers observe the scene."""
         return next(iter(self.cameras.values()))
 
     @property
     def table_height(self) -> float:
-        """Of the table on which support and pedestal stand, in T [m]."""
+        """Height of the table under support and pedestal, in T [m]."""
         return -self.support.floor_thickness - self.support.floor_height
 
     @property
     def pedestal(self) -> tuple[RigidTransform, tuple[float, float, float]] | None:
-        """Pose X_TS and extents [m] of the box under the robot's base; None if it has none.
+        """Pose in T and extents [m] of the box under the base; None without pedestal.
 
-        It is upright, and turned as far about the vertical as the base.
+        It is upright, with the yaw of the base.
         """
-        side, (x, y, z) = self.robot.pedestal_side, self.robot.X_TB.translation()
+        side = self.robot.pedestal_side
+        x, y, z = self.robot.X_TB.translation()
         height = z - self.table_height
         if not side or height <= 0.01:
             return None
@@ -102,27 +112,32 @@ class WorkCell(StrictModel):
 
     @property
     def _upright_base(self) -> RigidTransform:
-        """The turn of the base about the vertical alone."""
+        """Rotation of the base about the vertical only."""
         return PoseSpec(rpy_deg=(0.0, 0.0, self.robot.base.rpy_deg[2])).transform
 
     @property
     def pedestal_overlaps_support(self) -> bool:
-        """Whether the pedestal, or the base if it has none, would stand in the support."""
-        side, p_TB = self.robot.pedestal_side, self.robot.X_TB.translation()
+        """Whether the pedestal, or the base without pedestal, overlaps the support.
+
+        Both are rectangles seen from above: they overlap unless one of their edge directions is a
+        separating axis.
+        """
+        side = self.robot.pedestal_side
+        p_TB = self.robot.X_TB.translation()
         if not side and p_TB[2] > self.support.wall_height:
-            return False  # from a ceiling, or a wall
+            return False  # The robot is mounted on a ceiling or a wall.
         edges = self._upright_base.rotation().matrix()[:2, :2].T
         support = self.support.half_size + self.support.wall_thickness
-        axes = np.vstack([np.eye(2), edges])  # across each edge of either
-        reach = np.abs(axes) @ support + np.abs(axes @ edges.T).sum(axis=1) * side / 2
-        return bool((np.abs(axes @ p_TB[:2]) < reach).all())
+        axes = np.vstack([np.eye(2), edges])
+        extents = np.abs(axes) @ support + np.abs(axes @ edges.T).sum(axis=1) * side / 2
+        return bool((np.abs(axes @ p_TB[:2]) < extents).all())
 
     def with_support(self, support: Support) -> "WorkCell":
         """Return the cell with another support."""
         return self if support == self.support else self.model_copy(update={"support": support})
 
     def __eq__(self, other: object) -> bool:
-        """Whether all is the same, the order of the cameras included."""
+        """Return whether all fields are equal, including the order of the cameras."""
         return (
             super().__eq__(other)
             and isinstance(other, WorkCell)
@@ -130,7 +145,7 @@ class WorkCell(StrictModel):
         )
 
     def __hash__(self) -> int:
-        """Hash of the whole content, so that what is derived from a cell can be kept."""
+        """Return the hash of all fields, so that cells can be keys of caches."""
         return hash(self.model_dump_json())
 
 
@@ -141,14 +156,14 @@ def default_cell() -> WorkCell:
 
 
 def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
-    """Read a cell.
+    """Load a work cell.
 
     Args:
-        path: YAML with the fields of `WorkCell`.
-        settings: Single fields over those of the file, such as "robot.base.z=0.4".
+        path: YAML file with the fields of `WorkCell`.
+        settings: Fields that override those of the file, such as "robot.base.z=0.4".
 
     Raises:
-        InputError: The file, the field and what is allowed.
+        InputError: The file is invalid; names the field and what is allowed.
     """
     given = read_yaml(path, "a mapping with robot, gripper, support and cameras")
     cell = validate(WorkCell, _with_absolute_paths(given, path.parent), str(path))
@@ -156,7 +171,7 @@ def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
 
 
 def _with_absolute_paths(given: Any, folder: Path) -> Any:
-    """Return the document with its models' paths made absolute, as they are relative to the cell's file."""
+    """Return a cell document with model paths relative to `folder` made absolute."""
     if not isinstance(given, dict):
         return given
     absolute = dict(given)
