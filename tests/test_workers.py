@@ -196,3 +196,21 @@ def test_item_rng_depends_on_the_whole_path() -> None:
     }
     assert len(numbers) == 7
     assert item_rng(3, 4).normal() == item_rng(3, 4).normal()
+
+
+def test_a_script_without_a_guard_is_named_as_the_cause(tmp_path: Path) -> None:
+    """Each worker imports the script that starts the workers, and would start workers, too."""
+    script = tmp_path / "study.py"
+    script.write_text(
+        "from functools import partial\n"
+        "from drake_clutter.workers.parallel_map import map_ordered\n"
+        "print(list(map_ordered(partial(partial, int), range(2), workers=2)))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    result = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 1
+    assert "a worker process ended after 0 results" in result.stderr
+    assert "what a script runs belongs under `if __name__ == '__main__':`" in result.stderr
+    assert "lack of memory" not in result.stderr

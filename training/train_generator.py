@@ -102,7 +102,7 @@ def scene_metrics(episodes: Sequence[SampledEpisode], classes: dict[str, Any]) -
         "stable": len(infos) / len(episodes),
         "hidden": float(np.mean(hidden)) if infos else 0.0,
         "distinct": len(forms) / max(1, len(infos)),
-        "stacks": float(np.mean([len(graph.stack_objects()) for graph in graphs])) if infos else 0.0,
+        "stacks": float(np.mean([len(graph.stack_bases()) for graph in graphs])) if infos else 0.0,
         "balanced": float(np.mean(balanced)) if infos else 0.0,
         "rarest_class": min(class_counts[name] for name in classes) / max(1, class_counts.total()),
     }

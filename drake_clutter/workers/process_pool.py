@@ -39,6 +39,7 @@ def map_in_processes(
     remaining = iter(items)
     futures: deque[Future[Result]] = deque()
     num_results = 0
+    processes = pool._processes
     try:
         while True:
             for item in islice(remaining, workers * IN_FLIGHT_PER_WORKER - len(futures)):
@@ -52,14 +53,20 @@ def map_in_processes(
             num_results += 1
             yield result
     except BrokenProcessPool as error:
+        pool.shutdown()  # Until all processes have ended, an exit code may be missing.
+        exit_codes = {process.exitcode for process in processes.values()}
         raise BrokenProcessPool(
             f"a worker process was killed after {num_results} results, perhaps for lack of memory; "
             f"try fewer workers than {workers}"
+            if -signal.SIGKILL in exit_codes
+            else f"a worker process ended after {num_results} results, see its output above; each "
+            "worker imports the script, so what a script runs belongs under "
+            "`if __name__ == '__main__':`"
         ) from error
     finally:
         if futures:  # The caller did not read all results.
             # From Python 3.14 on, this is pool.terminate_workers().
-            for process in list((pool._processes or {}).values()):
+            for process in list(processes.values()):
                 process.terminate()
         pool.shutdown(cancel_futures=True)
 
