@@ -1,35 +1,44 @@
-"""What Drake says of RG scenes, group by group: the truth that `judge_agreement.py` holds the fast judge against.
+"""Collect Drake's verdicts on scenes and moves, the reference that `judge_agreement.py` uses.
 
-Every group of objects that may touch is settled, also after one of them has fallen, so that each says something.
+    python benchmarks/collect_drake_verdicts.py FOLDER --workers 2
 
-python benchmarks/collect_drake_verdicts.py FOLDER --workers 2
+The scenes are those of the random generator. Every group of objects that may touch is settled, also
+after an object of another group has become unstable, so that each group has a verdict. It takes
+one to two hours on two cores. An interrupted run is resumed by the same command.
 """
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from itertools import islice
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.records import resume_jsonl
-from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outcome
+from drake_clutter.scenes.interfaces import (
+    Instability,
+    Move,
+    MoveExecutor,
+    MoveResult,
+    Observation,
+    Outcome,
+    PickPlaceCommand,
+)
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.tasks.belief import legal_moves
-from drake_clutter.validation import config_yaml
-from drake_clutter.workers.parallel_map import map_ordered
+from drake_clutter.validation import to_plain
+from training.results_file import collect_records
+from training.script import WorkersOption, run_script
+
+Record = dict[str, Any]
+"""Verdicts on the groups of a scene, or the outcome of a move."""
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -37,245 +46,295 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "1 ms steps": {"time_step": 0.001},
     "no early stop": {"early_stop_samples": 1_000_000},
 }
-"""How Drake is asked: as by default, and in ways that should not matter."""
+"""Settings of the settling by variant: the defaults, and others with which verdicts should agree.
+
+"other offsets" differs in the random offsets of the objects.
+"""
 
 
 @dataclass(frozen=True)
-class Batch:
-    """RG scenes of a size and how Drake is asked about them."""
+class SceneBatch:
+    """Scenes of one size that are judged with the same settings.
+
+    Attributes:
+        objects: Name of the object set.
+        nodes: Number of nodes of the scene graphs.
+        seed: Seed of the scenes.
+        variant: Key of `VARIANTS`.
+    """
 
     objects: str
     nodes: int
     seed: int
     variant: str = "default"
 
+    @property
+    def name(self) -> str:
+        """Name of the record file."""
+        return f"{self.objects}_{self.nodes}_{self.seed}_{self.variant.replace(' ', '_')}"
 
-BATCHES = {
-    Batch("ycb7", 25, 0): 1000,
-    Batch("ycb7", 10, 0): 300,
-    Batch("ycb7", 15, 0): 300,
-    Batch("ycb7", 20, 0): 300,
-    Batch("pantry14", 25, 0): 300,
-    Batch("ycb7", 25, 0, "other offsets"): 100,
-    Batch("ycb7", 25, 0, "no early stop"): 100,
-    Batch("ycb7", 25, 0, "1 ms steps"): 100,
+    @property
+    def config(self) -> ClutterConfig:
+        """Configuration with the settings of the variant."""
+        config = ClutterConfig()
+        return replace(config, settle=replace(config.settle, **VARIANTS[self.variant]))
+
+    def lay_out(self, index: int) -> tuple[Scene, np.random.Generator]:
+        """Return a scene, and the random generator that a judge draws offsets from next."""
+        rng = item_rng(self.seed, index)
+        return _scene_generator(self.objects, self.nodes, self.seed).lay_out(rng)[0], rng
+
+
+@lru_cache(maxsize=16)
+def _scene_generator(objects: str, nodes: int, seed: int) -> SceneGenerator:
+    return SceneGenerator(GenerationJob("random", objects, None, nodes, seed, ClutterConfig()))
+
+
+SCENES_BY_BATCH = {
+    SceneBatch("ycb7", 25, 0): 1000,
+    SceneBatch("ycb7", 10, 0): 300,
+    SceneBatch("ycb7", 15, 0): 300,
+    SceneBatch("ycb7", 20, 0): 300,
+    SceneBatch("pantry14", 25, 0): 300,
+    SceneBatch("ycb7", 25, 0, "other offsets"): 100,
+    SceneBatch("ycb7", 25, 0, "no early stop"): 100,
+    SceneBatch("ycb7", 25, 0, "1 ms steps"): 100,
 }
-"""How many scenes of each batch the published experiment asks about."""
-MOVES = 1000
-"""Random moves, in the stable scenes of the first batch."""
+"""Number of scenes of each batch in the published results."""
+NUM_MOVES = 1000
+"""Number of random moves in the published results, in the stable scenes of the first batch."""
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Who works: processes here, or on the Ray cluster at an address."""
+class WorkerPool:
+    """Where the computation runs.
+
+    Attributes:
+        workers: Number of processes.
+        ray_address: Address of a Ray cluster; None for this machine.
+    """
 
     workers: int = 1
-    ray: str | None = None
+    ray_address: str | None = None
 
 
-class DrakeVerdicts:
-    """Generates a scene of a batch and settles it; a worker for the runner."""
+class SceneSettler:
+    """Settles the groups of a batch's scenes; a worker for `map_ordered`."""
 
-    def __init__(self, batch: Batch) -> None:
+    def __init__(self, batch: SceneBatch) -> None:
+        """Create the judge.
+
+        Args:
+            batch: The batch.
+        """
         self._batch = batch
-        self._judge = DrakeJudge(config_of(batch))
+        self._judge = DrakeJudge(batch.config)
 
-    def __call__(self, index: int) -> dict[str, Any]:
-        """The record of a scene, as it stands in the file."""
-        scene, rng = laid_out(self._batch, index)
+    def __call__(self, index: int) -> Record:
+        """Return the record of a scene.
+
+        Returns:
+            index: Index of the scene.
+            groups: For each group its `objects` and `fall`: None, or the reason, object,
+                displacement [m] and tilt [rad] of the instability.
+            settled: Only of a stable scene: visible fraction, translation [m] and quaternion of
+                each object at rest.
+        """
+        scene, rng = self._batch.lay_out(index)
         if self._batch.variant == "other offsets":
             rng = item_rng(self._batch.seed, index, 1)
         settled: dict[str, Pose] = dict(scene.poses)
         groups = []
         for group, result in self._judge.settle_groups(scene, rng):
             settled |= result.poses
-            fall = result.instability
-            record: dict[str, Any] = {"objects": [o.name for o in group], "fall": None}
-            if fall is not None:
-                record["fall"] = [fall.reason.value, fall.object, fall.displacement, fall.tilt]
-            groups.append(record)
-        fields: dict[str, Any] = {"index": index, "groups": groups}
+            names = [o.name for o in group]
+            groups.append({"objects": names, "fall": _instability_record(result.instability)})
+        record: Record = {"index": index, "groups": groups}
         if all(group["fall"] is None for group in groups):
-            shares = self._judge.judge_at_rest(scene.with_poses(settled)).visible_fractions
-            fields["settled"] = {
-                name: [shares[name], *pose.translation, *pose.quaternion]
+            fractions = self._judge.judge_at_rest(scene.with_poses(settled)).visible_fractions
+            record["settled"] = {
+                name: [fractions[name], *pose.translation, *pose.quaternion]
                 for name, pose in settled.items()
             }
-        return fields
+        return record
 
 
-def config_of(batch: Batch) -> ClutterConfig:
-    """The world under a variant's settings."""
-    config = ClutterConfig()
-    return replace(config, settle=replace(config.settle, **VARIANTS[batch.variant]))
+def _instability_record(instability: Instability | None) -> list[Any] | None:
+    if instability is None:
+        return None
+    return [
+        instability.reason.value,
+        instability.object,
+        instability.displacement,
+        instability.tilt,
+    ]
 
 
-@lru_cache(maxsize=16)
-def _generator(objects: str, nodes: int, seed: int) -> SceneGenerator:
-    return SceneGenerator(GenerationJob("random", objects, None, nodes, seed, ClutterConfig()))
+def collect_verdicts(batch: SceneBatch, count: int, folder: Path, pool: WorkerPool) -> list[Record]:
+    """Return the records of a batch's first scenes; those that its file lacks are computed.
 
-
-def laid_out(batch: Batch, index: int) -> tuple[Scene, np.random.Generator]:
-    """A scene of a batch, and the generator that the judge draws its offsets from next."""
-    rng = item_rng(batch.seed, index)
-    return _generator(batch.objects, batch.nodes, batch.seed).lay_out(rng)[0], rng
-
-
-@dataclass(frozen=True)
-class _Factory:
-    batch: Batch
-
-    def __call__(self) -> DrakeVerdicts:
-        return DrakeVerdicts(self.batch)
-
-
-def _records(
-    path: Path,
-    head: dict[str, Any],
-    make_worker: Callable[[], Callable[[Any], Any]],
-    items: Sequence[Any],
-    pool: Pool,
-) -> Iterator[dict[str, Any]]:
-    """The head, then a record per item."""
-
-    def make(done: int) -> Iterator[Any]:
-        return map_ordered(make_worker, items[done:], workers=pool.workers, ray_address=pool.ray)
-
-    return islice(resume_jsonl(path, head, make), 1 + len(items))
-
-
-def drake_verdicts(batch: Batch, count: int, folder: Path, pool: Pool) -> Iterator[dict[str, Any]]:
-    """A head (what was asked, at which commit), then the records of the first `count` scenes of a batch."""
-    path = (
-        folder
-        / f"{batch.objects}_{batch.nodes}_{batch.seed}_{batch.variant.replace(' ', '_')}.jsonl.gz"
+    Args:
+        batch: The batch.
+        count: Number of scenes.
+        folder: Folder of the record file.
+        pool: Where the computation runs.
+    """
+    return collect_records(
+        folder / f"{batch.name}.jsonl.gz",
+        asdict(batch) | {"config": to_plain(batch.config)},
+        partial(SceneSettler, batch),
+        range(count),
+        workers=pool.workers,
+        ray_address=pool.ray_address,
     )
-    head = asdict(batch) | {"config": config_yaml(config_of(batch))}
-    yield from _records(path, head, _Factory(batch), range(count), pool)
 
 
 @dataclass(frozen=True)
 class RandomMove:
-    """The k-th random move in a stable scene of a batch.
+    """A random move in a stable scene.
 
     Attributes:
-        batch: of the scene.
-        index: the scene's.
-        draw: k.
-        record: the scene's, see `DrakeVerdicts`.
+        batch: Batch of the scene.
+        index: Index of the scene.
+        number: Number of the move among those in this scene.
+        record: Record of the scene, see `SceneSettler`.
     """
 
-    batch: Batch
+    batch: SceneBatch
     index: int
-    draw: int
-    record: dict[str, Any]
+    number: int
+    record: Record
+
+    def scene(self) -> Scene:
+        """Return the scene at rest."""
+        return at_rest(self.batch.lay_out(self.index)[0], self.record)
+
+    def sample(self, observation: Observation) -> Move:
+        """Return a legal move, drawn uniformly."""
+        moves = legal_moves(observation)
+        rng = item_rng(self.batch.seed, self.index, 2, self.number)
+        return moves[rng.integers(len(moves))]
+
+    def rng(self) -> np.random.Generator:
+        """Return the random generator for the execution of the move."""
+        return item_rng(self.batch.seed, self.index, 3, self.number)
 
 
-class DrakeMoves:
-    """Carries out random moves as `SettleExecutor` does; a worker for the runner."""
+class MoveRunner:
+    """Runs random moves with `SettleExecutor`; a worker for `map_ordered`."""
 
     def __init__(self) -> None:
+        """Create the executor and the detector."""
         config = ClutterConfig()
-        self._executor, self._detector = (
-            SettleExecutor(config, simulate_collapse=False),
-            LabelDetector(config.cell.camera),
-        )
+        self._executor = SettleExecutor(config, simulate_collapse=False)
+        self._detector = LabelDetector(config.cell.camera)
 
-    def __call__(self, item: RandomMove) -> dict[str, Any]:
-        """The record of a move."""
-        scene = settled_scene(laid_out(item.batch, item.index)[0], item.record)
+    def __call__(self, item: RandomMove) -> Record:
+        """Return the record of a move.
+
+        Returns:
+            index: Index of the scene.
+            draw: Number of the move in the scene.
+            move: Object that is picked, and object or tray that it is placed on.
+            result: Result of the move.
+            fall: See `SceneSettler`.
+            place: Translation [m] and quaternion of the placement; None if there was none.
+        """
+        scene, rng = item.scene(), item.rng()
         observation = self._detector.perceive(scene).observation
-        move = random_move(observation, item)
-        rng = move_rng(item)
+        move = item.sample(observation)
         command = resolve_placement(move, observation, ClutterConfig().exploration, rng)
-        outcome = (
-            Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
-            if command is None
-            else self._executor.execute(
-                scene,
-                command,
-                rng,
-            )
-        )
-        fall = outcome.instability
-        place = command.X_TO_place if command else None
+        outcome = execute(self._executor, scene, command, rng)
+        X_TO = command.X_TO_place if command else None
         return {
             "index": item.index,
-            "draw": item.draw,
+            "draw": item.number,
             "move": [move.pick, move.place],
             "result": outcome.result.value,
-            "fall": [fall.reason.value, fall.object, fall.displacement, fall.tilt]
-            if fall
-            else None,
-            "place": [*place.translation, *place.quaternion] if place else None,
+            "fall": _instability_record(outcome.instability),
+            "place": [*X_TO.translation, *X_TO.quaternion] if X_TO else None,
         }
 
 
-def random_move(observation: Observation, item: RandomMove) -> Move:
-    """A legal move, drawn uniformly."""
-    moves = legal_moves(observation)
-    return moves[item_rng(item.batch.seed, item.index, 2, item.draw).integers(len(moves))]
+def execute(
+    executor: MoveExecutor, scene: Scene, command: PickPlaceCommand | None, rng: np.random.Generator
+) -> Outcome:
+    """Return the outcome of a command; without a command, there was no free placement."""
+    if command is None:
+        return Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
+    return executor.execute(scene, command, rng)
 
 
-def move_rng(item: RandomMove) -> np.random.Generator:
-    """What decides the chances of carrying the move out."""
-    return item_rng(item.batch.seed, item.index, 3, item.draw)
+def moves_path(batch: SceneBatch, folder: Path) -> Path:
+    """Return the record file of the random moves in a batch's scenes."""
+    return folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl.gz"
 
 
-def drake_moves(
-    batch: Batch, scenes: int, count: int, folder: Path, pool: Pool
-) -> Iterator[dict[str, Any]]:
-    """A head, then `count` random moves, spread over the batch's first `scenes` scenes that Drake calls stable."""
-    stable = [r for r in list(drake_verdicts(batch, scenes, folder, pool))[1:] if "settled" in r]
-    items = [
-        RandomMove(
-            batch, stable[k % len(stable)]["index"], k // len(stable), stable[k % len(stable)]
-        )
-        for k in range(count)
-    ]
-    head = asdict(batch) | {"config": config_yaml(config_of(batch)), "scenes": scenes}
-    yield from _records(
-        folder / f"moves_{batch.objects}_{batch.nodes}_{batch.seed}.jsonl.gz",
-        head,
-        DrakeMoves,
+def collect_moves(
+    batch: SceneBatch, num_scenes: int, count: int, folder: Path, pool: WorkerPool
+) -> list[Record]:
+    """Return the records of random moves; those that the file lacks are computed.
+
+    Args:
+        batch: Batch of the scenes.
+        num_scenes: Number of scenes; the moves are spread over those that are stable.
+        count: Number of moves.
+        folder: Folder of the record files.
+        pool: Where the computation runs.
+    """
+    records = collect_verdicts(batch, num_scenes, folder, pool)
+    stable = [record for record in records if "settled" in record]
+    items = []
+    for k in range(count):
+        number, position = divmod(k, len(stable))
+        record = stable[position]
+        items.append(RandomMove(batch, record["index"], number, record))
+    return collect_records(
+        moves_path(batch, folder),
+        asdict(batch) | {"config": to_plain(batch.config), "scenes": num_scenes},
+        MoveRunner,
         items,
-        pool,
+        workers=pool.workers,
+        ray_address=pool.ray_address,
     )
 
 
-def settled_scene(scene: Scene, record: dict[str, Any]) -> Scene:
-    """The scene as it came to rest; the record is a stable one's."""
+def at_rest(scene: Scene, record: Record) -> Scene:
+    """Return a stable scene as it came to rest.
+
+    Args:
+        scene: The scene as laid out.
+        record: Its record, see `SceneSettler`.
+    """
     return scene.with_poses(
         {name: Pose(tuple(v[1:4]), tuple(v[4:])) for name, v in record["settled"].items()}
     )
 
 
-def hidden(record: dict[str, Any], visibility_threshold: float) -> tuple[str, ...]:
-    """What a stable scene hides."""
+def hidden_objects(record: Record, visibility_threshold: float) -> tuple[str, ...]:
+    """Return the hidden objects of a stable scene.
+
+    Args:
+        record: Record of the scene, see `SceneSettler`.
+        visibility_threshold: Visible fraction below which an object is hidden.
+    """
     return tuple(name for name, v in record["settled"].items() if v[0] < visibility_threshold)
 
 
-def main(folder: Path, workers: int = 2, ray: str | None = None) -> None:
-    """Collects what `judge_agreement.py` needs, about an hour on two cores; a run that was stopped goes on."""
-    pool = Pool(workers, ray)
-    for batch, count in BATCHES.items():
-        if batch.variant == "default":
-            show(
-                drake_verdicts(batch, count, folder, pool),
-                f"{batch.objects}, {batch.nodes} nodes",
-                count,
-            )
-    (batch, scenes), *_ = BATCHES.items()
-    show(drake_moves(batch, scenes, MOVES, folder, pool), "moves", MOVES)
-    for batch, count in BATCHES.items():
-        show(drake_verdicts(batch, count, folder, pool), batch.variant, count)
-
-
-def show(records: Iterator[dict[str, Any]], what: str, count: int) -> None:
-    """Takes the records, with a progress bar."""
-    for _ in track(records, what, total=count + 1, console=Console(stderr=True)):
-        pass
+def main(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the record files.")],
+    workers: WorkersOption = 2,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Ray cluster to run on.")
+    ] = None,
+) -> None:
+    """Collect the verdicts and moves that are missing."""
+    pool = WorkerPool(workers, ray)
+    (batch, num_scenes), *_ = SCENES_BY_BATCH.items()
+    collect_moves(batch, num_scenes, NUM_MOVES, folder, pool)
+    for batch, count in SCENES_BY_BATCH.items():
+        collect_verdicts(batch, count, folder, pool)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

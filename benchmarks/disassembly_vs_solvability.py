@@ -1,93 +1,91 @@
-"""Is what the generator's reward asks of a scene, that it can be taken apart from the top, what makes it solvable?
+"""Compare two properties of stable scenes: can they be disassembled, and are they solvable.
 
-    drake-clutter generate --agent training/checkpoints/sg_star_paper.safetensors --count 100 --seed 1000 --out out/paper
-    python benchmarks/disassembly_vs_solvability.py out/paper out/others
+    drake-clutter generate --agent sg-star --count 100 --seed 1000 --out out/scenes
+    python benchmarks/disassembly_vs_solvability.py out/scenes --out disassembly.json
 
-For each folder that `drake-clutter generate` wrote: its stable scenes by whether they come apart, and whether they are solvable.
+The generators' reward asks that a scene can be disassembled from the top, which is cheap to test. A
+scene is solvable if the oracle search reveals all objects.
 """
 
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER
 from drake_clutter.commands.job_file import JOB_FILE
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import cli_error_handler, write_json
-from drake_clutter.resources import git_commit
+from drake_clutter.files import write_json
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.oracle_search import Solvability
+from training.results_file import Row, provenance
+from training.script import ROOT, print_table, run_script
 
-OUT = Path(__file__).parent / "results" / "come_apart.json"
+RESULTS_FILE = ROOT / "benchmarks/results/come_apart.json"
+"""Published results."""
 
 
-def counted(folder: Path) -> dict[str, Any]:
-    """A folder's row."""
-    job, catalog, judge = (
-        json.loads((folder / JOB_FILE).read_text()),
-        load_catalog(),
-        StaticStabilityJudge(ClutterConfig()),
-    )
-    counts: Counter[tuple[bool, bool]] = Counter()  # comes apart, solvable
+def count_scenes(folder: Path) -> Row:
+    """Return the counts of stable scenes by both properties.
+
+    Args:
+        folder: Folder that `drake-clutter generate` wrote.
+    """
+    job = json.loads((folder / JOB_FILE).read_text())
     answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
+    catalog = load_catalog()
+    judge = StaticStabilityJudge(ClutterConfig())
+    counts = Counter[tuple[bool, bool]]()
     for index, answer in enumerate(answers):
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         if file.verdict is not None and file.verdict.stable:
-            counts[
-                judge.is_disassemblable(file.settled_scene) is True,
-                answer == Solvability.SOLVABLE.value,
-            ] += 1
-    told: dict[str, Any] = {"agent": job["agent"], "objects": job["objects"], "nodes": job["nodes"]}
-    told |= {"seed": job["seed"], "scenes": len(answers)}
-    for name, apart in (("comes_apart", True), ("does_not", False)):
-        solved, total = counts[apart, True], counts[apart, True] + counts[apart, False]
-        told[name] = {
+            is_disassemblable = judge.is_disassemblable(file.settled_scene) is True
+            counts[is_disassemblable, answer == Solvability.SOLVABLE.value] += 1
+    row: Row = {key: job[key] for key in ("agent", "objects", "nodes", "seed")}
+    row["scenes"] = len(answers)
+    for name, is_disassemblable in (("comes_apart", True), ("does_not", False)):
+        num_solvable = counts[is_disassemblable, True]
+        total = num_solvable + counts[is_disassemblable, False]
+        row[name] = {
             "stable": total,
-            "solvable": solved,
-            "solvable_ci95": wilson_interval(solved, total),
+            "solvable": num_solvable,
+            "solvable_ci95": wilson_interval(num_solvable, total),
         }
-    return told
+    return row
+
+
+def table_row(row: Row) -> dict[str, str]:
+    """Return a row of the results as cells of the printed table."""
+    return {
+        "agent": Path(row["agent"]).stem,
+        "objects": row["objects"],
+        "nodes": str(row["nodes"]),
+        "scenes": str(row["scenes"]),
+        "disassemblable": str(row["comes_apart"]["stable"]),
+        "solvable of these": str(row["comes_apart"]["solvable"]),
+        "not disassemblable": str(row["does_not"]["stable"]),
+        "solvable of those": str(row["does_not"]["solvable"]),
+    }
 
 
 def main(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Of `drake-clutter generate`.")
+        list[Path], typer.Argument(metavar="DIR...", help="Folders of `drake-clutter generate`.")
     ],
-    out: Annotated[Path, typer.Option(help="JSON to write.")] = OUT,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")
+    ] = RESULTS_FILE,
 ) -> None:
-    """Counts, and prints a table."""
-    rows = [counted(folder) for folder in folders]
-    write_json(out, {"commit": git_commit(), "rows": rows})
-    table = Table(
-        "agent",
-        "objects",
-        "nodes",
-        "scenes",
-        "stable, come apart",
-        "of these solvable",
-        "stable, do not",
-        "of these solvable",
-    )
-    for row in rows:
-        cells = [
-            f"{row[name][key]}"
-            for name in ("comes_apart", "does_not")
-            for key in ("stable", "solvable")
-        ]
-        table.add_row(
-            Path(row["agent"]).stem, row["objects"], str(row["nodes"]), str(row["scenes"]), *cells
-        )
-    Console().print(table)
+    """Count scenes, and print and write the table."""
+    rows = [count_scenes(folder) for folder in folders]
+    write_json(out, {**provenance(), "rows": rows})
+    print_table([table_row(row) for row in rows])
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,96 +1,118 @@
-"""What a move and a new scene of `ClutterExploration-v0` take, judged fast, and where the time goes.
+"""Time the moves and resets of the exploration environment, and their parts.
 
-python benchmarks/exploration_env_speed.py --out benchmarks/results/exploration_environment.json
+    python benchmarks/exploration_env_speed.py --out exploration_env_speed.json
+
+Run it with no other work on the machine. The random moves are the same in every run, which the hash
+of all observations confirms.
 """
 
 import hashlib
-import platform
-from collections import defaultdict
-from pathlib import Path
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.generator_training_speed import timed
-from drake_clutter.files import cli_error_handler, write_json
+from benchmarks.measurement import Stopwatch, describe_machine
+from drake_clutter.files import write_json
 from drake_clutter.perception.ray_detector import RayDetector
-from drake_clutter.resources import git_commit, resource_path
+from drake_clutter.resources import resource_path
 from drake_clutter.tasks import clutter_exploration
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import SteppedBackend
+from drake_clutter.tasks.exploration_graph import build_exploration_graph
+from training.results_file import Row, provenance
+from training.script import ResultsOption, print_table, run_script
 
 SCENES = "training/scenes/sg_star_25.json"
-"""Whose graphs are laid out anew; this set does not change."""
-MOVE, SCENE = "a move", "a new scene"
-PARTS: dict[str, tuple[Any, str]] = {
-    MOVE: (ClutterExploration, "step"),
-    SCENE: (ClutterExploration, "reset"),
-    "of both: the move, judged": (SteppedBackend, "step"),
-    "of both: the look": (RayDetector, "look"),
-    "of both: the graph": (clutter_exploration, "exploration_graph"),
+"""Scene set whose graphs are laid out anew in every episode."""
+MOVE = "a move"
+"""Name of the measurement of the environment's steps."""
+RESET = "a new scene"
+"""Name of the measurement of the environment's resets."""
+PARTS: dict[str, tuple[Any, Callable[..., Any]]] = {
+    MOVE: (ClutterExploration, ClutterExploration.step),
+    RESET: (ClutterExploration, ClutterExploration.reset),
+    "of both: the move, judged": (SteppedBackend, SteppedBackend.step),
+    "of both: the look": (RayDetector, RayDetector.perceive),
+    "of both: the graph": (clutter_exploration, build_exploration_graph),
 }
-"""What is timed."""
+"""Measured functions by name, each with the class or module that it is called from."""
 
 
-def measured(privileged: bool, episodes: int, seconds: dict[str, float]) -> dict[str, Any]:
-    """Random moves that are allowed, until the episodes are over; the same ones whenever this is measured."""
-    environment, draw = (
-        ClutterExploration(resource_path(SCENES), privileged=privileged),
-        np.random.default_rng(0),
-    )
-    moves, told = 0, hashlib.sha256()
-    for episode in range(-1, episodes):
-        if episode == 0:  # what is compiled and read at first is not counted
-            seconds.clear()
-            moves, told = 0, hashlib.sha256()
-        observation, _ = environment.reset(seed=episode + 1)
-        over = out_of_moves = False
-        while not (over or out_of_moves):
-            allowed = np.argwhere(observation["allowed"])
-            observation, _, over, out_of_moves, _ = environment.step(
-                allowed[draw.integers(len(allowed))]
-            )
-            moves += 1
+def run_episodes(environment: ClutterExploration, seeds: range, rng: np.random.Generator) -> Row:
+    """Run episodes of random allowed moves.
+
+    Args:
+        environment: The environment.
+        seeds: Seed of each episode.
+        rng: Random generator of the moves.
+
+    Returns:
+        The number of moves, and the hash of all observations.
+    """
+    num_moves = 0
+    observations_hash = hashlib.sha256()
+    for seed in seeds:
+        observation, _ = environment.reset(seed=seed)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            allowed = np.argwhere(observation["action_mask"])
+            action = allowed[rng.integers(len(allowed))]
+            observation, _, terminated, truncated, _ = environment.step(action)
+            num_moves += 1
             for array in observation.values():
-                told.update(array.tobytes())
+                observations_hash.update(array.tobytes())
+    return {"moves": num_moves, "observations_sha256": observations_hash.hexdigest()}
+
+
+def measure(privileged: bool, episodes: int) -> Row:
+    """Return the times of the environment's parts.
+
+    Args:
+        privileged: Whether the observation is the full state.
+        episodes: Number of episodes.
+    """
+    environment = ClutterExploration(resource_path(SCENES), privileged=privileged)
+    rng = np.random.default_rng(0)
+    run_episodes(environment, range(1), rng)  # Compiles code and reads files.
+    stopwatch = Stopwatch()
+    with stopwatch.watch(PARTS):
+        run = run_episodes(environment, range(1, 1 + episodes), rng)
+    total = stopwatch.total(MOVE) + stopwatch.total(RESET)
     return {
         "privileged": privileged,
         "episodes": episodes,
-        "moves": moves,
-        "ms_a_move": 1000 * seconds[MOVE] / moves,
-        "ms_a_scene": 1000 * seconds[SCENE] / episodes,
-        "parts": {name: seconds[name] / (seconds[MOVE] + seconds[SCENE]) for name in PARTS},
-        "observations_sha256": told.hexdigest(),
+        "moves": run["moves"],
+        "ms_a_move": 1000 * stopwatch.total(MOVE) / run["moves"],
+        "ms_a_scene": 1000 * stopwatch.total(RESET) / episodes,
+        "parts": {name: stopwatch.total(name) / total for name in PARTS},
+        "observations_sha256": run["observations_sha256"],
+    }
+
+
+def table_row(row: Row) -> dict[str, str]:
+    """Return a row of the results as cells of the printed table."""
+    return {
+        "observation": "full state" if row["privileged"] else "what has been seen",
+        "moves": str(row["moves"]),
+        "scenes": str(row["episodes"]),
+        "move (ms)": f"{row['ms_a_move']:.1f}",
+        "new scene (ms)": f"{row['ms_a_scene']:.1f}",
+        **{f"fraction of time: {name}": f"{share:.2f}" for name, share in row["parts"].items()},
     }
 
 
 def main(
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    episodes: Annotated[int, typer.Option(help="Of each kind of observation.")] = 200,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each kind.")] = 200,
+    out: ResultsOption = None,
 ) -> None:
-    """Measures and prints; with nothing else running."""
-    seconds: dict[str, float] = defaultdict(float)
-    for name, (owner, method) in PARTS.items():
-        setattr(owner, method, timed(getattr(owner, method), name, seconds))
-    rows = [measured(privileged, episodes, seconds) for privileged in (False, True)]
-    heads = [
-        f"{'all objects' if row['privileged'] else 'K_t'}: {row['moves']} moves, {row['episodes']} scenes"
-        for row in rows
-    ]
-    table = Table("", *heads)
-    table.add_row("ms for a move", *[f"{row['ms_a_move']:.1f}" for row in rows])
-    table.add_row("ms for a new scene", *[f"{row['ms_a_scene']:.1f}" for row in rows])
-    for name in PARTS:
-        table.add_row(f"share of the time: {name}", *[f"{row['parts'][name]:.2f}" for row in rows])
-    Console(width=120).print(table)
+    """Measure the environment with both kinds of observations."""
+    rows = [measure(privileged, episodes) for privileged in (False, True)]
+    print_table([table_row(row) for row in rows])
     if out is not None:
-        machine = {"processor": platform.processor(), "system": platform.platform()}
-        write_json(out, {"rows": rows, "machine": machine, "commit": git_commit()})
+        write_json(out, {"rows": rows, "machine": describe_machine(), **provenance()})
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

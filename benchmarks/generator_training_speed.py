@@ -1,54 +1,49 @@
-"""Where the time of the generator's training goes, with one thread and with two.
+"""Time the training of a scene generator and its parts, by number of threads.
 
-python benchmarks/generator_training_speed.py --out benchmarks/results/generator_training.json
+    python benchmarks/generator_training_speed.py --out generator_training_speed.json
+
+Run it with no other work on the machine.
 """
 
-import platform
 import time
-from collections import defaultdict
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from benchmarks.measurement import Stopwatch, describe_machine
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.agents.soft_q import NUM_GRADIENT_SHARDS, ReplayBuffer, SoftQConfig, SoftQLearner
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import cli_error_handler, write_json
-from drake_clutter.resources import git_commit
+from drake_clutter.files import write_json
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
+from training.results_file import Row, provenance
+from training.script import ResultsOption, print_table, run_script
 
-TIMED: dict[str, tuple[type, str]] = {
-    "environments": (ClutterGeneration, "step"),
-    "new episodes": (ClutterGeneration, "reset"),
-    "remembering": (ReplayBuffer, "add"),
-    "updates": (SoftQLearner, "_update"),
-    "of updates: drawing from memory": (ReplayBuffer, "draw"),
-    "of updates: losses and gradients": (SoftQLearner, "_loss"),
+PARTS: dict[str, tuple[Any, Callable[..., Any]]] = {
+    "environments": (ClutterGeneration, ClutterGeneration.step),
+    "new episodes": (ClutterGeneration, ClutterGeneration.reset),
+    "remembering": (ReplayBuffer, ReplayBuffer.add),
+    "updates": (SoftQLearner, SoftQLearner._update),
+    "of updates: drawing from memory": (ReplayBuffer, ReplayBuffer.sample_sequences),
+    "of updates: losses and gradients": (SoftQLearner, SoftQLearner._loss),
 }
-"""What is timed. Gradients are summed over the threads, all else is of the wall clock."""
+"""Measured methods by name, each with its class.
+
+The times of losses and gradients are summed over the threads; all others are wall-clock times.
+"""
 
 
-def timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    """The function, with what it takes added up."""
+def measure(threads: int, steps: int) -> Row:
+    """Return the steps per second after the warm-up, and the times of the parts.
 
-    def call(*args: Any, **options: Any) -> Any:
-        start = time.perf_counter()
-        try:
-            return function(*args, **options)
-        finally:
-            seconds[name] += time.perf_counter() - start
-
-    return call
-
-
-def measured(threads: int, steps: int) -> dict[str, Any]:
-    """Steps per second after the warm-up, first without, then with the single parts timed."""
+    Args:
+        threads: Number of threads of an update.
+        steps: Steps of the environments in each of three rounds: one to warm up, one to measure the
+            whole, and one to measure the parts, which takes slightly longer.
+    """
     classes = load_catalog().object_set("ycb7")
     learning = SoftQConfig(temperature=0.25)
     learner = SoftQLearner(
@@ -59,57 +54,50 @@ def measured(threads: int, steps: int) -> dict[str, Any]:
         threads,
     )
 
-    def run() -> float:
-        until, start = learner.step + steps, time.perf_counter()
-        while learner.step < until:
+    def train(until_step: int) -> float:
+        """Train until a step; return the time that it took [s]."""
+        start = time.perf_counter()
+        while learner.step < until_step:
             learner.train_iteration()
         return time.perf_counter() - start
 
-    while learner.step < learning.learning_starts + steps:
-        learner.train_iteration()
-    whole = run()
-    seconds: dict[str, float] = defaultdict(float)
-    originals = {name: getattr(owner, method) for name, (owner, method) in TIMED.items()}
-    for name, (owner, method) in TIMED.items():
-        setattr(owner, method, timed(originals[name], name, seconds))
-    try:
-        parts = run()
-    finally:
-        for name, (owner, method) in TIMED.items():
-            setattr(owner, method, originals[name])
+    train(learning.learning_starts + steps)
+    seconds = train(learner.step + steps)
+    stopwatch = Stopwatch()
+    with stopwatch.watch(PARTS):
+        seconds_with_parts = train(learner.step + steps)
     return {
         "threads": threads,
-        "steps_per_s": steps / whole,
-        "seconds": parts,
-        "parts": {name: seconds[name] for name in TIMED},
+        "steps_per_s": steps / seconds,
+        "seconds": seconds_with_parts,
+        "parts": {name: stopwatch.total(name) for name in PARTS},
+    }
+
+
+def table_row(row: Row) -> dict[str, str]:
+    """Return a row of the results as cells of the printed table."""
+    fractions = {name: seconds / row["seconds"] for name, seconds in row["parts"].items()}
+    return {
+        "threads": str(row["threads"]),
+        "steps per second": f"{row['steps_per_s']:.0f}",
+        **{f"fraction of time: {name}": f"{value:.2f}" for name, value in fractions.items()},
     }
 
 
 def main(
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
     steps: Annotated[
-        int, typer.Option(help="Of the environments, in each of three rounds.")
+        int, typer.Option(min=1, help="Steps of the environments in each of three rounds.")
     ] = 8000,
+    out: ResultsOption = None,
 ) -> None:
-    """Measures and prints; with nothing else running."""
+    """Measure the training with one thread, two threads, and so on."""
     limit_operations_to_one_thread()
-    rows = [measured(threads, steps) for threads in range(1, NUM_GRADIENT_SHARDS + 1)]
-    table = Table(
-        "part, share of the time",
-        *[f"{row['threads']} thread(s), {row['steps_per_s']:.0f} steps/s" for row in rows],
-    )
-    for name in TIMED:
-        table.add_row(name, *[f"{row['parts'][name] / row['seconds']:.2f}" for row in rows])
-    Console().print(table)
+    rows = [measure(threads, steps) for threads in range(1, NUM_GRADIENT_SHARDS + 1)]
+    print_table([table_row(row) for row in rows])
     if out is not None:
-        machine = {
-            "processor": platform.processor(),
-            "system": platform.platform(),
-            "torch": torch.__version__,
-        }
-        write_json(out, {"steps": steps, "rows": rows, "machine": machine, "commit": git_commit()})
+        machine = describe_machine("torch")
+        write_json(out, {"steps": steps, "rows": rows, "machine": machine, **provenance()})
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -1,12 +1,14 @@
-"""How far the fast judge and executor agree with Drake, and Drake with itself, on RG scenes and random moves.
+"""Measure how far the static stability model agrees with Drake, and Drake with itself.
 
-python benchmarks/collect_drake_verdicts.py FOLDER --workers 2     # Drake's side, about an hour and a half; resumes
-python benchmarks/judge_agreement.py FOLDER --out benchmarks/results/judges.json --picture docs/images/judges_disagree.png
+    python benchmarks/collect_drake_verdicts.py FOLDER --workers 2
+    python benchmarks/judge_agreement.py FOLDER --out judges.json --figure disagreements.png
+
+The verdicts are compared on scenes of the random generator, and the outcomes of random moves.
 """
 
 import itertools
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,59 +16,67 @@ from typing import Annotated, Any
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from benchmarks.collect_drake_verdicts import (
-    BATCHES,
-    MOVES,
-    Batch,
-    Pool,
+    NUM_MOVES,
+    SCENES_BY_BATCH,
     RandomMove,
-    config_of,
-    drake_moves,
-    drake_verdicts,
-    hidden,
-    laid_out,
-    move_rng,
-    settled_scene,
+    Record,
+    SceneBatch,
+    WorkerPool,
+    collect_moves,
+    collect_verdicts,
+    execute,
+    hidden_objects,
+    moves_path,
 )
 from drake_clutter.files import write_json
+from drake_clutter.records import read_jsonl
 from drake_clutter.reports.scene_images import SceneRenderer
-from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import (
     InconclusiveReason,
     InconclusiveVerdict,
+    Instability,
     Move,
     MoveResult,
-    Outcome,
 )
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
+from training.evaluate_generators import verdict_name
+from training.results_file import Row, provenance
+from training.script import ResultsOption, print_table, progress, run_script
 
 MARGINS = (0.0005, 0.001, 0.0015, 0.00205, 0.0025, 0.003, 0.004)
+"""Margins of the static model that are compared [m]."""
 FRICTIONS = (0.0, 0.3, 0.5)
-SHOWN = 8
-"""Disagreements in the picture."""
+"""Friction coefficients of the static model that are compared."""
+NUM_PICTURES = 8
+"""Number of disagreements in the figure."""
+SAME_PLACE = 0.001
+"""Distance along each axis within which two placements count as the same [m]."""
 
 
 @dataclass
 class Confusion:
-    """Verdicts of two judges on the same things: (the fast one's, Drake's), each with how often."""
+    """Confusion matrix of the static model and Drake.
+
+    Attributes:
+        pairs: How often each pair of verdicts, static and Drake's, occurred.
+    """
 
     pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def row(self) -> dict[str, Any]:
-        """Agreement over what was judged, with 95 % interval, and each kind of error."""
+    def metrics(self) -> Row:
+        """Return the agreement over the conclusive verdicts, and the rate of each error."""
         judged = Counter({pair: n for pair, n in self.pairs.items() if pair[0] != "cannot judge"})
-        equal = sum(n for (fast, drake), n in judged.items() if fast == drake)
-        count, total = judged.total(), self.pairs.total()
+        equal = sum(n for (static, drake), n in judged.items() if static == drake)
+        count = judged.total()
+        total = self.pairs.total()
         falling = sum(n for (_, drake), n in judged.items() if drake == "falls")
-        called_stable = sum(n for (fast, _), n in judged.items() if fast == "stable")
+        called_stable = sum(n for (static, _), n in judged.items() if static == "stable")
         false_stable = judged["stable", "falls"]
         return {
             "count": total,
@@ -79,350 +89,354 @@ class Confusion:
             if called_stable
             else None,
             "false_fall_rate": judged["falls", "stable"] / count,
-            "confusion": {
-                f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(self.pairs.items())
-            },
+            "confusion": self.counts(),
         }
 
+    def counts(self) -> dict[str, int]:
+        """Return the matrix for a results file."""
+        pairs = sorted(self.pairs.items())
+        return {f"fast {static}, drake {drake}": n for (static, drake), n in pairs}
 
-@dataclass
+
+@dataclass(frozen=True)
 class Disagreement:
-    """A stack of which the judges say different things, for the picture."""
+    """A stack on which the verdicts differ.
 
-    objects: Scene
-    fast: str
+    Attributes:
+        scene: The scene with this stack only.
+        static: The static model's reason of instability, or "stable".
+        drake: Likewise Drake's.
+    """
+
+    scene: Scene
+    static: str
     drake: str
 
 
-def said(found: Any) -> str:
-    """One word for what a judge found."""
-    return (
-        "cannot judge"
-        if isinstance(found, InconclusiveVerdict)
-        else "stable"
-        if found is None
-        else "falls"
-    )
+@dataclass
+class BatchComparison:
+    """Comparison of the static model with Drake on a batch of scenes.
 
+    Attributes:
+        batch: The batch.
+        scenes: Verdicts on whole scenes.
+        stacks: Verdicts on the groups of objects that may touch.
+        by_drake_reason: Verdicts on unstable groups by Drake's reason.
+        by_class: Verdicts on unstable groups by the class of the object that is unstable in Drake.
+        by_static_reason: Verdicts on groups that are not stable in the static model, by its reason.
+        num_stable_in_both: Number of scenes that both call stable.
+        num_same_hidden: Number of these with the same hidden objects.
+        disagreements: The groups on which the verdicts differ.
+    """
 
-def compare_scenes(
-    batch: Batch, records: Sequence[dict[str, Any]], disagreements: list[Disagreement]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The row of a batch, and its confusions by reason and by class."""
-    config = config_of(batch)
-    judge = StaticStabilityJudge(config)
-    scenes, stacks = Confusion(), Confusion()
-    by_reason: dict[str, Confusion] = defaultdict(Confusion)
-    by_class: dict[str, Confusion] = defaultdict(Confusion)
-    fast_reasons: dict[str, Confusion] = defaultdict(Confusion)
-    same_hidden = both_stable = 0
-    for record in track(records, f"{batch.objects} {batch.nodes}", console=Console(stderr=True)):
-        scene, rng = laid_out(batch, record["index"])
-        verdict = judge.judge(scene, rng)
-        found = verdict if isinstance(verdict, InconclusiveVerdict) else verdict.instability
-        drake = "stable" if "settled" in record else "falls"
-        scenes.pairs[said(found), drake] += 1
-        if not isinstance(verdict, InconclusiveVerdict) and verdict.stable and drake == "stable":
-            both_stable += 1
-            same_hidden += verdict.hidden == hidden(record, config.cell.camera.visibility_threshold)
-        for group in record["groups"]:
-            part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
-            fall = group["fall"]
-            whole = judge.find_instability(part)
-            if (
-                isinstance(whole, InconclusiveVerdict)
-                and whole.reason is InconclusiveReason.FLOATING
-            ):
-                # What it misses stands in another group: asked again together with all that stands.
-                standing = tuple(
-                    scene[n]
-                    for other in record["groups"]
-                    if not other["fall"]
-                    for n in other["objects"]
-                )
-                whole = judge.find_instability(replace(scene, objects=part.objects + standing))
-            pair = said(whole), "stable" if fall is None else "falls"
-            stacks.pairs[pair] += 1
-            if fall is not None:
-                by_reason[fall[0]].pairs[pair] += 1
-                by_class[scene[fall[1]].object_class.name].pairs[pair] += 1
-            if whole is not None:
-                fast_reasons[whole.reason.value].pairs[pair] += 1
-            if pair[0] not in ("cannot judge", pair[1]):
-                why = f"falls: {fall[0]}" if fall else "stable"
-                disagreements.append(
-                    Disagreement(part, "stable" if whole is None else str(whole.reason.value), why)
-                )
-    row = scenes.row() | {
-        "hidden_agreement": same_hidden / both_stable if both_stable else None,
-        "hidden_agreement_ci95": wilson_interval(same_hidden, both_stable),
-        "stacks": stacks.row(),
-    }
-    details = {
-        "by_drakes_reason": {
-            reason: dict_of(confusion) for reason, confusion in sorted(by_reason.items())
-        },
-        "by_class_that_falls": {
-            name: dict_of(confusion) for name, confusion in sorted(by_class.items())
-        },
-        "by_the_fast_judges_reason": {
-            reason: dict_of(confusion) for reason, confusion in sorted(fast_reasons.items())
-        },
-    }
-    return row, details
+    batch: SceneBatch
+    scenes: Confusion = field(default_factory=Confusion)
+    stacks: Confusion = field(default_factory=Confusion)
+    by_drake_reason: dict[str, Confusion] = field(default_factory=lambda: defaultdict(Confusion))
+    by_class: dict[str, Confusion] = field(default_factory=lambda: defaultdict(Confusion))
+    by_static_reason: dict[str, Confusion] = field(default_factory=lambda: defaultdict(Confusion))
+    num_stable_in_both: int = 0
+    num_same_hidden: int = 0
+    disagreements: list[Disagreement] = field(default_factory=list)
 
+    def run(self, records: Iterable[Record]) -> None:
+        """Compare the verdicts on scenes.
 
-def dict_of(confusion: Confusion) -> dict[str, int]:
-    """For JSON."""
-    return {
-        f"fast {fast}, drake {drake}": n for (fast, drake), n in sorted(confusion.pairs.items())
-    }
+        Args:
+            records: Drake's records of the scenes.
+        """
+        config = self.batch.config
+        judge = StaticStabilityJudge(config)
+        threshold = config.cell.camera.visibility_threshold
+        for record in records:
+            scene, rng = self.batch.lay_out(record["index"])
+            verdict = judge.judge(scene, rng)
+            drake = "stable" if "settled" in record else "falls"
+            if isinstance(verdict, InconclusiveVerdict):
+                self.scenes.pairs[verdict_name(verdict), drake] += 1
+            else:
+                self.scenes.pairs[verdict_name(verdict.instability), drake] += 1
+                if verdict.stable and drake == "stable":
+                    self.num_stable_in_both += 1
+                    self.num_same_hidden += verdict.hidden == hidden_objects(record, threshold)
+            for group in record["groups"]:
+                self._compare_group(judge, scene, group, record["groups"])
+
+    def _compare_group(
+        self, judge: StaticStabilityJudge, scene: Scene, group: Row, all_groups: Sequence[Row]
+    ) -> None:
+        part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
+        fall = group["fall"]
+        found: Instability | InconclusiveVerdict | None = judge.find_instability(part)
+        is_floating = (
+            isinstance(found, InconclusiveVerdict) and found.reason is InconclusiveReason.FLOATING
+        )
+        if is_floating:  # The support is in another group: judge again with all stable groups.
+            stable_names = [
+                n for other in all_groups if not other["fall"] for n in other["objects"]
+            ]
+            stable_objects = tuple(scene[name] for name in stable_names)
+            found = judge.find_instability(replace(scene, objects=part.objects + stable_objects))
+        pair = verdict_name(found), "stable" if fall is None else "falls"
+        self.stacks.pairs[pair] += 1
+        if fall is not None:
+            reason, name, *_ = fall
+            self.by_drake_reason[reason].pairs[pair] += 1
+            self.by_class[scene[name].object_class.name].pairs[pair] += 1
+        if found is not None:
+            self.by_static_reason[found.reason.value].pairs[pair] += 1
+        if pair[0] not in ("cannot judge", pair[1]):
+            static = "stable" if found is None else str(found.reason.value)
+            drake = f"falls: {fall[0]}" if fall else "stable"
+            self.disagreements.append(Disagreement(part, static, drake))
+
+    def row(self) -> Row:
+        """Return the row of the results."""
+        both = self.num_stable_in_both
+        return self.scenes.metrics() | {
+            "hidden_agreement": self.num_same_hidden / both if both else None,
+            "hidden_agreement_ci95": wilson_interval(self.num_same_hidden, both),
+            "stacks": self.stacks.metrics(),
+        }
+
+    def details(self) -> dict[str, dict[str, dict[str, int]]]:
+        """Return the confusion matrices by reason and by class."""
+        parts = {
+            "by_drakes_reason": self.by_drake_reason,
+            "by_class_that_falls": self.by_class,
+            "by_the_fast_judges_reason": self.by_static_reason,
+        }
+        return {
+            key: {name: confusion.counts() for name, confusion in sorted(part.items())}
+            for key, part in parts.items()
+        }
 
 
 def compare_variants(
-    batch: Batch, default: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
-) -> dict[str, Any]:
-    """How often Drake, asked in another way, says the same of the same scenes."""
-    pairs = list(zip(default, other, strict=False))
-    equal = [("settled" in a) == ("settled" in b) for a, b in pairs]
-    falls = [(fall(a), fall(b)) for a, b in pairs]
-    below = config_of(batch).cell.camera.visibility_threshold
-    lists = [
-        hidden(a, below) == hidden(b, below) for a, b in pairs if "settled" in a and "settled" in b
+    batch: SceneBatch, default: Sequence[Record], variant: Sequence[Record]
+) -> Row:
+    """Return how often Drake's verdicts on the same scenes agree under other settings.
+
+    Args:
+        batch: The batch with the other settings.
+        default: Records of the scenes with the default settings.
+        variant: Records of the scenes with the other settings.
+    """
+    pairs = list(zip(default, variant, strict=False))
+    num_equal = sum(("settled" in a) == ("settled" in b) for a, b in pairs)
+    falls = [(falls_by_object(a), falls_by_object(b)) for a, b in pairs]
+    threshold = batch.config.cell.camera.visibility_threshold
+    same_hidden = [
+        hidden_objects(a, threshold) == hidden_objects(b, threshold)
+        for a, b in pairs
+        if "settled" in a and "settled" in b
     ]
     return {
         "count": len(pairs),
-        "agreement": sum(equal) / len(pairs),
-        "agreement_ci95": wilson_interval(sum(equal), len(pairs)),
+        "agreement": num_equal / len(pairs),
+        "agreement_ci95": wilson_interval(num_equal, len(pairs)),
         "stacks_agreement": sum(x == y for a, b in falls for x, y in zip(a, b, strict=True))
         / sum(len(a) for a, _ in falls),
-        "hidden_agreement": sum(lists) / len(lists),
-        "hidden_agreement_ci95": wilson_interval(sum(lists), len(lists)),
+        "hidden_agreement": sum(same_hidden) / len(same_hidden),
+        "hidden_agreement_ci95": wilson_interval(sum(same_hidden), len(same_hidden)),
     }
 
 
-def fall(record: dict[str, Any]) -> list[bool]:
-    """Whether each object's stack falls, in the order of the names."""
-    return [
-        falls
-        for _, falls in sorted(
-            (name, g["fall"] is not None) for g in record["groups"] for name in g["objects"]
-        )
-    ]
+def falls_by_object(record: Record) -> list[bool]:
+    """Return whether the group of each object is unstable, in the order of the names."""
+    falls = {name: g["fall"] is not None for g in record["groups"] for name in g["objects"]}
+    return [falls[name] for name in sorted(falls)]
 
 
-def compare_moves(
-    batch: Batch, records: Sequence[dict[str, Any]], scenes: dict[int, dict[str, Any]]
-) -> dict[str, Any]:
-    """Outcomes of random moves under the fast executor, each on its own observation, against Drake's."""
-    config = config_of(batch)
+def compare_moves(batch: SceneBatch, records: Sequence[Record], scenes: dict[int, Record]) -> Row:
+    """Return how often the outcomes of moves agree.
+
+    Args:
+        batch: Batch of the scenes.
+        records: Records of the moves in Drake.
+        scenes: Records of the scenes by index.
+    """
+    config = batch.config
     judge = StaticStabilityJudge(config)
     executor = StaticExecutor(config, judge)
-    outcomes: Counter[tuple[str, str]] = Counter()
-    by_reason: dict[str, Counter[str]] = defaultdict(Counter)
-    same_place = placed = 0
-    for record in track(records, "moves", console=Console(stderr=True)):
+    outcomes = Counter[tuple[str, str]]()
+    disagreements = defaultdict[str, Counter[str]](Counter)
+    num_placed = num_same_place = 0
+    for record in progress(records, "moves"):
         item = RandomMove(batch, record["index"], record["draw"], scenes[record["index"]])
-        scene = settled_scene(laid_out(batch, item.index)[0], item.record)
+        scene, rng = item.scene(), item.rng()
         observation, _ = judge.ray_caster.observe(scene)
-        pick, place = record["move"]
-        rng = move_rng(item)
-        command = resolve_placement(Move(pick, place), observation, config.exploration, rng)
-        outcome = (
-            Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
-            if command is None
-            else executor.execute(
-                scene,
-                command,
-                rng,
-            )
-        )
-        outcomes[outcome.result.value, record["result"]] += 1
-        if (
-            outcome.result is not MoveResult.INCONCLUSIVE
-            and outcome.result.value != record["result"]
-        ):
-            found = (
-                outcome.instability.reason.value if outcome.instability else outcome.result.value
-            )
-            by_reason[f"fast: {found}"][
-                f"drake: {record['fall'][0] if record['fall'] else record['result']}"
-            ] += 1
+        move = Move(*record["move"])
+        command = resolve_placement(move, observation, config.exploration, rng)
+        outcome = execute(executor, scene, command, rng)
+        static = outcome.result.value
+        outcomes[static, record["result"]] += 1
+        if outcome.result is not MoveResult.INCONCLUSIVE and static != record["result"]:
+            instability = outcome.instability
+            cause = instability.reason.value if instability else static
+            drake_cause = record["fall"][0] if record["fall"] else record["result"]
+            disagreements[f"fast: {cause}"][f"drake: {drake_cause}"] += 1
         if command is not None and record["place"] is not None:
-            placed += 1
-            where = command.X_TO_place.translation
-            apart = (abs(a - b) for a, b in zip(where, record["place"][:3], strict=True))
-            same_place += max(apart) < 0.001
+            num_placed += 1
+            p, p_drake = command.X_TO_place.translation, record["place"][:3]
+            distances = [abs(a - b) for a, b in zip(p, p_drake, strict=True)]
+            num_same_place += max(distances) < SAME_PLACE
     judged = {pair: n for pair, n in outcomes.items() if pair[0] != MoveResult.INCONCLUSIVE.value}
-    equal, count = sum(n for (a, b), n in judged.items() if a == b), sum(judged.values())
+    num_equal = sum(n for (static, drake), n in judged.items() if static == drake)
+    count = sum(judged.values())
     return {
-        "count": sum(outcomes.values()),
-        "agreement": equal / count,
-        "agreement_ci95": wilson_interval(equal, count),
-        "cannot_judge_share": 1 - count / sum(outcomes.values()),
+        "count": outcomes.total(),
+        "agreement": num_equal / count,
+        "agreement_ci95": wilson_interval(num_equal, count),
+        "cannot_judge_share": 1 - count / outcomes.total(),
         "false_placed_rate": outcomes[MoveResult.PLACED.value, MoveResult.COLLAPSED.value] / count,
-        "same_place_share": same_place / placed,
+        "same_place_share": num_same_place / num_placed,
         "confusion": {f"fast {a}, drake {b}": n for (a, b), n in sorted(outcomes.items())},
-        "disagreements": {a: dict(b) for a, b in by_reason.items()},
+        "disagreements": {cause: dict(counts) for cause, counts in disagreements.items()},
     }
 
 
-def sensitivity(batch: Batch, records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What other margins and coefficients of friction would have said of the same scenes."""
-    scenes = [laid_out(batch, record["index"])[0] for record in records]
+def measure_sensitivity(batch: SceneBatch, records: Sequence[Record]) -> list[Row]:
+    """Return the agreement on scenes with other margins and friction coefficients."""
+    scenes = [batch.lay_out(record["index"])[0] for record in records]
     rows = []
     for margin, friction in itertools.product(MARGINS, FRICTIONS):
-        judge, confusion = StaticStabilityJudge(config_of(batch), margin, friction), Confusion()
+        judge = StaticStabilityJudge(batch.config, margin, friction)
+        confusion = Confusion()
         for scene, record in zip(scenes, records, strict=True):
-            confusion.pairs[
-                said(judge.find_instability(scene)), "stable" if "settled" in record else "falls"
-            ] += 1
-        row = confusion.row()
-        rates = {key: row[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}
+            drake = "stable" if "settled" in record else "falls"
+            confusion.pairs[verdict_name(judge.find_instability(scene)), drake] += 1
+        metrics = confusion.metrics()
+        rates = {key: metrics[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}
         rows.append({"margin_mm": 1000 * margin, "friction": friction} | rates)
     return rows
 
 
-def draw(path: Path, disagreements: Sequence[Disagreement]) -> None:
-    """A picture of stacks that the judges see differently, at most one of each kind and shape first."""
-    seen: set[Any] = set()
-    chosen: list[Disagreement] = []
+def draw_disagreements(disagreements: Sequence[Disagreement], path: Path) -> None:
+    """Render stacks on which the verdicts differ, one of each kind, false stable verdicts first."""
+    by_kind = dict[Any, Disagreement]()
     for item in disagreements:
-        kind = (
-            item.fast,
-            item.drake,
-            tuple(sorted(o.object_class.name for o in item.objects.objects)),
-        )
-        if kind not in seen:
-            seen.add(kind)
-            chosen.append(item)
-    chosen = sorted(chosen, key=lambda item: item.fast != "stable")[:SHOWN]
-    camera = SceneRenderer()
-    figure, axes = plt.subplots(2, SHOWN // 2, figsize=(14, 8.4), layout="constrained")
+        classes = tuple(sorted(o.object_class.name for o in item.scene.objects))
+        by_kind.setdefault((item.static, item.drake, classes), item)
+    shown = sorted(by_kind.values(), key=lambda item: item.static != "stable")[:NUM_PICTURES]
+    renderer = SceneRenderer()
+    figure, axes = plt.subplots(2, NUM_PICTURES // 2, figsize=(14, 8.4), layout="constrained")
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, item in zip(axes.flat, chosen, strict=False):
-        x, y, _ = np.mean([o.X_TO.translation for o in item.objects.objects], axis=0)
-        centred = tuple(
-            replace(o, X_TO=o.X_TO.translated((-x, -y, 0.0))) for o in item.objects.objects
+    for axis, item in zip(axes.flat, shown, strict=False):
+        x, y, _ = np.mean([o.X_TO.translation for o in item.scene.objects], axis=0)
+        centered = tuple(
+            replace(o, X_TO=o.X_TO.translated((-x, -y, 0.0))) for o in item.scene.objects
         )
-        picture = camera.render_oblique(replace(item.objects, objects=centred, graph=None))
+        picture = renderer.render_oblique(replace(item.scene, objects=centered, graph=None))
         axis.imshow(picture[110:510, 290:690])
-        axis.set_title(f"fast: {item.fast}\nDrake: {item.drake}", fontsize=13)
+        axis.set_title(f"static: {item.static}\nDrake: {item.drake}", fontsize=13)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def show_results(results: Row) -> None:
+    """Print the tables."""
+    rows = [
+        {
+            "objects": row["objects"],
+            "nodes": row["nodes"],
+            "scenes": row["count"],
+            "agreement": f"{row['agreement']:.3f}",
+            "95 % interval": "{:.3f} to {:.3f}".format(*row["agreement_ci95"]),
+            "false stable": f"{row['false_stable_rate']:.3f}",
+            "inconclusive": f"{row['cannot_judge_share']:.3f}",
+            "hidden objects agree": f"{row['hidden_agreement']:.3f}",
+        }
+        for row in results["scenes"]
+    ]
+    print_table(rows, "Static model and Drake")
+    rows = [
+        {
+            "settings of Drake": row["variant"],
+            "scenes": row["count"],
+            "agreement": f"{row['agreement']:.3f}",
+            "on stacks": f"{row['stacks_agreement']:.3f}",
+            "hidden objects agree": f"{row['hidden_agreement']:.3f}",
+        }
+        for row in results["drake_itself"]
+    ]
+    print_table(rows, "Drake and Drake with other settings")
+    moves = results["moves"]
+    print(f"moves: agreement {moves['agreement']:.3f} of {moves['count']}")
+    print(moves["confusion"], moves["disagreements"])
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(help="What collect_drake_verdicts.py wrote.")],
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG of stacks that the judges see differently.")
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that collect_drake_verdicts.py wrote.")
+    ],
+    out: ResultsOption = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Image of stacks on which the verdicts differ (PNG)."),
     ] = None,
 ) -> None:
-    """Prints and writes the tables."""
-    disagreements: list[Disagreement] = []
-    sides = {
-        batch: list(drake_verdicts(batch, count, folder, Pool()))
-        for batch, count in BATCHES.items()
+    """Compare the verdicts, and print and write the results."""
+    pool = WorkerPool()
+    records = {
+        batch: collect_verdicts(batch, count, folder, pool)
+        for batch, count in SCENES_BY_BATCH.items()
     }
-    (first, scenes), *_ = BATCHES.items()
-    moves = list(drake_moves(first, scenes, MOVES, folder, Pool()))
-    agreement, details, itself = [], {}, []
-    for batch, (head, *records) in sides.items():
+    (first, num_scenes), *_ = SCENES_BY_BATCH.items()
+    moves = collect_moves(first, num_scenes, NUM_MOVES, folder, pool)
+    agreement = list[Row]()
+    self_agreement = list[Row]()
+    details = dict[str, Any]()
+    disagreements = list[Disagreement]()
+    for batch, batch_records in records.items():
+        header = read_jsonl(folder / f"{batch.name}.jsonl.gz")[0]
         key = {
             "objects": batch.objects,
             "nodes": batch.nodes,
             "seed": batch.seed,
-            "drake_commit": head["commit"],
+            "drake_commit": header["commit"],
         }
         if batch.variant == "default":
-            row, found = compare_scenes(batch, records, disagreements)
-            agreement.append(key | row)
-            details[f"{batch.objects}, {batch.nodes} nodes"] = found
+            comparison = BatchComparison(batch)
+            comparison.run(progress(batch_records, f"{batch.objects}, {batch.nodes} nodes"))
+            agreement.append(key | comparison.row())
+            details[f"{batch.objects}, {batch.nodes} nodes"] = comparison.details()
+            disagreements += comparison.disagreements
         else:
-            default = sides[replace(batch, variant="default")][1:]
-            itself.append(
-                key | {"variant": batch.variant} | compare_variants(batch, default, records)
+            default = records[replace(batch, variant="default")]
+            variant_row = {"variant": batch.variant} | compare_variants(
+                batch, default, batch_records
             )
-    by_index = {record["index"]: record for record in sides[first][1:]}
-    of_moves = {"drake_commit": moves[0]["commit"]} | compare_moves(first, moves[1:], by_index)
-    result = {
-        "commit": git_commit(),
-        "config": sides[first][0]["config"],
-        "scene_agreement": {
-            f"{r['objects']}, {r['nodes']} nodes": r["agreement"] for r in agreement
-        },
-        "false_stable_rate": {
-            f"{r['objects']}, {r['nodes']} nodes": r["false_stable_rate"] for r in agreement
-        },
-        "hidden_agreement": {
-            f"{r['objects']}, {r['nodes']} nodes": r["hidden_agreement"] for r in agreement
-        },
-        "move_agreement": of_moves["agreement"],
-        "drake_self_agreement": {row["variant"]: row["agreement"] for row in itself},
+            self_agreement.append(key | variant_row)
+    by_index = {record["index"]: record for record in records[first]}
+    moves_header = read_jsonl(moves_path(first, folder))[0]
+    moves_row = {"drake_commit": moves_header["commit"]} | compare_moves(first, moves, by_index)
+
+    def by_size(key: str) -> dict[str, float]:
+        return {f"{row['objects']}, {row['nodes']} nodes": row[key] for row in agreement}
+
+    results: Row = {
+        **provenance(),
+        "config": read_jsonl(folder / f"{first.name}.jsonl.gz")[0]["config"],
+        "scene_agreement": by_size("agreement"),
+        "false_stable_rate": by_size("false_stable_rate"),
+        "hidden_agreement": by_size("hidden_agreement"),
+        "move_agreement": moves_row["agreement"],
+        "drake_self_agreement": {row["variant"]: row["agreement"] for row in self_agreement},
         "scenes": agreement,
-        "moves": of_moves,
-        "drake_itself": itself,
-        "sensitivity": sensitivity(first, sides[first][1:]),
+        "moves": moves_row,
+        "drake_itself": self_agreement,
+        "sensitivity": measure_sensitivity(first, records[first]),
         "details": details,
     }
     if out is not None:
-        write_json(out, result)
-    if picture is not None:
-        draw(picture, disagreements)
-    show(agreement, itself, of_moves)
-
-
-def show(
-    agreement: Sequence[dict[str, Any]], itself: Sequence[dict[str, Any]], of_moves: dict[str, Any]
-) -> None:
-    """The tables."""
-    table = Table(
-        "objects",
-        "nodes",
-        "scenes",
-        "verdicts",
-        "95 %",
-        "false stable",
-        "cannot judge",
-        "hidden lists",
-        title="fast, Drake",
-    )
-    for row in agreement:
-        low, high = row["agreement_ci95"]
-        shares = [
-            f"{row[key]:.3f}"
-            for key in ("false_stable_rate", "cannot_judge_share", "hidden_agreement")
-        ]
-        numbers = (
-            str(row["nodes"]),
-            str(row["count"]),
-            f"{row['agreement']:.3f}",
-            f"{low:.3f} to {high:.3f}",
-        )
-        table.add_row(row["objects"], *numbers, *shares)
-    Console().print(table)
-    table = Table(
-        "Drake, asked with",
-        "scenes",
-        "verdicts",
-        "stacks",
-        "hidden lists",
-        title="Drake and itself",
-    )
-    for row in itself:
-        shares = [
-            f"{row[key]:.3f}" for key in ("agreement", "stacks_agreement", "hidden_agreement")
-        ]
-        table.add_row(row["variant"], str(row["count"]), *shares)
-    Console().print(table)
-    print(
-        f"moves: {of_moves['agreement']:.3f} of {of_moves['count']}",
-        of_moves["confusion"],
-        of_moves["disagreements"],
-    )
+        write_json(out, results)
+    if figure is not None:
+        draw_disagreements(disagreements, figure)
+    show_results(results)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

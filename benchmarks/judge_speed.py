@@ -1,24 +1,21 @@
-"""How fast scenes are judged, seen and searched: this project and PyBullet, on the same scenes and one core.
+"""Time stability verdicts, visibility and search, beside PyBullet on the same scenes and core.
 
-python benchmarks/judge_speed.py --out benchmarks/results/speed.json
+python benchmarks/judge_speed.py --out judge_speed.json --figure growth.png
 """
 
 import os
 
-os.environ.update(
-    {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-)  # before numpy is imported
+# Before numpy is imported.
+os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"})
 
 import itertools
 import math
-import platform
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -31,12 +28,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.pybullet_world import label_image, load, poses
+from benchmarks.measurement import describe_machine
+from benchmarks.pybullet_world import load_world, object_poses, render_labels
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.files import write_json
-from drake_clutter.resources import git_commit
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import Scene, perturb_poses, tilt_between
 from drake_clutter.seeding import item_rng
@@ -45,64 +42,88 @@ from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
-from drake_clutter.validation import config_yaml
+from drake_clutter.validation import to_plain
+from training.results_file import Row, provenance
+from training.script import ResultsOption, SeedOption, run_script
 
 CONFIG = ClutterConfig()
+"""Configuration of the scenes and judges."""
 NODES = 25
+"""Number of nodes of the scene graphs in the main comparison."""
 NEVER = 1_000_000
+"""Number of samples that is never reached: disables the early stop of the settling."""
 REPEATS = 5
-"""Rounds through all scenes of what takes less than a millisecond; a scene's time is the median."""
-SLOW = 6
-"""Scenes of each size that Drake and PyBullet judge; and the scenes that Drake judges beforehand, not timed."""
-BUDGET = 2000
-"""Moves that the search may try."""
-HIDDEN = ("0", "1", "2", "3", "4-5", "4-5", "6+")
-"""Row of the search's table by hidden objects; the last for more."""
-FAST, WARM, DRAKE, ACCURATE, BULLET = (
-    "StaticStabilityJudge, cold",
-    "StaticStabilityJudge, warm",
-    "DrakeJudge",
-    "DrakeJudge, accurate",
-    "PyBullet",
-)
-RAYS, VTK, TINY = "ray caster", "Drake VTK labels", "TinyRenderer"
-RAY_SHARES, VTK_SHARES = "shares, ray caster", "shares, Drake VTK"
+"""Number of rounds of calls that take less than a millisecond; a scene's time is the median."""
+SLOW_SCENES = 6
+"""Number of scenes of each size for Drake and PyBullet, and of Drake's untimed first calls."""
+SEARCH_BUDGET = 2000
+"""Number of moves that the oracle search may evaluate."""
+HIDDEN_GROUPS = ("0", "1", "2", "3", "4-5", "4-5", "6+")
+"""Row of the search's table by number of hidden objects; the last for more."""
+PYBULLET_STEPS = 480
+"""Number of steps that PyBullet simulates, 2 s."""
+PYBULLET_STEPS_BEFORE_REST = 360
+"""Number of steps after which objects should rest in PyBullet, 0.5 s before the end."""
+
+# Names of judges and cameras in results files.
+STATIC_COLD = "FastJudge, cold"
+STATIC_WARM = "FastJudge, warm"
+DRAKE = "DrakeJudge"
+DRAKE_ACCURATE = "DrakeJudge, accurate"
+BULLET = "PyBullet"
+RAY_LABELS = "ray caster"
+VTK_LABELS = "Drake VTK labels"
+BULLET_LABELS = "TinyRenderer"
+RAY_FRACTIONS = "shares, ray caster"
+VTK_FRACTIONS = "shares, Drake VTK"
+
 NOTES = {
-    "core": "one process on one core; times are of the wall clock",
-    "scenes": f"RG's of {NODES} nodes, ycb7, as `generate` draws them; every judge gets the same random offsets",
-    "growth": f"half of the scenes of each size stable, half not, by the fast judge; the first {SLOW} for Drake and PyBullet; "
-    "30 objects may be one more or less, 60 two",
-    FAST: "stability and visibility; its memory of stacks is emptied before every scene, shape table and compiled code are kept",
-    WARM: "asked again about scenes that it has judged",
-    DRAKE: "as by default, stops when all is calm; one judge for all scenes, which remembers objects that stand on their own; "
-    f"the first {SLOW} scenes were judged once before; its engine is built anew when a scene has more of a class than any before",
-    ACCURATE: "likewise, but without the early stop: what does not fall is simulated for 2 s",
-    BULLET: "480 steps of 1/240 s in a new world for every scene, friction 0.5; loading the exported models is not counted but "
-    "given as load_mean_ms, export not at all; Drake's limits at the end; stability only. Lying markers roll away in it",
-    "agreement": "with the accurate form. agrees: stable or not; agrees_on_hidden: of the scenes that both call stable, those "
-    "with the same objects hidden; unchanged: both",
-    "eyes": "640 x 480, shares: the visible shares of all objects. Every scene was drawn once before with the same engine, not "
-    "timed; in PyBullet, without shadows, by a frame in the same world",
-    "repeats": f"StaticStabilityJudge and ray caster: a scene's time is the median of {REPEATS} rounds; all else is timed once",
-    "search": f"budget {BUDGET} moves; the judge's memory of stacks is emptied before every scene",
+    "core": "One process on one core; wall-clock times.",
+    "scenes": f"Random generator, {NODES} nodes, ycb7. All judges get the same random offsets.",
+    "growth": "Half of the scenes of each size are stable by the static model; Drake and PyBullet"
+    f" judge the first {SLOW_SCENES}. 30 objects may be one more or less, 60 two.",
+    STATIC_COLD: "Stability and visibility. The cache of stacks is cleared before every scene.",
+    STATIC_WARM: "Second verdict on the same scenes.",
+    DRAKE: "Default settings with early stop. One judge for all scenes, which caches objects that"
+    f" stand alone; untimed verdicts on the first {SLOW_SCENES} scenes come first. Its engine is"
+    " rebuilt when a scene has more objects of a class than any before.",
+    DRAKE_ACCURATE: "Without the early stop: stable scenes are simulated for 2 s.",
+    BULLET: f"{PYBULLET_STEPS} steps of 1/240 s in a new world for every scene, friction 0.5,"
+    " Drake's limits at the end, stability only. Loading is given as load_mean_ms; the export is"
+    " not included. Lying markers roll away.",
+    "agreement": "With the accurate settings. agrees: stability; agrees_on_hidden: hidden objects of"
+    " scenes that both call stable; unchanged: both.",
+    "eyes": "640 x 480; shares: the visible fractions of all objects. Every scene was rendered once"
+    " before, untimed; PyBullet without shadows.",
+    "repeats": f"Static judge and ray caster: median of {REPEATS} rounds; all others: one call.",
+    "search": f"Budget {SEARCH_BUDGET} moves; the cache of stacks is cleared before every scene.",
 }
-AIMS = {
+"""What the results mean, for the results file."""
+TARGETS = {
     "fast_ms_16_objects": "< 0.5",
     "fast_ms_16_objects_stable": "< 0.5",
     "ratio_to_pybullet": ">= 300",
     "drake_median_s": "< 1.0",
     "drake_verdicts_unchanged": ">= 0.99",
 }
+"""Target of each headline number."""
 
-T = TypeVar("T")
-Row = dict[str, Any]
-Found = tuple[bool | None, tuple[str, ...] | None]
-"""Whether a scene is stable, and what it hides; None: the judge does not say."""
+Answer = TypeVar("Answer")
+Verdict = tuple[bool | None, tuple[str, ...] | None]
+"""Whether a scene is stable, and its hidden objects; None where the judge does not say."""
+AnyJudge = StaticStabilityJudge | DrakeJudge
 
 
 @dataclass(frozen=True)
-class Size:
-    """Scenes of a number of objects: how large a graph and a tray (m) they need, and how many are drawn."""
+class SceneSize:
+    """Scenes with a certain number of objects.
+
+    Attributes:
+        objects: Number of objects.
+        nodes: Number of nodes of the scene graphs.
+        tray_side: Side of the tray that they need [m].
+        scenes: Number of scenes.
+    """
 
     objects: int
     nodes: int
@@ -111,216 +132,311 @@ class Size:
 
 
 SIZES = (
-    Size(5, 9, 0.7, 40),
-    Size(10, 18, 0.7, 40),
-    Size(16, 29, 0.7, 40),
-    Size(30, 53, 1.0, 20),
-    Size(60, 104, 1.2, 10),
+    SceneSize(5, 9, 0.7, 40),
+    SceneSize(10, 18, 0.7, 40),
+    SceneSize(16, 29, 0.7, 40),
+    SceneSize(30, 53, 1.0, 20),
+    SceneSize(60, 104, 1.2, 10),
 )
+"""Sizes of the comparison by number of objects."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scene as laid out, and the generator that did it: what it draws next are the random offsets."""
+    """A scene as laid out.
+
+    Attributes:
+        scene: The scene.
+        rng: Random generator that laid it out; its next values are the random offsets.
+    """
 
     scene: Scene
-    after: np.random.Generator
+    rng: np.random.Generator
 
     @cached_property
-    def start(self) -> Scene:
-        """The scene with its offsets."""
-        return replace(
-            self.scene,
-            objects=tuple(
-                perturb_poses(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.after))
-            ),
-        )
+    def perturbed(self) -> Scene:
+        """The scene with its random offsets."""
+        objects = perturb_poses(self.scene.objects, CONFIG.settle.jitter, deepcopy(self.rng))
+        return replace(self.scene, objects=tuple(objects))
 
 
-def generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
-    """RG on a tray."""
+def make_generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
+    """Return the random generator on a tray of a certain side [m]."""
     support = CONFIG.cell.support.model_copy(update={"size": (tray_side, tray_side)})
     config = replace(CONFIG, cell=CONFIG.cell.with_support(support))
     return SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))
 
 
-def half_stable(size: Size, count: int, seed: int) -> tuple[list[Case], float]:
-    """Scenes of a size, stable and unstable in turn by the fast judge, and the share of stable ones among all of that size."""
-    rg, judge = generator(size.nodes, size.tray_side, seed), StaticStabilityJudge(CONFIG)
-    drawn: dict[bool, list[Case]] = {True: [], False: []}
+def sample_cases(count: int, seed: int) -> list[Case]:
+    """Return random scenes of the main comparison."""
+    generator = make_generator(NODES, CONFIG.cell.support.size[0], seed)
+    cases = []
+    for index in range(count):
+        rng = item_rng(seed, index)
+        cases.append(Case(generator.lay_out(rng)[0], rng))
+    return cases
+
+
+def sample_half_stable(size: SceneSize, count: int, seed: int) -> tuple[list[Case], float]:
+    """Return scenes of a size, stable and unstable in turn by the static model.
+
+    Args:
+        size: The size.
+        count: Number of scenes.
+        seed: Seed of the scenes.
+
+    Returns:
+        The scenes, and the fraction of stable ones among all that were sampled.
+    """
+    generator = make_generator(size.nodes, size.tray_side, seed)
+    judge = StaticStabilityJudge(CONFIG)
+    cases: dict[bool, list[Case]] = {True: [], False: []}
     for draw in itertools.count():
         rng = item_rng(seed, size.objects, draw)
-        scene, _ = rg.lay_out(rng)
+        scene, _ = generator.lay_out(rng)
         if abs(len(scene.objects) - size.objects) <= size.objects // 30:
-            drawn[judge.find_instability(scene) is None].append(Case(scene, rng))
-        if min(len(cases) for cases in drawn.values()) >= count // 2:
+            cases[judge.find_instability(scene) is None].append(Case(scene, rng))
+        if min(map(len, cases.values())) >= count // 2:
             break
-    pairs = itertools.islice(zip(drawn[True], drawn[False], strict=False), count // 2)
-    return list(itertools.chain(*pairs)), len(drawn[True]) / sum(
-        len(cases) for cases in drawn.values()
-    )
+    pairs = itertools.islice(zip(cases[True], cases[False], strict=False), count // 2)
+    stable_fraction = len(cases[True]) / sum(map(len, cases.values()))
+    return list(itertools.chain(*pairs)), stable_fraction
 
 
-def timed(ask: Callable[..., T], *arguments: Any) -> tuple[float, T]:
-    """Seconds that a call takes, and what it returns."""
+def time_call(call: Callable[..., Answer], *arguments: Any) -> tuple[float, Answer]:
+    """Return the time of a call [s], and its result."""
     start = time.perf_counter()
-    result = ask(*arguments)
-    return time.perf_counter() - start, result
+    answer = call(*arguments)
+    return time.perf_counter() - start, answer
 
 
-def asked(
-    what: str,
-    ask: Callable[[Scene, np.random.Generator], T],
+def time_cases(
+    label: str,
+    call: Callable[[Scene, np.random.Generator], Answer],
     cases: Sequence[Case],
     warm_up: int = NEVER,
     repeats: int = 1,
     before: Callable[[], None] = lambda: None,
-) -> tuple[list[float], list[T]]:
-    """Seconds and answer by scene; not timed: asking about the first `warm_up` beforehand, and `before`, called before each."""
+) -> tuple[list[float], list[Answer]]:
+    """Return the time [s] and the result of a call for each scene.
+
+    Args:
+        label: Text of the progress bar.
+        call: The function.
+        cases: The scenes.
+        warm_up: Number of scenes for which it is called once before, untimed.
+        repeats: Number of rounds; a scene's time is their median.
+        before: Function that is called before each timed call.
+    """
     for case in cases[:warm_up]:
-        ask(case.scene, deepcopy(case.after))
-    seconds, answers = [], []
-    # Drawing a progress bar would disturb what is over in a moment.
-    for case in track([*cases] * repeats, what, console=Console(stderr=True), disable=repeats > 1):
-        rng = deepcopy(case.after)
+        call(case.scene, deepcopy(case.rng))
+    seconds = list[float]()
+    answers = list[Answer]()
+    # A progress bar would disturb the measurement of short calls.
+    is_short = repeats > 1
+    for case in track([*cases] * repeats, label, console=Console(stderr=True), disable=is_short):
+        rng = deepcopy(case.rng)
         before()
-        took, answer = timed(ask, case.scene, rng)
-        seconds.append(took)
+        elapsed, answer = time_call(call, case.scene, rng)
+        seconds.append(elapsed)
         answers.append(answer)
-    return np.median(np.reshape(seconds, (repeats, -1)), axis=0).tolist(), answers[: len(cases)]
+    medians = np.median(np.reshape(seconds, (repeats, -1)), axis=0).tolist()
+    return medians, answers[: len(cases)]
 
 
-def in_bullet(case: Case) -> tuple[float, float, float, Found]:
-    """PyBullet's seconds for loading a scene, a frame and 2 s of stepping; and its verdict."""
-    scene, limits = case.start, CONFIG.settle
+@dataclass(frozen=True)
+class BulletRun:
+    """A scene in PyBullet.
+
+    Attributes:
+        load_seconds: Time to load it [s].
+        frame_seconds: Time to render a frame [s].
+        step_seconds: Time of all steps [s].
+        is_stable: Whether it is stable by the limits of the settle configuration.
+    """
+
+    load_seconds: float
+    frame_seconds: float
+    step_seconds: float
+    is_stable: bool
+
+
+def run_in_bullet(case: Case) -> BulletRun:
+    """Load, render and simulate a scene in PyBullet."""
+    scene, limits = case.perturbed, CONFIG.settle
+
+    def step(count: int) -> float:
+        seconds, _ = time_call(lambda: [pybullet.stepSimulation() for _ in range(count)])
+        return seconds
+
     with tempfile.TemporaryDirectory() as folder:
-        loading, _ = timed(load, export_scene(scene, ExportFormat.SDF, Path(folder)))
-        label_image()
-        frame, _ = timed(label_image)
-        first = poses(scene)
-        steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(360)])
-        late = poses(scene)
-        more_steps, _ = timed(lambda: [pybullet.stepSimulation() for _ in range(120)])
-        stayed = all(
+        exported = export_scene(scene, ExportFormat.SDF, Path(folder))
+        load_seconds, _ = time_call(load_world, exported)
+        render_labels()
+        frame_seconds, _ = time_call(render_labels)
+        first = object_poses(scene)
+        step_seconds = step(PYBULLET_STEPS_BEFORE_REST)
+        late = object_poses(scene)
+        step_seconds += step(PYBULLET_STEPS - PYBULLET_STEPS_BEFORE_REST)
+        last = object_poses(scene)
+        is_stable = all(
             scene.support.contains(*X.p[:2])
             and X.p[2] >= 0
             and np.linalg.norm(X.p - X_first.p) < limits.max_displacement
             and np.linalg.norm(X.p - X_late.p) <= limits.max_rest_displacement
             and tilt_between(o.object_class, X_first, X) < math.radians(limits.max_tilt_deg)
-            for o, X, X_first, X_late in zip(scene.objects, poses(scene), first, late, strict=True)
+            for o, X, X_first, X_late in zip(scene.objects, last, first, late, strict=True)
         )
         pybullet.disconnect()
-    return loading, frame, steps + more_steps, (stayed, None)
+    return BulletRun(load_seconds, frame_seconds, step_seconds, is_stable)
 
 
-def figures(seconds: Sequence[float]) -> Row:
-    """What is said of some times."""
+def time_metrics(seconds: Sequence[float]) -> Row:
+    """Return the median, mean and 95th percentile of times, and the calls per second."""
     ms = 1000 * np.array(seconds)
-    row = {
+    metrics = {
         "median_ms": np.median(ms),
         "mean_ms": ms.mean(),
         "p95_ms": np.percentile(ms, 95),
         "per_second": 1000 / ms.mean(),
     }
-    return {"count": len(ms)} | {key: float(value) for key, value in row.items()}
+    return {"count": len(ms)} | {key: float(value) for key, value in metrics.items()}
 
 
-def judge_row(
-    seconds: Sequence[float], found: Sequence[Found], truth: Sequence[Found] | None
+def judge_metrics(
+    seconds: Sequence[float], verdicts: Sequence[Verdict], reference: Sequence[Verdict] | None
 ) -> Row:
-    """Figures of a judge, and how often it agrees with the truth."""
-    row = figures(seconds) | {
-        "stable_share": float(np.mean([stable is True for stable, _ in found]))
-    }
-    on_stable = [s for s, (stable, _) in zip(seconds, found, strict=True) if stable]
+    """Return the times of a judge, and its agreement with a reference."""
+    is_stable = [stable is True for stable, _ in verdicts]
+    on_stable = [s for s, stable in zip(seconds, is_stable, strict=True) if stable]
+    row = time_metrics(seconds)
+    row["stable_share"] = float(np.mean(is_stable))
     row["stable_median_ms"] = 1000 * float(np.median(on_stable)) if on_stable else None
-    if truth:
-        pairs = list(zip(found, truth, strict=True))
+    if reference:
+        pairs = list(zip(verdicts, reference, strict=True))
         row["agrees"] = float(np.mean([a[0] == b[0] for a, b in pairs]))
         same_hidden = [a[1] == b[1] for a, b in pairs if a[0] and b[0]]
-        if found[0][1] is not None:
+        if verdicts[0][1] is not None:
             row["agrees_on_hidden"] = float(np.mean(same_hidden)) if same_hidden else None
             row["unchanged"] = float(np.mean([a == b for a, b in pairs]))
     return row
 
 
-def ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
-    """The whole label image, by one cast."""
+def render_ray_labels(rays: RayCaster, scene: Scene) -> NDArray[np.int16]:
+    """Return the label image of a scene by one ray cast. Shape (H, W)."""
     _, rectangle = rays._cast(*rays._shapes.rows_and_positions(scene.objects))
     image = np.full(rays._hit.shape, -1, np.int16)
     image[rectangle] = rays._hit[rectangle]
     return image
 
 
-def measure(
-    what: str,
-    cases: Sequence[Case],
-    slow: int,
-    judges: Mapping[str, StaticStabilityJudge | DrakeJudge],
+def to_verdict(answer: Any) -> Verdict:
+    """Return a judge's answer as a verdict."""
+    if isinstance(answer, InconclusiveVerdict):
+        return None, None
+    return answer.stable, answer.hidden
+
+
+def measure_scenes(
+    label: str, cases: Sequence[Case], num_slow: int, judges: Mapping[str, AnyJudge]
 ) -> Row:
-    """Figures by judge and by eye, those of Drake and PyBullet's judge only on the first `slow` cases."""
-    found: dict[str, tuple[list[float], list[Found]]] = {}
+    """Return the metrics of all judges and cameras on some scenes.
+
+    Args:
+        label: Text of the progress bars.
+        cases: The scenes.
+        num_slow: Number of scenes, the first, for Drake's and PyBullet's judges.
+        judges: The judges by name.
+    """
+    found: dict[str, tuple[list[float], list[Verdict]]] = {}
     for name, judge in judges.items():
         if isinstance(judge, StaticStabilityJudge):
-            forget = judge._cache.clear if name == FAST else lambda: None
-            seconds, verdicts = asked(
-                f"{what}: {name}", judge.judge, cases, repeats=REPEATS, before=forget
+            clear = judge._cache.clear if name == STATIC_COLD else lambda: None
+            seconds, answers = time_cases(
+                f"{label}: {name}", judge.judge, cases, repeats=REPEATS, before=clear
             )
+            found[name] = seconds, [to_verdict(answer) for answer in answers]
         else:
-            seconds, verdicts = asked(f"{what}: {name}", judge.judge, cases[:slow], SLOW)
-        found[name] = (
-            seconds,
-            [
-                (None, None) if isinstance(v, InconclusiveVerdict) else (v.stable, v.hidden)
-                for v in verdicts
-            ],
-        )
-    progress = track(cases[:slow], f"{what}: {BULLET}", console=Console(stderr=True))
-    loads, frames, steps, in_bullet_found = zip(*map(in_bullet, progress), strict=True)
-    found[BULLET] = [*steps], [*in_bullet_found]
-    truth = found[ACCURATE][1] if ACCURATE in found else None
-    rows = {name: judge_row(*pair, truth) for name, pair in found.items()}
-    rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean(loads))
+            slow_seconds, slow_answers = time_cases(
+                f"{label}: {name}", judge.judge, cases[:num_slow], SLOW_SCENES
+            )
+            found[name] = slow_seconds, [to_verdict(answer) for answer in slow_answers]
+    progress_bar = track(cases[:num_slow], f"{label}: {BULLET}", console=Console(stderr=True))
+    runs = [run_in_bullet(case) for case in progress_bar]
+    found[BULLET] = [r.step_seconds for r in runs], [(r.is_stable, None) for r in runs]
+    reference = found[DRAKE_ACCURATE][1] if DRAKE_ACCURATE in found else None
+    judge_rows = {name: judge_metrics(*pair, reference) for name, pair in found.items()}
+    judge_rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean([r.load_seconds for r in runs]))
 
-    rays, camera = RayCaster(CONFIG.cell.camera), CameraRenderer(CONFIG.cell.camera)
-    eyes: dict[str, tuple[Callable[[Scene, np.random.Generator], Any], int]] = {
-        RAYS: (lambda scene, _: ray_labels(rays, scene), REPEATS),
-        VTK: (lambda scene, _: camera.render_label(scene), 1),
-        RAY_SHARES: (lambda scene, _: rays.visible_fractions(scene.objects), REPEATS),
-        VTK_SHARES: (lambda scene, _: camera.visible_fractions(scene), 1),
+    rays = RayCaster(CONFIG.cell.camera)
+    camera = CameraRenderer(CONFIG.cell.camera)
+    cameras: dict[str, tuple[Callable[[Scene, np.random.Generator], Any], int]] = {
+        RAY_LABELS: (lambda scene, _: render_ray_labels(rays, scene), REPEATS),
+        VTK_LABELS: (lambda scene, _: camera.render_label(scene), 1),
+        RAY_FRACTIONS: (lambda scene, _: rays.visible_fractions(scene.objects), REPEATS),
+        VTK_FRACTIONS: (lambda scene, _: camera.visible_fractions(scene), 1),
     }
-    seen = {TINY: figures(frames)}
-    for name, (look, repeats) in eyes.items():
-        seen[name] = figures(asked(f"{what}: {name}", look, cases, repeats=repeats)[0])
-    return {"judges": rows, "eyes": seen}
+    camera_rows = {BULLET_LABELS: time_metrics([r.frame_seconds for r in runs])}
+    for name, (render, repeats) in cameras.items():
+        seconds, _ = time_cases(f"{label}: {name}", render, cases, repeats=repeats)
+        camera_rows[name] = time_metrics(seconds)
+    return {"judges": judge_rows, "eyes": camera_rows}
 
 
-def searched(cases: Sequence[Case]) -> dict[str, Row]:
-    """The search on the scenes that are stable and hide something, as laid out, by how much they hide."""
+def measure_growth(count: int, seed: int, judges: Mapping[str, AnyJudge]) -> list[Row]:
+    """Return the metrics by number of objects.
+
+    Args:
+        count: Number of scenes of each size at most.
+        seed: Seed of the scenes.
+        judges: The judges by name.
+    """
+    rows = []
+    for size in SIZES:
+        cases, stable_fraction = sample_half_stable(size, min(size.scenes, count), seed)
+        row: Row = {
+            "objects": size.objects,
+            "objects_mean": float(np.mean([len(case.scene.objects) for case in cases])),
+            "nodes": size.nodes,
+            "tray_side": size.tray_side,
+            "stable_share_of_drawn": stable_fraction,
+        }
+        rows.append(row | measure_scenes(f"{size.objects} objects", cases, SLOW_SCENES, judges))
+    return rows
+
+
+def measure_search(cases: Sequence[Case]) -> dict[str, Row]:
+    """Return the metrics of the oracle search by number of hidden objects.
+
+    Args:
+        cases: Scenes; those that are not stable or hide nothing are left out.
+    """
     judge = StaticStabilityJudge(CONFIG)
     search = OracleSearch(CONFIG, judge)
-    parts: dict[str, list[Case]] = {name: [] for name in HIDDEN}
+    groups: dict[str, list[Case]] = {name: [] for name in HIDDEN_GROUPS}
     for case in cases:
         if judge.find_instability(case.scene) is None:
-            shares = judge.ray_caster.visible_fractions(case.scene.objects).values()
-            hidden = sum(share < CONFIG.cell.camera.visibility_threshold for share in shares)
-            parts[HIDDEN[min(hidden, len(HIDDEN) - 1)]].append(case)
-    del parts["0"]
-    rows: dict[str, Row] = {name: {"count": len(part)} for name, part in parts.items()}
-    for name, part in parts.items():
-        if part:
-            search.solve(part[0].scene, budget=20)
-            took, solutions = asked(
+            fractions = judge.ray_caster.visible_fractions(case.scene.objects).values()
+            hidden = sum(f < CONFIG.cell.camera.visibility_threshold for f in fractions)
+            groups[HIDDEN_GROUPS[min(hidden, len(HIDDEN_GROUPS) - 1)]].append(case)
+    del groups["0"]
+    rows: dict[str, Row] = {name: {"count": len(group)} for name, group in groups.items()}
+    for name, group in groups.items():
+        if group:
+            search.solve(group[0].scene, budget=20)
+            seconds, solutions = time_cases(
                 f"{name} hidden",
-                lambda scene, _: search.solve(scene, 0, BUDGET),
-                part,
+                lambda scene, _: search.solve(scene, 0, SEARCH_BUDGET),
+                group,
                 0,
                 before=judge._cache.clear,
             )
-            rows[name] |= {"median_s": float(np.median(took)), "max_s": max(took)}
-            rows[name]["median_moves_tried"] = float(
-                np.median([solution.moves_evaluated for solution in solutions])
-            )
+            moves = [solution.moves_evaluated for solution in solutions]
+            rows[name] |= {
+                "median_s": float(np.median(seconds)),
+                "max_s": max(seconds),
+                "median_moves_tried": float(np.median(moves)),
+            }
             rows[name] |= {
                 answer.value: float(np.mean([s.solvability is answer for s in solutions]))
                 for answer in Solvability
@@ -328,81 +444,80 @@ def searched(cases: Sequence[Case]) -> dict[str, Row]:
     return rows
 
 
-def table(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-    """Rows by name; columns by their head: which figure."""
-    made = Table(title, *columns, padding=0)
-    made.columns[0].no_wrap = True
+def make_table(
+    title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]
+) -> Table:
+    """Return a table.
+
+    Args:
+        title: Title of the first column.
+        rows: Values of each row by key, by name of the row.
+        columns: Key of each column's values by its title.
+    """
+    table = Table(title, *columns, padding=0)
+    table.columns[0].no_wrap = True
     for name, row in rows.items():
-        values = [row.get(key) for key in columns.values()]
-        texts = [
-            v
-            if isinstance(v, str)
-            else ""
-            if v is None
-            else f"{v:,.0f}"
-            if v >= 100
-            else f"{v:.3g}"
-            for v in values
-        ]
-        made.add_row(name, *texts)
-    return made
+        table.add_row(name, *(format_cell(row.get(key)) for key in columns.values()))
+    return table
 
 
-def show(result: Row, console: Console) -> None:
-    """Prints the tables."""
+def format_cell(value: Any) -> str:
+    """Return a value as a cell of a table: numbers with three digits or more."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def show_results(results: Row, console: Console) -> None:
+    """Print the tables."""
     times = {"median": "median_ms", "mean": "mean_ms", "95 %": "p95_ms", "per s": "per_second"}
-    agreement = {"stable": "stable_share", "agrees": "agrees", "on hidden": "agrees_on_hidden"}
-    console.print(
-        table(
-            "ms per scene", result["judges"], times | {"of stable": "stable_median_ms"} | agreement
-        )
-    )
-    console.print(table("ms per frame", result["eyes"], times))
-    grown = {}
-    for part in ("judges", "eyes"):
-        for name in result["growth"][0][part]:
-            grown[name] = {
-                str(row["objects"]): row[part][name]["mean_ms"] for row in result["growth"]
-            }
-    console.print(
-        table("mean ms by objects", grown, {str(size.objects): str(size.objects) for size in SIZES})
-    )
-    columns = {
+    judge_columns = times | {
+        "of stable": "stable_median_ms",
+        "stable": "stable_share",
+        "agrees": "agrees",
+        "on hidden": "agrees_on_hidden",
+    }
+    console.print(make_table("ms per scene", results["judges"], judge_columns))
+    console.print(make_table("ms per frame", results["eyes"], times))
+    growth = {
+        name: {str(row["objects"]): row[part][name]["mean_ms"] for row in results["growth"]}
+        for part in ("judges", "eyes")
+        for name in results["growth"][0][part]
+    }
+    sizes = {str(size.objects): str(size.objects) for size in SIZES}
+    console.print(make_table("mean ms by objects", growth, sizes))
+    search_columns = {
         "scenes": "count",
         "median s": "median_s",
-        "most": "max_s",
+        "max s": "max_s",
         "moves": "median_moves_tried",
-    }
-    console.print(
-        table(
-            "search: hidden",
-            result["search"],
-            columns | {answer.value: answer.value for answer in Solvability},
-        )
-    )
+    } | {answer.value: answer.value for answer in Solvability}
+    console.print(make_table("search: hidden", results["search"], search_columns))
     targets = {
-        name: {"aim": AIMS[name], "measured": value} for name, value in result["targets"].items()
+        name: {"target": TARGETS[name], "measured": value}
+        for name, value in results["targets"].items()
     }
-    console.print(table("target", targets, {"aim": "aim", "measured": "measured"}))
+    console.print(make_table("headline", targets, {"target": "target", "measured": "measured"}))
 
 
 def draw_growth(growth: Sequence[Row], path: Path) -> None:
-    """Time by number of objects, of judges and of eyes."""
+    """Plot the time of judges and cameras over the number of objects."""
     plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
     objects = [row["objects"] for row in growth]
     figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained", sharey=True)
     parts = (
-        ("judges", (BULLET, DRAKE, FAST), "scene judged"),
-        ("eyes", (TINY, VTK, RAYS), "frame"),
+        ("judges", (BULLET, DRAKE, STATIC_COLD), "verdict"),
+        ("eyes", (BULLET_LABELS, VTK_LABELS, RAY_LABELS), "frame"),
     )
-    for panel, (part, names, what) in zip(panels, parts, strict=True):
+    for panel, (part, names, unit) in zip(panels, parts, strict=True):
         for name, marker in zip(names, "sDo", strict=True):
-            panel.loglog(
-                objects, [row[part][name]["mean_ms"] for row in growth], marker=marker, label=name
-            )
+            means = [row[part][name]["mean_ms"] for row in growth]
+            panel.loglog(objects, means, marker=marker, label=name)
         panel.set_xticks(objects, objects)
         panel.minorticks_off()
-        panel.set(xlabel="objects in the scene", ylabel=f"mean ms per {what}")
+        panel.set(xlabel="objects in the scene", ylabel=f"mean ms per {unit}")
         panel.tick_params(labelleft=True)
         panel.grid(alpha=0.4)
         panel.legend(
@@ -417,84 +532,73 @@ def draw_growth(growth: Sequence[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def cpu() -> str:
-    """The processor's model."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    return next(
-        (line.partition(": ")[2] for line in lines if line.startswith("model name")),
-        platform.processor(),
-    )
+def headline_numbers(results: Row) -> dict[str, float]:
+    """Return the numbers that have `TARGETS`."""
+    (sixteen,) = (row["judges"][STATIC_COLD] for row in results["growth"] if row["objects"] == 16)
+    judges = results["judges"]
+    return {
+        "fast_ms_16_objects": sixteen["median_ms"],
+        "fast_ms_16_objects_stable": sixteen["stable_median_ms"],
+        "ratio_to_pybullet": judges[BULLET]["mean_ms"] / judges[STATIC_COLD]["mean_ms"],
+        "drake_median_s": judges[DRAKE]["median_ms"] / 1000,
+        "drake_verdicts_unchanged": judges[DRAKE]["unchanged"],
+    }
 
 
 def main(
     count: Annotated[
         int,
         typer.Option(
-            help=f"Scenes of {NODES} nodes; of the other sizes, no more than this.", min=2
+            min=2,
+            help=f"Number of scenes of {NODES} nodes, and of the other sizes at most.",
         ),
     ] = 60,
-    seed: int = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG to write: the growth with the number of objects.")
+    seed: SeedOption = 0,
+    out: ResultsOption = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Plot of the time over the number of objects (PNG)."),
     ] = None,
 ) -> None:
-    """Measures everything in one go; prints the tables and writes them."""
+    """Measure all judges, cameras and the search; print and write the results."""
+    # PyBullet prints to the standard output of the process: keep it for the tables alone.
     console = Console(file=os.fdopen(os.dup(1), "w"))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what PyBullet prints, see docs/export.md
-    if hasattr(os, "sched_setaffinity"):  # renderers start threads
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if hasattr(os, "sched_setaffinity"):  # Renderers start threads.
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    for path in filter(None, (out, picture)):
+    for path in filter(None, (out, figure)):
         path.parent.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    packages = {name: version(name) for name in ("drake", "pybullet", "numba", "numpy")}
-    result: Row = {
-        "config": config_yaml(CONFIG),
+    start = time.monotonic()
+    static = StaticStabilityJudge(CONFIG)
+    accurate_settle = replace(CONFIG.settle, early_stop_samples=NEVER)
+    accurate = DrakeJudge(replace(CONFIG, settle=accurate_settle))
+    judges: dict[str, AnyJudge] = {
+        STATIC_COLD: static,
+        STATIC_WARM: static,
+        DRAKE: DrakeJudge(CONFIG),
+    }
+    cases = sample_cases(count, seed)
+    results: Row = {
+        "config": to_plain(CONFIG),
         "seed": seed,
         "count": count,
         "nodes": NODES,
-        "commit": git_commit(),
-        "cpu": cpu(),
+        **provenance(),
+        "machine": describe_machine("drake", "pybullet", "numba", "numpy"),
+        "notes": NOTES,
+        "objects_mean": float(np.mean([len(case.scene.objects) for case in cases])),
+        **measure_scenes(f"{NODES} nodes", cases, count, judges | {DRAKE_ACCURATE: accurate}),
+        "growth": measure_growth(count, seed, judges),
+        "search": measure_search(cases),
     }
-    result |= {"versions": {"python": platform.python_version()} | packages, "notes": NOTES}
-
-    fast, drake = StaticStabilityJudge(CONFIG), DrakeJudge(CONFIG)
-    accurate = DrakeJudge(replace(CONFIG, settle=replace(CONFIG.settle, early_stop_samples=NEVER)))
-    rg, cases = generator(NODES, CONFIG.cell.support.size[0], seed), []
-    for index in range(count):
-        rng = item_rng(seed, index)
-        cases.append(Case(rg.lay_out(rng)[0], rng))
-    judges: dict[str, StaticStabilityJudge | DrakeJudge] = {FAST: fast, WARM: fast, DRAKE: drake}
-    result |= {"objects_mean": float(np.mean([len(case.scene.objects) for case in cases]))}
-    result |= measure(f"{NODES} nodes", cases, count, judges | {ACCURATE: accurate})
-    result["growth"] = []
-    for size in SIZES:
-        grown, share = half_stable(size, min(size.scenes, count), seed)
-        row: Row = {
-            "objects": size.objects,
-            "objects_mean": float(np.mean([len(case.scene.objects) for case in grown])),
-        }
-        row |= {"nodes": size.nodes, "tray_side": size.tray_side, "stable_share_of_drawn": share}
-        result["growth"].append(row | measure(f"{size.objects} objects", grown, SLOW, judges))
-    result["search"] = searched(cases)
-
-    (sixteen,) = (row["judges"][FAST] for row in result["growth"] if row["objects"] == 16)
-    rows = result["judges"]
-    result["targets"] = {
-        "fast_ms_16_objects": sixteen["median_ms"],
-        "fast_ms_16_objects_stable": sixteen["stable_median_ms"],
-        "ratio_to_pybullet": rows[BULLET]["mean_ms"] / rows[FAST]["mean_ms"],
-        "drake_median_s": rows[DRAKE]["median_ms"] / 1000,
-        "drake_verdicts_unchanged": rows[DRAKE]["unchanged"],
-    }
-    result["seconds"] = time.monotonic() - began
+    results["targets"] = headline_numbers(results)
+    results["seconds"] = time.monotonic() - start
     if out is not None:
-        write_json(out, result)
-    if picture is not None:
-        draw_growth(result["growth"], picture)
-    show(result, console)
+        write_json(out, results)
+    if figure is not None:
+        draw_growth(results["growth"], figure)
+    show_results(results, console)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

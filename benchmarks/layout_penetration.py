@@ -1,4 +1,4 @@
-"""Lays out random graphs of both object sets and measures the deepest penetration of any two objects.
+"""Check that objects of random scene graphs do not penetrate each other after the layout.
 
 python benchmarks/layout_penetration.py --count 10000
 """
@@ -16,21 +16,25 @@ from drake_clutter.scenes.geometry import max_penetration
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.seeding import item_rng
 from drake_clutter.workers.parallel_map import map_ordered
+from training.script import WorkersOption, run_script
 
-ROUNDING = 1e-9
-"""m; objects that touch may overlap by this much."""
+TOLERANCE = 1e-9
+"""Penetration of objects in contact that is due to rounding [m]."""
+SEED = 2022
+"""Seed of the scene graphs."""
 
 
-class _Layouts:
-    """Lays out the random graph of an index: 3 to 30 nodes, either object set."""
+class LayoutTester:
+    """Lays out random graphs of 3 to 30 nodes; a worker for `map_ordered`."""
 
     def __init__(self) -> None:
+        """Load the grammars of both object sets, which take turns."""
         catalog = load_catalog()
         self._grammars = [SceneGrammar(catalog.object_set(name)) for name in ("ycb7", "pantry14")]
 
     def __call__(self, index: int) -> tuple[str, float]:
-        """What came of it, and the deepest penetration, m."""
-        rng = item_rng(2022, index)
+        """Return the result for the graph of an index, and its deepest penetration [m]."""
+        rng = item_rng(SEED, index)
         grammar = self._grammars[index % 2]
         derivation = grammar.derive(NodeBudget(int(rng.integers(3, 31))), uniform_choice(rng))
         scene = lay_out(derivation, grammar.classes, ClutterConfig(), rng)
@@ -40,18 +44,22 @@ class _Layouts:
 
 
 def main(
-    count: Annotated[int, typer.Option(help="Graphs to lay out.")] = 10_000, workers: int = 1
+    count: Annotated[int, typer.Option(min=1, help="Number of scene graphs.")] = 10_000,
+    workers: WorkersOption = 1,
 ) -> None:
-    """Prints how many were laid out and the deepest penetration among them; fails if any two objects overlap."""
-    results: Counter[str] = Counter()
+    """Print the number of layouts and the deepest penetration.
+
+    The exit code is 1 if any two objects penetrate each other.
+    """
+    results = Counter[str]()
     deepest = -np.inf
-    for result, depth in map_ordered(_Layouts, range(count), workers=workers):
+    for result, depth in map_ordered(LayoutTester, range(count), workers=workers):
         results[result] += 1
         deepest = max(deepest, depth)
     print(f"{dict(results)}; deepest penetration {1000 * deepest:.3g} mm")
-    if deepest > ROUNDING:
+    if deepest > TOLERANCE:
         raise typer.Exit(1)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

@@ -1,4 +1,4 @@
-"""The scenes of `judge_speed.py` in PyBullet: loading, looking, and where the objects are."""
+"""Scenes in PyBullet, which `judge_speed.py` compares Drake with."""
 
 import math
 from pathlib import Path
@@ -9,13 +9,32 @@ import pybullet
 from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.scenes.scene import Pose, Scene
 
+TIME_STEP = 1 / 240
+"""Time step of the simulation, PyBullet's default [s]."""
+FRICTION = 0.5
+"""Coefficient of friction between any two bodies."""
 
-def label_image() -> Any:
-    """The body that the overhead camera sees in each pixel of PyBullet's world."""
+
+def load_world(path: Path) -> None:
+    """Create a world from an exported scene.
+
+    Args:
+        path: SDF file of the scene.
+    """
+    pybullet.connect(pybullet.DIRECT)
+    for body in pybullet.loadSDF(str(path)):
+        # PyBullet multiplies the coefficients of two bodies in contact.
+        pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(FRICTION))
+    pybullet.setGravity(0, 0, -9.81)
+    pybullet.setTimeStep(TIME_STEP)
+
+
+def render_labels() -> Any:
+    """Return the body that the cell's camera sees in each pixel. Shape (H, W)."""
     camera = default_cell().camera
     X_TC = camera.X_TC
-    eye, ahead, up = (X_TC @ p for p in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
-    view = pybullet.computeViewMatrix(eye, ahead, up - eye)
+    p_TC, ahead, up = (X_TC @ p for p in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
+    view = pybullet.computeViewMatrix(p_TC, ahead, up - p_TC)
     projection = pybullet.computeProjectionMatrixFOV(
         camera.fov_y_deg, camera.width / camera.height, 0.05, 20
     )
@@ -25,25 +44,12 @@ def label_image() -> Any:
     )[4]
 
 
-def load(path: Path) -> None:
-    """Makes a world of an export."""
-    pybullet.connect(pybullet.DIRECT)
-    for body in pybullet.loadSDF(str(path)):
-        pybullet.changeDynamics(
-            body, -1, lateralFriction=math.sqrt(0.5)
-        )  # those of the two that touch are multiplied
-    pybullet.setGravity(0, 0, -9.81)
-    pybullet.setTimeStep(1 / 240)
-
-
-def poses(scene: Scene) -> list[Pose]:
-    """X_TO of the scene's objects."""
-    found = []
+def object_poses(scene: Scene) -> list[Pose]:
+    """Return the pose X_TO of each object in the world that was created from a scene."""
+    poses = []
     for body in range(1, len(scene.objects) + 1):
-        X_TCm, X_OCm = (
-            pybullet.getBasePositionAndOrientation(body),
-            pybullet.getDynamicsInfo(body, -1)[3:5],
-        )
+        X_TCm = pybullet.getBasePositionAndOrientation(body)
+        X_OCm = pybullet.getDynamicsInfo(body, -1)[3:5]
         p, (x, y, z, w) = pybullet.multiplyTransforms(*X_TCm, *pybullet.invertTransform(*X_OCm))
-        found.append(Pose(p, (w, x, y, z)))
-    return found
+        poses.append(Pose(p, (w, x, y, z)))
+    return poses

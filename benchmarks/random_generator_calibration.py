@@ -1,109 +1,113 @@
-"""RG's row of the paper's Table I under a config: stability and hidden objects by size, judged by Drake.
+"""Compare the random generator with the paper's Table I, under a configuration.
 
-python benchmarks/random_generator_calibration.py --count 1000 --workers 2 --out benchmarks/results/calibration.json
+    python benchmarks/random_generator_calibration.py --count 1000 --out calibration.json
+
+For each size: the fraction of scenes that are stable in Drake, and the number of hidden objects by
+visibility threshold. An interrupted run is resumed by the same command.
 """
 
-import json
 import time
-from pathlib import Path
-from typing import Annotated, Any
+from functools import partial
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator, summarize_scenes
-from drake_clutter.config import load_config
-from drake_clutter.files import InputError, write_json
-from drake_clutter.resources import git_commit
-from drake_clutter.validation import config_yaml
+from drake_clutter.config import ClutterConfig, load_config
+from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
+from training.results_file import ResultsFile, Row, provenance
+from training.script import (
+    ConfigOption,
+    ResultsOption,
+    SeedOption,
+    WorkersOption,
+    format_number,
+    print_table,
+    progress,
+    run_script,
+)
 
-PAPER_RG = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
-"""Stability rate and mean hidden objects of RG by nodes (Table I)."""
+PAPER = {10: (0.84, 1.13), 15: (0.64, 1.64), 20: (0.55, 2.18), 25: (0.41, 2.51)}
+"""Stability rate and mean number of hidden objects by nodes (Kumar et al. 2022, Table I, RG)."""
 THRESHOLDS = (0.10, 0.20, 0.25, 0.30, 0.35, 0.40)
+"""Visible fractions below which an object may count as hidden."""
 
 
-class _Size:
-    """Makes the worker of a job; picklable."""
+def evaluate_size(
+    nodes: int, count: int, objects: str, seed: int, workers: int, config: ClutterConfig
+) -> Row:
+    """Generate and judge scenes of one size and return their row.
 
-    def __init__(self, job: GenerationJob) -> None:
-        self.job = job
+    Args:
+        nodes: Number of nodes of the scene graphs.
+        count: Number of scenes.
+        objects: Name of the object set.
+        seed: Seed of the scenes.
+        workers: Number of processes.
+        config: Configuration of the scenes and the judge.
+    """
+    job = GenerationJob("random", objects, None, nodes, seed, config)
+    start = time.monotonic()
+    generated = map_ordered(partial(SceneGenerator, job), range(count), workers=workers)
+    scenes = list(progress(generated, f"{nodes} nodes", count))
+    row = summarize_scenes(job, [(scene.scene, scene.verdict) for scene in scenes])
+    fractions = [s.verdict.visible_fractions.values() for s in scenes if s.verdict.stable]
+    failures = sum((s.layout_failures for s in scenes), start=type(scenes[0].layout_failures)())
+    return row | {
+        "hidden_by_threshold": {
+            str(threshold): sum(f < threshold for scene in fractions for f in scene)
+            / len(fractions)
+            for threshold in THRESHOLDS
+        },
+        "layout_failures": dict(failures),
+        "seconds": time.monotonic() - start,
+        **provenance(),
+    }
 
-    def __call__(self) -> SceneGenerator:
-        return SceneGenerator(self.job)
+
+def table_row(row: Row) -> dict[str, str]:
+    """Return a row of the results as cells of the printed table."""
+    stable, hidden = PAPER.get(row["nodes"], (None, None))
+    return {
+        "nodes": str(row["nodes"]),
+        "stable": format_number(row["stability_rate"], 3),
+        "stable (paper)": format_number(stable),
+        "hidden": format_number(row["hidden_mean"]),
+        "hidden (paper)": format_number(hidden),
+        **{
+            f"hidden below {threshold}": format_number(mean)
+            for threshold, mean in row["hidden_by_threshold"].items()
+        },
+        "time (s)": format_number(row["seconds"], 0),
+    }
 
 
 def main(
-    count: Annotated[int, typer.Option(help="Scenes of each size.")] = 150,
-    seed: int = 0,
-    workers: int = 1,
-    objects: str = "ycb7",
+    count: Annotated[int, typer.Option(min=1, help="Number of scenes of each size.")] = 150,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 1,
+    objects: Annotated[str, typer.Option(help="Name of the object set.")] = "ycb7",
     nodes: Annotated[
-        list[int] | None, typer.Option(help="Sizes; the paper's four if not given.")
+        list[int] | None, typer.Option(help="A size instead of the paper's. May be repeated.")
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML with fields to put over the defaults.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
+    config: ConfigOption = None,
+    out: ResultsOption = None,
 ) -> None:
-    """Prints the table, and hidden objects by threshold, and writes both with what is needed to repeat them.
-
-    A run that was stopped goes on with the sizes that its file lacks.
-    """
+    """Evaluate the sizes that are missing in the results file, and print the table."""
     world = load_config(config)
-    head = {
-        "count": count,
-        "seed": seed,
-        "objects": objects,
-        "workers": workers,
-        "config": config_yaml(world),
-    }
-    rows: list[dict[str, Any]] = []
-    if out is not None and out.exists():
-        earlier = json.loads(out.read_text())
-        if {key: earlier[key] for key in head} != head:
-            raise InputError(
-                f"--out {out}: holds results of other options; give the same options or another file"
-            )
-        rows = earlier["rows"]
-    for size in nodes or PAPER_RG:
-        if any(row["nodes"] == size for row in rows):
-            continue
-        job = GenerationJob("random", objects, None, size, seed, world)
-        start = time.monotonic()
-        scenes = map_ordered(_Size(job), range(count), workers=workers)
-        made = list(track(scenes, f"{size} nodes", total=count, console=Console(stderr=True)))
-        row = summarize_scenes(job, [(m.scene, m.verdict) for m in made])
-        shares = [m.verdict.visible_fractions.values() for m in made if m.verdict.stable]
-        row["hidden_by_threshold"] = {
-            str(t): sum(sum(v < t for v in s) for s in shares) / len(shares) for t in THRESHOLDS
-        }
-        failures = sum((m.layout_failures for m in made), start=type(made[0].layout_failures)())
-        row |= {
-            "layout_failures": dict(failures),
-            "seconds": time.monotonic() - start,
-            "commit": git_commit(),
-        }
+    header = {"count": count, "seed": seed, "objects": objects, "config": to_plain(world)}
+    results = ResultsFile(out, header, ("nodes",)) if out else None
+    rows = list[Row]()
+    for size in nodes or PAPER:
+        row = results.find({"nodes": size}) if results else None
+        if row is None:
+            row = evaluate_size(size, count, objects, seed, workers, world)
+            if results:
+                results.add(row)
         rows.append(row)
-        if out is not None:
-            write_json(out, head | {"rows": rows})
-    table = Table(
-        "nodes", "stable", "paper", "hidden", "paper", *(f"< {t:g}" for t in THRESHOLDS), "s"
-    )
-    for row in rows:
-        paper = PAPER_RG.get(row["nodes"], (float("nan"),) * 2)
-        cells = [
-            f"{row['stability_rate']:.3f}",
-            f"{paper[0]:.2f}",
-            f"{row['hidden_mean']:.2f}",
-            f"{paper[1]:.2f}",
-        ]
-        cells += [f"{h:.2f}" for h in row["hidden_by_threshold"].values()]
-        table.add_row(str(row["nodes"]), *cells, f"{row['seconds']:.0f}")
-    Console().print(table)
+    print_table([table_row(row) for row in rows])
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

@@ -1,32 +1,39 @@
-"""Is the judge's settling its own truth? Verdicts under finer and coarser steps and without the early stop, on RG stacks.
+"""Measure how verdicts on random stacks depend on the settings of the settling simulation.
 
-python benchmarks/settle_sensitivity.py --count 150 --out benchmarks/results/settle_settings.json
+python benchmarks/settle_sensitivity.py --count 150 --out settle_sensitivity.json
 """
 
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from drake_clutter.agents.generators import RandomGenerator
 from drake_clutter.catalog import RestOrientation, Shape, load_catalog
-from drake_clutter.config import ClutterConfig, SettleConfig
+from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar
-from drake_clutter.resources import git_commit
 from drake_clutter.scenes.geometry import group_touching_objects
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import SceneObject, perturb_poses
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import settle
+from training.results_file import provenance
+from training.script import (
+    ResultsOption,
+    SeedOption,
+    print_table,
+    progress,
+    run_script,
+)
 
 NEVER = 1_000_000
+"""Number of samples that is never reached: disables the early stop."""
+OTHER_OFFSETS = "other random offsets"
+"""Settings under which each stack has its second set of random offsets."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "no early stop, 2.5 s": {
@@ -37,103 +44,132 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "calm, or 2 s": {"chatter_displacement": 0.0},
     "1 ms steps": {"time_step": 0.001},
     "4 ms steps": {"time_step": 0.004},
-    "other random offsets": {},
+    OTHER_OFFSETS: {},
 }
+"""Fields of the settle configuration by the name of the settings."""
 
 
-def stacks(
-    count: int, nodes: int, seed: int, config: ClutterConfig
-) -> list[tuple[list[SceneObject], list[SceneObject]]]:
-    """RG stacks of two objects or more, each with two draws of its random offsets."""
+@dataclass(frozen=True)
+class Stack:
+    """Two or more objects that may touch, with two sets of random offsets.
+
+    Attributes:
+        objects: The objects with the first offsets.
+        other_objects: The objects with the second offsets.
+    """
+
+    objects: list[SceneObject]
+    other_objects: list[SceneObject]
+
+
+def sample_stacks(count: int, nodes: int, seed: int, config: ClutterConfig) -> list[Stack]:
+    """Return stacks of the random generator.
+
+    Args:
+        count: Number of stacks.
+        nodes: Number of nodes of the scene graphs.
+        seed: Seed of the scene graphs.
+        config: Configuration of the layout and the offsets.
+    """
     grammar = SceneGrammar(load_catalog().object_set("ycb7"))
-    found: list[tuple[list[SceneObject], list[SceneObject]]] = []
+    stacks = list[Stack]()
     index = 0
-    while len(found) < count:
+    while len(stacks) < count:
         rng = item_rng(seed, index)
         index += 1
-        scene = lay_out(
-            RandomGenerator().derive(grammar, NodeBudget(nodes), rng), grammar.classes, config, rng
-        )
+        derivation = RandomGenerator().derive(grammar, NodeBudget(nodes), rng)
+        scene = lay_out(derivation, grammar.classes, config, rng)
         if isinstance(scene, LayoutFailure):
             continue
         for group in group_touching_objects(scene.objects, TOUCHING_MARGIN):
             if len(group) > 1:
-                found.append(
-                    (
-                        perturb_poses(group, config.settle.jitter, rng),
-                        perturb_poses(group, config.settle.jitter, rng),
-                    )
-                )
-    return found[:count]
+                first = perturb_poses(group, config.settle.jitter, rng)
+                second = perturb_poses(group, config.settle.jitter, rng)
+                stacks.append(Stack(first, second))
+    return stacks[:count]
 
 
-def rests_on_lying(group: list[SceneObject]) -> str:
-    """ "single" or "pair" if something rests on a lying cylinder or on two side by side, else ""."""
-    found = ""
-    for o in group:
+def lying_support(objects: Sequence[SceneObject]) -> str:
+    """Return on what kind of lying cylinders an object rests.
+
+    Returns:
+        "single" for one cylinder, "pair" for two side by side, "" for none.
+    """
+    kind = ""
+    for o in objects:
         if (
             o.object_class.shape is not Shape.CYLINDER
             or o.object_class.only_rest is RestOrientation.UPRIGHT
         ):
             continue
-        loaded = any(abs(other.bounds_T[0][2] - o.top_height) < 1e-6 for other in group)
-        beside = any(
+        is_loaded = any(abs(other.bounds_T[0][2] - o.top_height) < 1e-6 for other in objects)
+        is_in_pair = any(
             other is not o
             and other.object_class is o.object_class
             and abs(other.X_TO.p[2] - o.X_TO.p[2]) < 1e-6
-            for other in group
+            for other in objects
         )
-        if loaded:
-            found = "pair" if beside and found != "single" else "single"
-    return found
+        if is_loaded:
+            kind = "pair" if is_in_pair and kind != "single" else "single"
+    return kind
 
 
 def main(
-    count: Annotated[int, typer.Option(help="Stacks of two objects or more.")] = 150,
-    nodes: int = 25,
-    seed: int = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON to write.")] = None,
+    count: Annotated[int, typer.Option(min=1, help="Number of stacks.")] = 150,
+    nodes: Annotated[int, typer.Option(min=3, help="Number of nodes of the scene graphs.")] = 25,
+    seed: SeedOption = 0,
+    out: ResultsOption = None,
 ) -> None:
-    """Prints and writes how often each setting agrees with the default, and how stacks on lying markers fare."""
+    """Compare verdicts under all settings with those under the defaults."""
     config = ClutterConfig()
-    groups = stacks(count, nodes, seed, config)
-    stable: dict[str, list[bool]] = {}
+    stacks = sample_stacks(count, nodes, seed, config)
+    stable = dict[str, list[bool]]()
     for name, changes in SETTINGS.items():
-        settle_config: SettleConfig = replace(config.settle, **changes)
-        chosen = [second if name.startswith("other") else first for first, second in groups]
+        settle_config = replace(config.settle, **changes)
+        groups = [s.other_objects if name == OTHER_OFFSETS else s.objects for s in stacks]
         stable[name] = [
             settle(group, config.cell.support, settle_config).instability is None
-            for group in track(chosen, name, console=Console(stderr=True))
+            for group in progress(groups, name)
         ]
-    table = Table("setting", "agrees with the default", "stable")
-    rows: list[dict[str, Any]] = []
-    for name, verdicts in stable.items():
-        agreement = float(np.mean(np.equal(verdicts, stable["default"])))
-        rows.append(
-            {"setting": name, "agreement": agreement, "stable_share": float(np.mean(verdicts))}
-        )
-        table.add_row(name, f"{agreement:.3f}", f"{np.mean(verdicts):.3f}")
-    lying = {}
+    rows = [
+        {
+            "setting": name,
+            "agreement": float(np.mean(np.equal(verdicts, stable["default"]))),
+            "stable_share": float(np.mean(verdicts)),
+        }
+        for name, verdicts in stable.items()
+    ]
+    on_lying_markers = dict[str, dict[str, int]]()
     for kind in ("single", "pair"):
-        fates = [
-            held
-            for (group, _), held in zip(groups, stable["default"], strict=True)
-            if rests_on_lying(group) == kind
+        verdicts = [
+            is_stable
+            for stack, is_stable in zip(stacks, stable["default"], strict=True)
+            if lying_support(stack.objects) == kind
         ]
-        lying[kind] = {"stacks": len(fates), "stable": sum(fates)}
-        table.add_row(f"on a {kind} of lying markers", "", f"{sum(fates)} of {len(fates)}")
-    Console().print(table)
+        on_lying_markers[kind] = {"stacks": len(verdicts), "stable": sum(verdicts)}
+    print_table(
+        [
+            {
+                "settings": row["setting"],
+                "agreement with the default": f"{row['agreement']:.3f}",
+                "stable": f"{row['stable_share']:.3f}",
+            }
+            for row in rows
+        ]
+    )
+    for kind, counts in on_lying_markers.items():
+        print(f"on a {kind} of lying markers: {counts['stable']} of {counts['stacks']} stable")
     if out is not None:
-        result = {
+        results = {
             "count": count,
             "nodes": nodes,
             "seed": seed,
-            "commit": git_commit(),
+            **provenance(),
             "settings": rows,
-            "on_lying_markers": lying,
+            "on_lying_markers": on_lying_markers,
         }
-        write_json(out, result)
+        write_json(out, results)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_script(main)

@@ -16,6 +16,8 @@ from drake_clutter.files import InputError
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.validation import to_plain
+from training.evaluate_explorers import PANTRY14_SETS, YCB7_SETS
 from training.results_file import ResultsFile
 
 ALL, COLLAPSED, OUT = "all found", "collapsed", "out of moves"
@@ -193,7 +195,7 @@ def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
 
 @pytest.mark.parametrize(
     ("with_poses", "message"),
-    [(False, r"something else \(weights\)"), (True, "scenes of other options")],
+    [(False, r"something else \(weights\)"), (True, "results of other options")],
 )
 def test_a_set_goes_on_with_the_weights_that_it_began_with(
     with_poses: bool, message: str, tmp_path: Path
@@ -225,3 +227,34 @@ def test_a_set_that_cannot_be_made_ends(tmp_path: Path) -> None:
         training_script("generate_scene_dataset").main(
             tmp_path / "set.json", tmp_path / "work", agent="random", nodes=3, count=1
         )
+
+
+@pytest.mark.parametrize("name", [*YCB7_SETS, *PANTRY14_SETS])
+def test_published_episodes_are_resumed(name: str, tmp_path: Path) -> None:
+    """The header of a record file of an earlier version is that of today."""
+    script = training_script("evaluate_explorers")
+    scenes = load_scene_dataset(script.SCENES / f"{name}.json", CATALOG)
+    for agent in script.TABLES[name][1]:
+        path = script.episodes_path(script.EPISODES, name, agent)
+        if path.exists():
+            copy = Path(copyfile(path, tmp_path / path.name))
+            options = {"fidelity": "settle", "seed": 2000, "workers": 1}
+            records = script.collect_episodes(copy, scenes, agent, 3, **options)
+            assert [record["scene"] for record in records] == [f"{name}.json {k}" for k in range(3)]
+
+
+def test_published_closed_loop_episodes_are_resumed(tmp_path: Path) -> None:
+    script = training_script("evaluate_closed_loop")
+    for evaluation in script.EVALUATIONS:
+        path = script.EPISODES / f"{evaluation.name}.jsonl.gz"
+        if path.exists():
+            copy = Path(copyfile(path, tmp_path / path.name))
+            records = script.collect_episodes(evaluation, 3, 1, copy)
+            assert [r["number"] for r in records] == [evaluation.first + k for k in range(3)]
+
+
+def test_published_rows_are_read() -> None:
+    script = training_script("evaluate_explorers")
+    header = {"seed": 2000, "fidelity": "settle", "config": to_plain(ClutterConfig())}
+    for name in ("table2.json", "table3.json"):
+        assert ResultsFile(script.RESULTS / name, header, ("set", "agent")).read()

@@ -19,13 +19,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
+from drake_clutter.config import upgrade_record_head
 from drake_clutter.files import InputError, file_sha256
 from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.scenes.interfaces import MoveResult
@@ -44,7 +45,7 @@ from drake_clutter.systems.tracking import match_to_ground_truth
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
-from drake_clutter.validation import to_plain
+from drake_clutter.validation import override_config, to_plain
 from training.results_file import ResultsFile, Row, collect_records
 from training.script import (
     RESULTS,
@@ -220,7 +221,16 @@ def collect_episodes(
         requests,
         workers=workers,
         max_items_per_process=EPISODES_PER_PROCESS,
+        upgrade=upgrade_scenario,
     )
+
+
+def upgrade_scenario(header: Any) -> Any:
+    """Return the header of a record file of an earlier version with today's names of fields."""
+    header = upgrade_record_head(header)
+    scenario = to_plain(override_config(Scenario(), header["scenario"], "scenario"))
+    scenario.pop("seed")
+    return header | {"scenario": scenario}
 
 
 def episode_record(task: ExplorationTask, known: Sequence[SceneObject]) -> Row:

@@ -31,6 +31,14 @@ def provenance() -> dict[str, str]:
     return {"software_version": drake_clutter.__version__, "commit": git_commit()}
 
 
+def upgrade_record_header(header: Any) -> Any:
+    """Return the header of a file of an earlier version with today's names of fields."""
+    upgraded = upgrade_record_head(header)
+    if isinstance(upgraded, dict) and "fidelity" in upgraded:
+        upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
+    return upgraded
+
+
 @dataclass(frozen=True)
 class ResultsFile:
     """A results file whose rows are measured one after the other, in one run or several.
@@ -52,7 +60,7 @@ class ResultsFile:
             InputError: The file is no results file, or has another header.
         """
         try:
-            document = _upgrade_header(json.loads(self.path.read_text(encoding="utf-8")))
+            document = upgrade_record_header(json.loads(self.path.read_text(encoding="utf-8")))
             rows: list[Row] = document["rows"]
             differing = [key for key, value in self.header.items() if document[key] != value]
         except FileNotFoundError:
@@ -85,14 +93,6 @@ class ResultsFile:
         return tuple(row[key] for key in self.keys)
 
 
-def _upgrade_header(header: Any) -> Any:
-    """Return a header with its configs and its fidelity under their current names."""
-    upgraded = upgrade_record_head(header)
-    if isinstance(upgraded, dict) and "fidelity" in upgraded:
-        upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
-    return upgraded
-
-
 def collect_records(
     path: Path,
     header: Mapping[str, Any],
@@ -102,6 +102,7 @@ def collect_records(
     workers: int,
     ray_address: str | None = None,
     max_items_per_process: int | None = None,
+    upgrade: Callable[[Any], Any] = upgrade_record_header,
 ) -> list[Row]:
     """Return the record of each item; those that a record file lacks are computed and appended.
 
@@ -114,6 +115,7 @@ def collect_records(
         workers: See `map_ordered`.
         ray_address: See `map_ordered`.
         max_items_per_process: See `map_ordered`.
+        upgrade: Converts the header of an earlier version to today's form.
     """
     software = provenance()
 
@@ -129,5 +131,5 @@ def collect_records(
             record = result if isinstance(result, dict) else asdict(result)
             yield record | software
 
-    with closing(resume_jsonl(path, header, compute, _upgrade_header)) as lines:
+    with closing(resume_jsonl(path, header, compute, upgrade)) as lines:
         return list(islice(lines, 1, 1 + len(items)))
