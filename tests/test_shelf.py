@@ -23,9 +23,12 @@ from drake_clutter.validation import load_config_as
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory: pytest.TempPathFactory) -> ClutterConfig:
-    """The shelf of docs/work_cell.md."""
+    """Return the shelf of docs/how_to/set_up_work_cell.md."""
+    page = ROOT / "docs" / "how_to" / "set_up_work_cell.md"
     (text,) = (
-        b.text for b in blocks(ROOT / "docs/work_cell.md", "yaml") if "wall_height" in b.text
+        block.text
+        for block in blocks(page)
+        if block.language == "yaml" and "wall_height" in block.text
     )
     path: Path = tmp_path_factory.mktemp("shelf") / "shelf.yaml"
     path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A serial arm as an SDF model: base, links on revolute joints, and the frame of the flange."""
+"""SDF models of serial arms: base, links on revolute joints, and the flange frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ArmLink:
-    """A link, and for all but the base the joint that moves it about its z.
+    """Link L, with the joint between its parent P and itself about the z axis of L.
 
     Attributes:
-        name: As in the model.
-        mass: [kg].
-        p_LCm: Center of mass in the link's frame [m]. Shape (3,).
-        collision_geometry: Capsules that cover it.
-        visual_geometry: Cylinders that it is drawn with.
-        joint: Name of the joint before it; "" for the base.
-        X_PL: Pose in the frame of the link before, when the joint is at 0. Shape (4, 4).
-        max_angle: Greatest angle of the joint either way [rad].
-        max_torque: Greatest torque of the joint [N m].
-        max_speed: Greatest speed of the joint [rad/s].
+        name: Name of the link.
+        mass: Mass [kg].
+        p_LCm: Center of mass in L [m]. Shape (3,).
+        collision_geometry: Capsules that cover the link.
+        visual_geometry: Cylinders of the visual geometry.
+        joint: Name of the joint; "" for the base.
+        X_PL: Pose of L in P when the joint is at 0; None for the base. Shape (4, 4).
+        max_angle: Limit of the joint position in both directions [rad].
+        max_torque: Torque limit of the joint [N m].
+        max_speed: Velocity limit of the joint [rad/s].
     """
 
     name: str
@@ -42,17 +42,19 @@ class ArmLink:
 
 
 def arm_sdf(name: str, written_by: str, links: Sequence[ArmLink], X_LF: Floats) -> str:
-    """Return an arm as SDF text.
+    """Return the SDF model of an arm, as text.
 
     Args:
-        name: Of the model.
-        written_by: Module that has the numbers and names their sources.
-        links: Base first.
-        X_LF: Pose of the frame `flange` in that of the last link. Shape (4, 4).
+        name: Name of the model.
+        written_by: Module with the numbers and their sources.
+        links: Links, base first.
+        X_LF: Pose of the frame `flange` in the frame of the last link. Shape (4, 4).
     """
-    parts, parent = list[str](), ""
+    parts = list[str]()
+    parent = ""
     for link in links:
-        X, pose = link.X_PL, ""
+        X = link.X_PL
+        pose = ""
         if X is not None:
             pose = "\n      " + sdf_pose(X[:3, 3], Rotation.from_matrix(X[:3, :3]), parent)
         parts.append(

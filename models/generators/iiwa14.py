@@ -1,14 +1,15 @@
-"""The KUKA LBR iiwa 14 R820, an arm with seven joints, as a model: `models/robots/iiwa14.sdf`.
+"""SDF model of the KUKA LBR iiwa 14 R820, `models/robots/iiwa14.sdf`.
 
-Frames: B the base, z up; L1 to L7 the links, z the axis of the joint before each, placed as in the
-URDF of the Bullet project (`kuka_iiwa/model.urdf` in `pybullet_data`, BSD).
+Frames: B is the base, z up; L1 to L7 are the links, with z along the axis of the joint that moves
+them, placed as in the URDF of the Bullet project (`kuka_iiwa/model.urdf` in `pybullet_data`, BSD).
 
-Sources: lengths, ranges and speeds, ROS-Industrial's `lbr_iiwa_14_r820.urdf`, after KUKA's
-specification; torques, from memory of that specification; masses and centers of mass, Bullet's
-URDF, whose meshes the capsules cover. KUKA publishes no masses of the links.
+Sources: Lengths, ranges and speeds: ROS-Industrial's `lbr_iiwa_14_r820.urdf`, after KUKA's
+specification. Masses and centers of mass: Bullet's URDF, whose meshes the capsules cover; KUKA
+publishes no masses of the links. The torques are assumptions, close to KUKA's specification.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,16 @@ from scipy.spatial.transform import Rotation
 from arm_sdf import ArmLink, arm_sdf
 from drake_clutter.cell.primitives import LinkPrimitive
 
-_ORANGE, _GREY = "0.90 0.45 0.12 1", "0.62 0.63 0.65 1"
+_ORANGE = "0.90 0.45 0.12 1"
+_GREY = "0.62 0.63 0.65 1"
 _RANGES_DEG = (170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0)
+"""Position limits of the joints in both directions [deg]."""
 _SPEEDS_DEG = (85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0)
+"""Velocity limits of the joints [deg/s]."""
 _TORQUES = (320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0)
+"""Torque limits of the joints [N m]."""
 _MASSES = (5.0, 4.0, 4.0, 3.0, 2.7, 1.7, 1.8, 0.3)
-"""Base first [kg]."""
+"""Masses of the links, base first [kg]."""
 _CENTERS_OF_MASS = (
     (-0.1, 0.0, 0.07),
     (0.0, -0.03, 0.12),
@@ -33,8 +38,11 @@ _CENTERS_OF_MASS = (
     (0.0, 0.0006, 0.0004),
     (0.0, 0.0, 0.02),
 )
-"""Centers of mass, base first [m]."""
-_IDENTITY_RPY, _TWIST_RPY, _BEND_RPY, _FLIP_RPY = (0, 0, 0), (90, 0, 180), (90, 0, 0), (-90, 180, 0)
+"""Centers of mass of the links, base first [m]."""
+_IDENTITY_RPY = (0, 0, 0)
+_TWIST_RPY = (90, 0, 180)
+_BEND_RPY = (90, 0, 0)
+_FLIP_RPY = (-90, 180, 0)
 _LINK_POSES = (
     ((0.0, 0.0, 0.1575), _IDENTITY_RPY),
     ((0.0, 0.0, 0.2025), _TWIST_RPY),
@@ -44,9 +52,9 @@ _LINK_POSES = (
     ((0.0, 0.0, 0.2155), _BEND_RPY),
     ((0.0, 0.081, 0.0), _FLIP_RPY),
 )
-"""Of each link in the one before: position [m], and roll, pitch, yaw [deg]."""
+"""Pose of each moving link in its parent: position [m] and roll, pitch, yaw [deg]."""
 FLANGE = 0.045
-"""From the last link's frame to the flange [m]."""
+"""Distance from the frame of the last link to the flange [m]."""
 COLLISION_GEOMETRY = (
     (LinkPrimitive((-0.037, 0.0001, 0.0673), (0.0002, 0.0, 0.0554), 0.134),),
     (LinkPrimitive((0.0001, -0.0003, 0.0293), (-0.0001, -0.0301, 0.2035), 0.092),),
@@ -66,7 +74,7 @@ COLLISION_GEOMETRY = (
     (LinkPrimitive((0.0001, 0.0226, 0.0), (0.0001, -0.0199, -0.0029), 0.079),),
     (LinkPrimitive((-0.0001, 0.0, 0.0065), (0.0002, 0.0, 0.0066), 0.053),),
 )
-"""Base first."""
+"""Capsules that cover each link, base first."""
 _VISUAL_GEOMETRY = (
     (LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, 0.1500), 0.093, _GREY),),
     (
@@ -95,33 +103,38 @@ _VISUAL_GEOMETRY = (
     ),
     (LinkPrimitive((0.0, 0.0, 0.0), (0.0, 0.0, FLANGE), 0.032, _GREY),),
 )
+"""Cylinders of the visual geometry of each link, base first."""
 
 
 def _pose(place: tuple[tuple[float, ...], tuple[int, ...]]) -> NDArray[np.float64]:
+    """Return a pose of position [m] and roll, pitch, yaw, multiples of 90 [deg]."""
+    position, rpy_deg = place
     X = np.eye(4)
-    X[:3, :3] = np.round(Rotation.from_euler("xyz", place[1], degrees=True).as_matrix())
-    X[:3, 3] = place[0]
+    X[:3, :3] = np.round(Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
+    X[:3, 3] = position
     return X
 
 
 def iiwa14_sdf() -> str:
     """Return the SDF model, as text."""
-    base = ArmLink(
-        "link_0",
-        _MASSES[0],
-        np.array(_CENTERS_OF_MASS[0]),
-        COLLISION_GEOMETRY[0],
-        _VISUAL_GEOMETRY[0],
-    )
-    links = [base]
-    for k, place in enumerate(_LINK_POSES):
-        shape = (
-            _MASSES[k + 1],
-            np.array(_CENTERS_OF_MASS[k + 1]),
-            COLLISION_GEOMETRY[k + 1],
-            _VISUAL_GEOMETRY[k + 1],
+    links = []
+    for k, mass in enumerate(_MASSES):
+        link = ArmLink(
+            name=f"link_{k}",
+            mass=mass,
+            p_LCm=np.array(_CENTERS_OF_MASS[k]),
+            collision_geometry=COLLISION_GEOMETRY[k],
+            visual_geometry=_VISUAL_GEOMETRY[k],
         )
-        drive = math.radians(_RANGES_DEG[k]), _TORQUES[k], math.radians(_SPEEDS_DEG[k])
-        links.append(ArmLink(f"link_{k + 1}", *shape, f"joint_{k + 1}", _pose(place), *drive))
+        if k:
+            link = replace(
+                link,
+                joint=f"joint_{k}",
+                X_PL=_pose(_LINK_POSES[k - 1]),
+                max_angle=math.radians(_RANGES_DEG[k - 1]),
+                max_torque=_TORQUES[k - 1],
+                max_speed=math.radians(_SPEEDS_DEG[k - 1]),
+            )
+        links.append(link)
     X_LF = _pose(((0.0, 0.0, FLANGE), _IDENTITY_RPY))
     return arm_sdf("iiwa14", "models/generators/iiwa14.py", links, X_LF)

@@ -1,13 +1,14 @@
-"""The e-series of Universal Robots as models: UR3e, UR5e, UR10e, UR16e.
+"""SDF models of the Universal Robots e-series: UR3e, UR5e, UR10e and UR16e.
 
-Sources: Denavit-Hartenberg parameters, masses and centers of mass, Universal Robots, "DH parameters
-for calculations of kinematics and dynamics"; torques, "Max. joint torques"; speeds, user manuals.
+Sources: Denavit-Hartenberg parameters, masses and centers of mass: Universal Robots, "DH parameters
+for calculations of kinematics and dynamics". Torques: Universal Robots, "Max. joint torques".
+Speeds: user manuals.
 
-The capsules of UR3e and UR5e cover the meshes of `airo-models` 0.0.12 (MIT). For UR10e and UR16e
-no mesh was at hand. Their capsules cover the meshes of ROS-Industrial's UR10 (BSD), which has
-joints of the same sizes, moved to the published lengths, and are 1 to 10 mm thicker than that: 1.3 times
-what capsules made for the UR5e from the UR5 in the same way need. Their base is a cylinder as wide
-as the footprint of the data sheet. The masses of the bases are assumed.
+The capsules of UR3e and UR5e cover the meshes of `airo-models` 0.0.12 (MIT). No meshes of UR10e and
+UR16e were available: their capsules cover the meshes of ROS-Industrial's UR10 (BSD), which has
+joints of the same sizes, moved to the published lengths, with a margin of 1 to 10 mm. The margin is
+1.3 times what capsules of the UR5e derived from the UR5 in the same way need. Their base is a
+cylinder with the footprint of the data sheet. The masses of the bases are assumptions.
 """
 
 import math
@@ -21,25 +22,27 @@ from ur_family import CAP_COLOR, JOINT_COLOR, TUBE_COLOR, UrArm, UrLink
 
 LINK_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 BASE_MASS = 4.0
-"""Of all bases; assumed [kg]."""
+"""Mass of the base of all arms [kg]; an assumption."""
 
 
 @dataclass(frozen=True)
 class VisualShape:
-    """Cylinders that an arm is drawn with; all lengths in m, along z of the links unless said.
+    """Dimensions of the cylinders of an arm's visual geometry.
+
+    Ends are coordinates along z of the link.
 
     Attributes:
-        base: Radius and height.
-        shoulder: Radius, lower and upper end, length of the part along -y.
-        upper_arm: Radius, lower and upper end of the housing at the shoulder.
-        tube: Height and radius of the upper arm's tube.
-        elbow: Radius, lower and upper end of the upper arm's housing at the elbow.
-        forearm: Radius, lower and upper end of the forearm's housing at the elbow.
-        thin_tube: Height and radius of the forearm's tube.
-        wrist: Radius, lower and upper end of the forearm's housing at the wrist.
-        wrist_1: Lower and upper end, length of the part along -y.
-        wrist_2: Lower and upper end, length of the part along y.
-        wrist_3: Lower end.
+        base: Radius and height [m].
+        shoulder: Radius, lower end, upper end, and length of the part along -y [m].
+        upper_arm: Radius, lower end and upper end of the housing at the shoulder [m].
+        tube: Height and radius of the tube of the upper arm [m].
+        elbow: Radius, lower end and upper end of the upper arm's housing at the elbow [m].
+        forearm: Radius, lower end and upper end of the forearm's housing at the elbow [m].
+        thin_tube: Height and radius of the tube of the forearm [m].
+        wrist: Radius, lower end and upper end of the forearm's housing at the wrist [m].
+        wrist_1: Lower end, upper end, and length of the part along -y [m].
+        wrist_2: Lower end, upper end, and length of the part along y [m].
+        wrist_3: Lower end [m].
     """
 
     base: tuple[float, float]
@@ -57,13 +60,15 @@ class VisualShape:
     def visual_geometry(
         self, parameters: DenavitHartenberg
     ) -> tuple[tuple[LinkPrimitive, ...], ...]:
-        """Return the cylinders of each moving link."""
-        (_, a2, a3, *_), (d1, _, _, d4, d5, d6) = parameters.a, parameters.d
-        side, w = self.shoulder[3], self.wrist[0]
+        """Return the cylinders of each moving link, in its frame."""
+        _, a2, a3, *_ = parameters.a
+        d1, _, _, d4, d5, d6 = parameters.d
+        shoulder_length = self.shoulder[3]
+        wrist_radius = self.wrist[0]
         return (
             (
                 _vertical_cylinder(self.shoulder[:3]),
-                _cylinder((0, 0, d1), (0, -side, d1), self.shoulder[0]),
+                _cylinder((0, 0, d1), (0, -shoulder_length, d1), self.shoulder[0]),
             ),
             (
                 _vertical_cylinder(self.upper_arm),
@@ -76,14 +81,14 @@ class VisualShape:
                 _vertical_cylinder(self.wrist, a3),
             ),
             (
-                _vertical_cylinder((w, *self.wrist_1[:2])),
-                _cylinder((0, 0, d4), (0, -self.wrist_1[2], d4), w, CAP_COLOR),
+                _vertical_cylinder((wrist_radius, *self.wrist_1[:2])),
+                _cylinder((0, 0, d4), (0, -self.wrist_1[2], d4), wrist_radius, CAP_COLOR),
             ),
             (
-                _vertical_cylinder((w, *self.wrist_2[:2])),
-                _cylinder((0, 0, d5), (0, self.wrist_2[2], d5), w, CAP_COLOR),
+                _vertical_cylinder((wrist_radius, *self.wrist_2[:2])),
+                _cylinder((0, 0, d5), (0, self.wrist_2[2], d5), wrist_radius, CAP_COLOR),
             ),
-            (_cylinder((0, 0, self.wrist_3), (0, 0, d6), 0.85 * w, TUBE_COLOR),),
+            (_cylinder((0, 0, self.wrist_3), (0, 0, d6), 0.85 * wrist_radius, TUBE_COLOR),),
         )
 
 
@@ -91,18 +96,25 @@ def _cylinder(start: Point, end: Point, radius: float, color: str = JOINT_COLOR)
     return LinkPrimitive(start, end, radius, color)
 
 
-def _vertical_cylinder(extent: tuple[float, float, float], x: float = 0.0) -> LinkPrimitive:
-    radius, low, high = extent
+def _vertical_cylinder(dimensions: tuple[float, float, float], x: float = 0.0) -> LinkPrimitive:
+    """Return a cylinder along z from its radius, lower end and upper end [m]."""
+    radius, low, high = dimensions
     return _cylinder((x, 0.0, low), (x, 0.0, high), radius)
 
 
 def _tube(a: float, tube: tuple[float, float]) -> LinkPrimitive:
+    """Return a tube along a link of length a, from its height and radius [m]."""
     return _cylinder((0.1 * a, 0.0, tube[0]), (0.95 * a, 0.0, tube[0]), tube[1], TUBE_COLOR)
 
 
-def _parameters(a2: float, a3: float, *d: float) -> DenavitHartenberg:
-    a, d = (0.0, a2, a3, 0.0, 0.0, 0.0), (d[0], 0.0, 0.0, *d[1:])
-    return DenavitHartenberg(a, d, (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0))
+def _parameters(
+    a2: float, a3: float, d1: float, d4: float, d5: float, d6: float
+) -> DenavitHartenberg:
+    return DenavitHartenberg(
+        a=(0.0, a2, a3, 0.0, 0.0, 0.0),
+        d=(d1, 0.0, 0.0, d4, d5, d6),
+        alpha=(np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0),
+    )
 
 
 def _make_arm(
@@ -130,16 +142,22 @@ def _make_arm(
         for link, mass, center, torque, speed, collision, visual in zip(*columns, strict=True)
     )
     radius, height = shape.base
-    base_looks = (_cylinder((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),)
-    this = "models/generators/ur_e_series.py"
-    return UrArm(name, parameters, links, (base_collision_geometry,), base_looks, BASE_MASS, this)
+    return UrArm(
+        name=name,
+        parameters=parameters,
+        links=links,
+        base_collision_geometry=(base_collision_geometry,),
+        base_visual_geometry=(_cylinder((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),),
+        base_mass=BASE_MASS,
+        written_by="models/generators/ur_e_series.py",
+    )
 
 
 UR3E = _make_arm(
-    "ur3e",
-    _parameters(-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
-    (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
-    (
+    name="ur3e",
+    parameters=_parameters(a2=-0.24355, a3=-0.2132, d1=0.15185, d4=0.13105, d5=0.08535, d6=0.0921),
+    masses=(1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
+    centers=(
         (0.0, -0.02, 0.0),
         (0.13, 0.0, 0.1157),
         (0.05, 0.0, 0.0238),
@@ -147,9 +165,9 @@ UR3E = _make_arm(
         (0.0, 0.0, 0.01),
         (0.0, 0.0, -0.02),
     ),
-    (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
-    (180.0, 180.0, 180.0, 360.0, 360.0, 360.0),
-    VisualShape(
+    torques=(56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
+    speeds_deg=(180.0, 180.0, 180.0, 360.0, 360.0, 360.0),
+    shape=VisualShape(
         base=(0.053, 0.0890),
         shoulder=(0.045, 0.0960, 0.200, 0.061),
         upper_arm=(0.045, 0.066, 0.170),
@@ -162,8 +180,8 @@ UR3E = _make_arm(
         wrist_2=(0.0499, 0.115, 0.050),
         wrist_3=0.0504,
     ),
-    LinkPrimitive((0.0, 0.0, 0.0280), (-0.0001, -0.0008, 0.0419), 0.071),
-    (
+    base_collision_geometry=LinkPrimitive((0.0, 0.0, 0.0280), (-0.0001, -0.0008, 0.0419), 0.071),
+    collision_geometry=(
         (LinkPrimitive((-0.0008, -0.0005, 0.1467), (-0.0018, -0.0123, 0.1524), 0.070),),
         (
             LinkPrimitive((-0.0143, 0.0, 0.1199), (-0.001, 0.0004, 0.1144), 0.070),
@@ -182,10 +200,10 @@ UR3E = _make_arm(
 )
 
 UR5E = _make_arm(
-    "ur5e",
-    _parameters(-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
-    (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
-    (
+    name="ur5e",
+    parameters=_parameters(a2=-0.425, a3=-0.3922, d1=0.1625, d4=0.1333, d5=0.0997, d6=0.0996),
+    masses=(3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
+    centers=(
         (0.0, -0.02561, 0.00193),
         (0.2125, 0.0, 0.11336),
         (0.15, 0.0, 0.0265),
@@ -193,9 +211,9 @@ UR5E = _make_arm(
         (0.0, 0.0018, 0.01634),
         (0.0, 0.0, -0.001159),
     ),
-    (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
-    (180.0, 180.0, 180.0, 180.0, 180.0, 180.0),
-    VisualShape(
+    torques=(150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+    speeds_deg=(180.0, 180.0, 180.0, 180.0, 180.0, 180.0),
+    shape=VisualShape(
         base=(0.062, 0.0950),
         shoulder=(0.056, 0.1010, 0.216, 0.0730),
         upper_arm=(0.056, 0.076, 0.198),
@@ -208,8 +226,8 @@ UR5E = _make_arm(
         wrist_2=(0.0536, 0.137, 0.053),
         wrist_3=0.0560,
     ),
-    LinkPrimitive((0.0003, 0.0003, 0.0466), (0.0, 0.0, 0.0214), 0.079),
-    (
+    base_collision_geometry=LinkPrimitive((0.0003, 0.0003, 0.0466), (0.0, 0.0, 0.0214), 0.079),
+    collision_geometry=(
         (LinkPrimitive((-0.0002, -0.0032, 0.1553), (0.0, -0.0144, 0.162), 0.084),),
         (
             LinkPrimitive((0.0001, 0.0, 0.1342), (-0.0231, 0.0, 0.1379), 0.084),
@@ -234,13 +252,13 @@ _LARGE_WRISTS = (
     (LinkPrimitive((0.0, -0.0002, 0.1118), (-0.001, 0.0127, 0.1194), 0.072),),
     (LinkPrimitive((-0.0004, -0.0009, 0.0811), (0.0, -0.001, 0.0813), 0.051),),
 )
-"""Of UR10e and UR16e alike."""
+"""Capsules of the wrist links of UR10e and UR16e."""
 
 UR10E = _make_arm(
-    "ur10e",
-    _parameters(-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
-    (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
-    (
+    name="ur10e",
+    parameters=_parameters(a2=-0.6127, a3=-0.57155, d1=0.1807, d4=0.17415, d5=0.11985, d6=0.11655),
+    masses=(7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
+    centers=(
         (0.021, 0.0, 0.027),
         (0.38, 0.0, 0.158),
         (0.24, 0.0, 0.068),
@@ -248,9 +266,9 @@ UR10E = _make_arm(
         (0.0, 0.007, 0.018),
         (0.0, 0.0, -0.026),
     ),
-    (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
-    (120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
-    VisualShape(
+    torques=(330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
+    speeds_deg=(120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
+    shape=VisualShape(
         base=(0.090, 0.0917),
         shoulder=(0.070, 0.0917, 0.260, 0.083),
         upper_arm=(0.075, 0.086, 0.255),
@@ -263,8 +281,8 @@ UR10E = _make_arm(
         wrist_2=(0.062, 0.164, 0.0616),
         wrist_3=0.0660,
     ),
-    _LARGE_BASE,
-    (
+    base_collision_geometry=_LARGE_BASE,
+    collision_geometry=(
         _LARGE_SHOULDER,
         (
             LinkPrimitive((-0.0018, 0.0, 0.1635), (-0.0188, 0.0, 0.1761), 0.119),
@@ -281,10 +299,10 @@ UR10E = _make_arm(
 )
 
 UR16E = _make_arm(
-    "ur16e",
-    _parameters(-0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
-    (7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
-    (
+    name="ur16e",
+    parameters=_parameters(a2=-0.4784, a3=-0.36, d1=0.1807, d4=0.17415, d5=0.11985, d6=0.11655),
+    masses=(7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
+    centers=(
         (0.0, -0.016, 0.03),
         (0.302, 0.0, 0.16),
         (0.194, 0.0, 0.065),
@@ -292,9 +310,9 @@ UR16E = _make_arm(
         (0.0, 0.018, 0.012),
         (0.0, 0.0, -0.044),
     ),
-    (330.0, 330.0, 150.0, 54.0, 54.0, 54.0),
-    (120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
-    VisualShape(
+    torques=(330.0, 330.0, 150.0, 54.0, 54.0, 54.0),
+    speeds_deg=(120.0, 120.0, 180.0, 180.0, 180.0, 180.0),
+    shape=VisualShape(
         base=(0.090, 0.0917),
         shoulder=(0.070, 0.0917, 0.260, 0.083),
         upper_arm=(0.075, 0.086, 0.255),
@@ -307,8 +325,8 @@ UR16E = _make_arm(
         wrist_2=(0.062, 0.164, 0.0616),
         wrist_3=0.0660,
     ),
-    _LARGE_BASE,
-    (
+    base_collision_geometry=_LARGE_BASE,
+    collision_geometry=(
         _LARGE_SHOULDER,
         (
             LinkPrimitive((0.0013, 0.0, 0.1622), (-0.0194, -0.0005, 0.1762), 0.119),

@@ -1,7 +1,8 @@
-"""Arms of Universal Robots as models, from their Denavit-Hartenberg parameters.
+"""SDF models of Universal Robots arms from their Denavit-Hartenberg parameters.
 
-Frames: B the base as the controller has it, z up; L1 to L6 the links, L(i) being frame i - 1 of the
-convention turned by q(i), whose z is the axis of joint i. Frame `flange` is frame 6.
+Frames: B is the base as in the controller, z up; L1 to L6 are the links, where L(i) is
+Denavit-Hartenberg frame i - 1 rotated by q(i) about its z axis, the axis of joint i. Frame `flange`
+is frame 6.
 """
 
 import math
@@ -18,23 +19,24 @@ from drake_clutter.robots.ur_kinematics import (
 )
 
 JOINT_RANGE = 2 * math.pi
-"""Greatest angle of all joints, either way [rad] (data sheets)."""
-TUBE_COLOR, JOINT_COLOR, CAP_COLOR = "0.75 0.76 0.78 1", "0.58 0.60 0.63 1", "0.36 0.55 0.74 1"
-"""Colors."""
+"""Position limit of all joints in both directions [rad] (data sheets)."""
+TUBE_COLOR = "0.75 0.76 0.78 1"
+JOINT_COLOR = "0.58 0.60 0.63 1"
+CAP_COLOR = "0.36 0.55 0.74 1"
 
 
 @dataclass(frozen=True)
 class UrLink:
-    """A moving link.
+    """Moving link of a Universal Robots arm.
 
     Attributes:
-        name: As in the model.
-        mass: [kg].
-        p_DhCm: Center of mass in the frame of the convention that moves with the link [m].
-        max_torque: Of the joint before it [N m].
-        max_speed: Of the joint before it [rad/s].
-        collision_geometry: Capsules that cover it, in its frame L.
-        visual_geometry: Cylinders that it is drawn with, in its frame L.
+        name: Name of the link.
+        mass: Mass [kg].
+        p_DhCm: Center of mass in the Denavit-Hartenberg frame that moves with the link [m].
+        max_torque: Torque limit of the joint that moves the link [N m].
+        max_speed: Velocity limit of that joint [rad/s].
+        collision_geometry: Capsules that cover the link, in its frame L.
+        visual_geometry: Cylinders of the visual geometry, in frame L.
     """
 
     name: str
@@ -48,16 +50,16 @@ class UrLink:
 
 @dataclass(frozen=True)
 class UrArm:
-    """An arm of the family.
+    """Universal Robots arm.
 
     Attributes:
-        name: Of the model.
+        name: Name of the model.
         parameters: Denavit-Hartenberg parameters.
-        links: From the shoulder to wrist 3.
+        links: Moving links, from the shoulder to wrist 3.
         base_collision_geometry: Capsules that cover the base.
-        base_visual_geometry: Cylinders that the base is drawn with.
-        base_mass: [kg].
-        written_by: Module that has these numbers.
+        base_visual_geometry: Cylinders of the visual geometry of the base.
+        base_mass: Mass of the base [kg].
+        written_by: Module with these numbers and their sources.
     """
 
     name: str
@@ -72,16 +74,31 @@ class UrArm:
 def ur_sdf(arm: UrArm) -> str:
     """Return the SDF model of an arm, as text."""
     p_BCm = np.array([0.0, 0.0, arm.base_visual_geometry[-1].end[2] / 2])
-    made = [
-        ArmLink("base", arm.base_mass, p_BCm, arm.base_collision_geometry, arm.base_visual_geometry)
+    links = [
+        ArmLink(
+            name="base",
+            mass=arm.base_mass,
+            p_LCm=p_BCm,
+            collision_geometry=arm.base_collision_geometry,
+            visual_geometry=arm.base_visual_geometry,
+        )
     ]
     X_PL = np.eye(4)
     for number, (joint, link) in enumerate(zip(UR_JOINT_NAMES, arm.links, strict=True)):
         X_LDh = fixed_link_transform(arm.parameters, number)
-        p_LCm = X_LDh[:3, :3] @ np.array(link.p_DhCm) + X_LDh[:3, 3]
-        shape = link.mass, p_LCm, link.collision_geometry, link.visual_geometry
-        made.append(
-            ArmLink(link.name, *shape, joint, X_PL, JOINT_RANGE, link.max_torque, link.max_speed)
+        links.append(
+            ArmLink(
+                name=link.name,
+                mass=link.mass,
+                p_LCm=X_LDh[:3, :3] @ np.array(link.p_DhCm) + X_LDh[:3, 3],
+                collision_geometry=link.collision_geometry,
+                visual_geometry=link.visual_geometry,
+                joint=joint,
+                X_PL=X_PL,
+                max_angle=JOINT_RANGE,
+                max_torque=link.max_torque,
+                max_speed=link.max_speed,
+            )
         )
         X_PL = X_LDh
-    return arm_sdf(arm.name, arm.written_by, made, X_PL)
+    return arm_sdf(arm.name, arm.written_by, links, X_PL)

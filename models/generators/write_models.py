@@ -1,4 +1,7 @@
-"""Write the robot models of `models/robots`: python models/generators/write_models.py"""
+"""Write the SDF files of `models/robots`.
+
+Usage: python models/generators/write_models.py
+"""
 
 from pathlib import Path
 
@@ -8,10 +11,11 @@ from ur_e_series import E_SERIES
 from ur_family import ur_sdf
 
 ROBOTS = Path(__file__).parents[1] / "robots"
+"""Folder of the models."""
 
 
 def main() -> None:
-    """Write a file for each arm."""
+    """Write an SDF file for each arm."""
     texts = {"iiwa14": iiwa14_sdf(), "ur10": ur10_sdf()} | {
         arm.name: ur_sdf(arm) for arm in E_SERIES
     }
