@@ -51,8 +51,8 @@ _REFERENCE_SIDE = 0.70
 _CAMERA_POSITION = (0.45, -1.35, 1.10)
 _CAMERA_TARGET = (0.0, 0.0, 0.14)
 """Point that the camera looks at, in the tray frame [m]."""
-_CAMERA_POSITION_WITH_ARM = (0.75, -1.90, 1.40)
-_CAMERA_TARGET_WITH_ARM = (-0.15, 0.0, 0.36)
+_CAMERA_POSITION_WITH_ARM = (0.80, -2.10, 1.45)
+_CAMERA_TARGET_WITH_ARM = (-0.15, 0.0, 0.46)
 """Point that the camera looks at if the arm is shown, in the tray frame [m]."""
 _FOV_Y_DEG = 36.0
 _LIGHTS: dict[str, dict[str, Any]] = {

@@ -61,7 +61,7 @@ def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
         "stacks": f"{summary['mean_stacks']:.2f} per scene",
         "objects": f"{summary['mean_objects']:.2f} per scene",
         "largest stack": f"{summary['largest_stack_share']:.0%} of the objects of a scene (mean)",
-        "balanced": _fraction(summary["balanced_share"], None, "scenes"),
+        "balanced": _fraction(summary["balanced_share"], None, "scenes") + " (no dominant stack)",
         "class entropy": f"{summary['class_entropy']:.2f} bit",
         "objects by class": _counts(summary["classes"]),
         "unstable scenes": _counts(summary["instability_reasons"]),
