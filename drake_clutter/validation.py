@@ -202,7 +202,8 @@ def validate(schema: type[Schema], given: Any, source: str) -> Schema:
 
 
 def _message(schema: Any, error: ErrorDetails) -> str:
-    kind, loc = error["type"], error["loc"]
+    kind = error["type"]
+    loc = error["loc"]
     if kind in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
         owner, node = _locate(schema, loc[:-1])
         names = ", ".join(node.get("properties", {}))
@@ -253,7 +254,8 @@ def _describe_list(node: Mapping[str, Any]) -> str:
 def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
     """Return the path of a field as text, and its part of the schema's JSON schema."""
     document = _json_schema(schema)
-    field, node = "", _resolve_reference(document, document)
+    field = ""
+    node = _resolve_reference(document, document)
     for part in loc:
         if part == "[key]":  # of a mapping with a key that is not allowed
             break
@@ -333,7 +335,8 @@ def _parse_setting(setting: str, config: Any) -> Any:
     value = parse_yaml(text, f"--set {setting}", "FIELD=VALUE with a YAML value")
     parts = name.split(".")
     for depth in range(len(parts) - 1, -1, -1):
-        owner, part = _get_nested(config, parts[:depth]), parts[depth]
+        owner = _get_nested(config, parts[:depth])
+        part = parts[depth]
         if part in _POSE_FIELDS and {"translation", "rpy_deg"} <= _field_values(owner).keys():
             part, index = _POSE_FIELDS[part]
             value = _with_item(getattr(owner, part), index, value)

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from drake_clutter.scenes.scene import Scene
     from drake_clutter.tasks.exploration_task import Transition
 
-out_console, err_console = Console(), Console(stderr=True)
+out_console = Console()
+err_console = Console(stderr=True)
 
 
 def escape_markup(text: str) -> str:

@@ -124,16 +124,13 @@ def execute_moves(
     """
     backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
 
-    def next_move(
-        belief: Belief,
-        observation: Observation,
-        rng: np.random.Generator,
-    ) -> Decision:
-        number = len(belief.history)
-        if number == len(moves):
+    def next_move(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+        """Return the next move of the list; a `Policy`."""
+        index = len(belief.history)
+        if index == len(moves):
             return Decision(None)
-        _check_move(moves, number, [d.name for d in observation.detections], backend.scene)
-        return Decision(moves[number])
+        _check_move(moves, index, [d.name for d in observation.detections], backend.scene)
+        return Decision(moves[index])
 
     return run_episode(
         backend,
@@ -168,16 +165,13 @@ def plan_moves(
     rng = item_rng(seed)
     executor = ArmExecutor(config)
     plans = list[dict[str, Any]]()
-    for number, move in enumerate(moves):
-        _check_move(moves, number, [d.name for d in perception.observation.detections], scene)
+    for index, move in enumerate(moves):
+        _check_move(moves, index, [d.name for d in perception.observation.detections], scene)
         command = resolve_placement(move, perception.observation, config.exploration, rng)
         plan = (
             PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, move.place)
             if command is None
-            else executor.plan(
-                scene,
-                command,
-            )
+            else executor.plan(scene, command)
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(plan)})
     write_json(

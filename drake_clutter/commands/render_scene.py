@@ -45,7 +45,8 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
 def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
     """Write the images of one camera; return the visible fraction of each object."""
     camera = CameraRenderer(config)
-    images, visible_fractions = camera.render(scene), camera.visible_fractions(scene)
+    images = camera.render(scene)
+    visible_fractions = camera.visible_fractions(scene)
     depth = np.rint(images.depth / DEPTH_UNIT)
     depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
     Image.fromarray(images.color).save(out / f"{prefix}color.png")

@@ -131,7 +131,7 @@ def _illustrate_carry(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
         X_T_placed: Pose of the object at the end.
     """
     picked = scene[pick]
-    # Its lowest point may lie below its origin by as much as its farthest corner.
+    # The lowest point is below the origin by at most the distance of the farthest corner.
     reach = float(np.linalg.norm(picked.object_class.corners, axis=1).max())
     tops = [o.top_height for o in scene.objects if o.name != pick]
     height = max([picked.X_TO.p[2], X_T_placed.p[2], *(top + reach for top in tops)]) + _CLEARANCE
@@ -142,8 +142,8 @@ def _illustrate_carry(scene: Scene, pick: str, X_T_placed: Pose) -> list[Pose]:
     count = round(_CARRY_TIME * FRAMES_PER_SECOND)
     time_fraction = np.arange(count) / count
     smooth = time_fraction**2 * (3 - 2 * time_fraction)
-    poses = []
-    for leg in range(3):
+    poses = list[Pose]()
+    for leg in range(3):  # lift, carry, lower
         for s in smooth:
             rotation_fraction = (0.0, s, 1.0)[leg]
             poses.append(
@@ -182,7 +182,8 @@ def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Me
         animation.set_repetitions(_NUM_REPETITIONS)
         animation.set_autoplay(True)
         numbers = [round(frame.time * FRAMES_PER_SECOND) for frame in frames]
-        all_poses, q = list[dict[str, Pose]](), arm_positions[0] if arm_positions else ()
+        all_poses = list[dict[str, Pose]]()
+        q = arm_positions[0] if arm_positions else ()
         for frame in frames:
             q = (
                 frame.arm.q if frame.arm else q
@@ -293,19 +294,19 @@ def _key_frames(poses: Sequence[Pose]) -> list[tuple[int, Pose]]:
     """
     keys = [(0, poses[0])]
     for index, pose in enumerate(poses[1:], start=1):
-        last, held = keys[-1]
-        if _nearly_equal(held, pose):
+        last, held_pose = keys[-1]
+        if _nearly_equal(held_pose, pose):
             continue
         if last < index - 1:
-            keys.append((index - 1, held))
+            keys.append((index - 1, held_pose))
         keys.append((index, pose))
-    last, held = keys[-1]
-    return keys if last == len(poses) - 1 else [*keys, (len(poses) - 1, held)]
+    last, held_pose = keys[-1]
+    return keys if last == len(poses) - 1 else [*keys, (len(poses) - 1, held_pose)]
 
 
 def _nearly_equal(a: Pose, b: Pose) -> bool:
-    # A rotation by a small angle changes the unit quaternion by half the angle; q and -q are equal.
     """Return whether two poses may share a key frame."""
+    # A small rotation changes the unit quaternion by half its angle; q and -q are equal.
     angle = 2 * min(
         np.linalg.norm(np.subtract(a.quaternion, b.quaternion)),
         np.linalg.norm(np.add(a.quaternion, b.quaternion)),

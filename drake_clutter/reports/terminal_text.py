@@ -94,8 +94,8 @@ def describe_solution(solution: Mapping[str, Any]) -> dict[str, str]:
         rows["cannot be revealed"] = _names(solution["unrevealable"])
     if solution["confirmed"] is not None:
         rows["confirmed by Drake"] = "yes" if solution["confirmed"] else "no"
-    evaluated, budget = solution["moves_evaluated"], solution["budget"]
-    rows["search"] = f"{evaluated} of at most {budget} moves evaluated"
+    evaluated = solution["moves_evaluated"]
+    rows["search"] = f"{evaluated} of at most {solution['budget']} moves evaluated"
     return rows
 
 
