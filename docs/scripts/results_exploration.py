@@ -185,13 +185,35 @@ def _static_and_drake() -> str:
         seed=2000,
         results=["training/results/explorers_fast.json", "training/results/table2.json"],
     )
-    body = []
+    compared = []
+    others = []
     for static in read_training_results("explorers_fast.json")["rows"]:
         drake = settled.get((static["set"], static["agent"], static["episodes"]))
-        if drake is not None:
-            body.append(_comparison(static, drake))
+        if drake is None:
+            others.append(_static_row(static))
+        else:
+            compared.append(_comparison(static, drake))
     head = ["scene set", "policy", "scenes", "success in 10", "success in 20", "fraction found"]
-    return text + table([*head, "collapsed", "moves"], body)
+    text += table([*head, "collapsed", "moves"], compared)
+    text += (
+        "\n### Further policies\n\n"
+        "Clones before fine-tuning with the static stability model alone. SE\\*, cloning: behavior "
+        "cloning without DAgger.\n\n"
+    )
+    return text + table([*head, "collapsed", "moves"], others)
+
+
+def _static_row(row: Mapping[str, Any]) -> list[str]:
+    return [
+        row["set"],
+        policy_name(row["agent"]),
+        str(row["episodes"]),
+        estimate(row["within_10"], "success", "success_ci95"),
+        estimate(row["within_20"], "success", "success_ci95"),
+        number(row["within_20"]["found_of_hidden"]),
+        estimate(row["within_20"], "collapsed", "collapsed_ci95"),
+        number(row["moves_of_successes"], 1),
+    ]
 
 
 def _comparison(static: Mapping[str, Any], drake: Mapping[str, Any]) -> list[str]:

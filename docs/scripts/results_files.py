@@ -29,6 +29,8 @@ POLICIES = {
     "student-dagger": "SE\\*, DAgger",
     "student": "SE\\*",
     "student-14": "SE-14",
+    "student_14_dagger": "SE-14, DAgger",
+    "student_bc": "SE\\*, cloning",
     "full-knowledge": "oracle",
     "student_seed_1": "SE\\*, seed 1",
     "student_seed_2": "SE\\*, seed 2",
