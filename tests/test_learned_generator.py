@@ -122,7 +122,7 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
 def test_shipped_agents_hide_objects_in_stable_stacks(
     name: str, objects: str, hidden: float, fast: StaticStabilityJudge
 ) -> None:
-    """As the fast judge sees it; docs/generation.md has what Drake says of many more."""
+    """As the fast judge sees it; docs/results has what Drake says of many more."""
     agent, grammar, generator = (
         make_generation_agent(name, ClutterConfig()),
         GRAMMARS[objects],
