@@ -238,7 +238,7 @@ def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) ->
             "{motif: unicorns}",
             r"classes\.block\.label\.motif: 'unicorns'; allowed are dots, crackers",
         ),
-        ("{base: red}", r"classes\.block\.label\.base: 'red'; allowed is a colour"),
+        ("{base: red}", r"classes\.block\.label\.base: 'red'; allowed is a color"),
         ("{accent: '#12345'}", r"classes\.block\.label\.accent"),
         (
             "{title: A title that nobody could ever read}",

@@ -1,4 +1,4 @@
-"""Builds what Drake loads, one folder per object class, from a catalog: SDF model, collision pieces, textured visual."""
+"""Builder of the SDF models, collision pieces and textured visuals of a catalog's classes."""
 
 from drake_clutter.assets.asset_builder import build_assets, build_class
 from drake_clutter.assets.textures import MOTIFS

@@ -1,4 +1,4 @@
-"""The SDF model of an object class: exact inertia, hydroelastic collision geometry, textured visual."""
+"""Building the SDF model of an object class: inertia, collision geometry, textured visual."""
 
 import os
 import re
@@ -29,10 +29,17 @@ from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
 _BUILT_FILE = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
-# Edge of a cylinder's contact mesh, in radii. One that may lie needs a fine rim, or it becomes a prism (32 sides); for one
-# that always stands 16 do: the same verdicts as 32 on 20 stacks of cans, in about half the time.
-_LYING_MESH_RESOLUTION, _STANDING_MESH_RESOLUTION = 0.2, 0.4
-# Few pieces rather than close ones, since every piece costs simulation time: CoACD's own defaults give the example's mug 48.
+"""Names of the files that a build writes."""
+_LYING_MESH_RESOLUTION = 0.2
+"""Edge length of the contact mesh of a cylinder that may lie, in radii.
+
+Its rim has 32 sides; with fewer it would rest like a prism.
+"""
+_STANDING_MESH_RESOLUTION = 0.4
+"""Edge length of the contact mesh of a cylinder that always stands, in radii.
+
+Its rim has 16 sides, which halves the simulation time of stacks of cans.
+"""
 _COACD_OPTIONS = {
     "threshold": 0.06,
     "mcts_iterations": 20,
@@ -41,7 +48,12 @@ _COACD_OPTIONS = {
     "resolution": 1000,
     "seed": 1,
 }
+"""Options of CoACD for few pieces, as every piece costs simulation time.
+
+With its default options, CoACD makes 48 pieces of the example's mug.
+"""
 _CONVEX_VOLUME_RATIO = 0.999
+"""A mesh whose volume is at least this fraction of its hull's counts as convex."""
 
 _PACKAGE_XML = """<?xml version="1.0"?>
 <package format="2">
@@ -85,7 +97,12 @@ _MODEL_SDF = """<?xml version="1.0"?>
 
 @dataclass(frozen=True)
 class _Inertial:
-    """Centre of mass p_OBcm: (3,) m and inertia about it, expressed in O: (3, 3) kg m^2."""
+    """Mass distribution of a body with frame O.
+
+    Attributes:
+        com: Center of mass p_OBcm [m]. Shape (3,).
+        inertia: Inertia about the center of mass, expressed in O [kg m^2]. Shape (3, 3).
+    """
 
     com: NDArray[np.float64]
     inertia: NDArray[np.float64]
@@ -98,7 +115,7 @@ def _load_centered_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
-    """Of a solid of uniform density."""
+    """Return the mass distribution of a solid of uniform density."""
     mass = object_class.mass
     x, y, z = object_class.size
     if mesh is not None:
@@ -117,15 +134,18 @@ def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -
 
 
 def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Convex hulls that together cover the mesh (CoACD, Wei et al. 2022); one for a convex mesh."""
+    """Return convex hulls that cover a mesh; one for a convex mesh.
+
+    The decomposition is CoACD (Wei et al. 2022).
+    """
     if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
         return [mesh.convex_hull]
-    import coacd  # not above: loaded before Drake, it breaks Drake's SDF reader
+    import coacd  # here, because it breaks Drake's SDF reader when loaded before Drake
 
     coacd.set_log_level("error")
     pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
     low, high = mesh.bounds
-    # Clipped: what stacks on an object relies on its pieces ending where its bounding box does.
+    # Clipped, because objects are stacked on the bounding box.
     return [
         trimesh.Trimesh(np.clip(vertices, low, high), faces).convex_hull
         for vertices, faces in pieces
@@ -175,7 +195,7 @@ def _collisions_sdf(object_class: ObjectClass, num_pieces: int) -> str:
 
 
 def _make_asset_files(object_class: ObjectClass) -> dict[str, str]:
-    """Contents of every file of a class, by name."""
+    """Return the contents of every file of a class, by file name."""
     mesh = _load_centered_mesh(object_class.mesh) if object_class.mesh else None
     texture = draw_texture(object_class)
     if mesh is not None:
@@ -209,13 +229,14 @@ def _comment_text(text: str) -> str:
 
 
 def build_class(object_class: ObjectClass, folder: Path) -> Path:
-    """Builds one class into `<folder>/<class>/`, replacing an earlier build.
+    """Build a class into `<folder>/<class>/`, replacing an earlier build.
 
     Returns:
-        The folder that it made; it holds `model.sdf`, `visual.gltf` and a mesh's `convex_000.obj`, ...
+        The folder of the class, with `model.sdf`, `visual.gltf` and, for a mesh,
+        `convex_000.obj`, ...
 
     Raises:
-        InputError: the folder holds files that no build makes, or its label cannot be drawn.
+        InputError: The folder holds other files, or the label cannot be drawn.
     """
     target = folder / object_class.name
     if target.exists():
@@ -226,7 +247,8 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
         )
         if foreign_files:
             raise InputError(
-                f"{target}: holds {sorted(foreign_files)[0]}; allowed is a folder that only `assets build` fills"
+                f"{target}: holds {sorted(foreign_files)[0]}; "
+                "allowed is a folder that only `assets build` fills"
             )
     files = _make_asset_files(object_class)
     staging = folder / f".{object_class.name}.{secrets.token_hex(4)}"
@@ -242,17 +264,17 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
 
 
 def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]:
-    """Builds the classes of an asset folder's own catalog, and its `package.xml`.
+    """Build the classes of an asset folder's own catalog, and its `package.xml`.
 
     Args:
-        folder: holds `catalog.yaml`.
-        names: the classes to build; None for all.
+        folder: The asset folder, which holds `catalog.yaml`.
+        names: Names of the classes to build, or None for all.
 
     Returns:
-        The folders made, one per class, in the catalog's order.
+        The folders of the classes, in the order of the catalog.
 
     Raises:
-        InputError: a broken catalog, a class that it does not hold, or a folder that may not be written.
+        InputError: The catalog is invalid, does not hold a class, or the folder is not writable.
     """
     folder = folder.resolve()
     own_classes = {
@@ -263,7 +285,8 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
     unknown = sorted(set(names or ()) - set(own_classes))
     if unknown:
         raise InputError(
-            f"{catalog_path(folder)}: classes: no {unknown[0]}; allowed are {', '.join(own_classes)}"
+            f"{catalog_path(folder)}: classes: no {unknown[0]}; "
+            f"allowed are {', '.join(own_classes)}"
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")

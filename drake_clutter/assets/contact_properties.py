@@ -1,26 +1,28 @@
-"""The contact properties of everything that Drake simulates here (DRAKE_NOTES, "Verdicts")."""
+"""Contact properties of everything that is simulated in Drake."""
 
 HYDROELASTIC_MODULUS = 1e8
-"""Pa; softer objects buckle under a stack, harder ones need a shorter time step."""
+"""Hydroelastic modulus [Pa].
+
+Softer objects buckle under a stack; harder ones need a shorter time step.
+"""
 DISSIPATION = 10.0
-"""s/m, Hunt-Crossley: objects settle without bouncing."""
+"""Hunt-Crossley dissipation, with which objects settle without bouncing [s/m]."""
 SURFACE_FRICTION = 0.5
-"""Coulomb coefficient, static and dynamic, of every surface."""
+"""Coulomb coefficient of every surface, static and dynamic."""
 
 
 def proximity_properties_sdf(resolution_hint: float, *, compliant: bool) -> str:
-    """The SDF element of hydroelastic contact properties.
+    """Return the SDF element with the hydroelastic contact properties.
 
     Args:
-        resolution_hint: m, edge of the contact mesh.
-        compliant: False for a rigid surface.
+        resolution_hint: Edge length of the contact mesh [m].
+        compliant: Whether the geometry is compliant; otherwise it is rigid.
     """
     rigidity = "compliant" if compliant else "rigid"
-    modulus = (
-        f"\n          <drake:hydroelastic_modulus>{HYDROELASTIC_MODULUS:g}</drake:hydroelastic_modulus>"
-        if compliant
-        else ""
-    )
+    modulus = ""
+    if compliant:
+        tag = "drake:hydroelastic_modulus"
+        modulus = f"\n          <{tag}>{HYDROELASTIC_MODULUS:g}</{tag}>"
     return f"""        <drake:proximity_properties>
           <drake:{rigidity}_hydroelastic/>{modulus}
           <drake:mesh_resolution_hint>{resolution_hint:.6g}</drake:mesh_resolution_hint>

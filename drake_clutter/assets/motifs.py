@@ -1,4 +1,4 @@
-"""The pictures that products carry: each motif draws one piece (a cracker, a bean), and the label is strewn with it."""
+"""The motifs of product labels: each draws one piece, and a label is covered with pieces."""
 
 import math
 import random
@@ -8,18 +8,20 @@ from dataclasses import dataclass
 from PIL import ImageDraw
 
 Point = tuple[float, float]
+"""A point (x, y)."""
 
 
 @dataclass(frozen=True)
 class MotifPen:
-    """Draws one piece in its own coordinates: the piece fits the unit circle, x right, y down.
+    """Draws one piece in its own coordinates: the unit circle, with x right and y down.
 
     Attributes:
-        draw: the picture.
-        center, radius: pixels, where the piece lies and how large it is.
-        angle: rad, how it is turned.
-        accent: the label's accent colour.
-        rng: for what differs between pieces.
+        draw: The picture.
+        center: Center of the piece [pixels].
+        radius: Radius of the piece [pixels].
+        angle: Rotation of the piece [rad].
+        accent: Accent color of the label.
+        rng: Random generator for differences between pieces.
     """
 
     draw: ImageDraw.ImageDraw
@@ -34,16 +36,16 @@ class MotifPen:
         return [(self.center[0] + c * x - s * y, self.center[1] + s * x + c * y) for x, y in points]
 
     def polygon(self, points: Sequence[Point], fill: str) -> None:
-        """A filled polygon."""
+        """Draw a filled polygon."""
         self.draw.polygon(self._pixels(points), fill=fill)
 
     def oval(self, x: float, y: float, a: float, b: float, fill: str) -> None:
-        """A filled ellipse with centre (x, y) and half axes a, b."""
+        """Draw a filled ellipse with center (x, y) and half axes a and b."""
         turns = [2 * math.pi * i / 28 for i in range(28)]
         self.polygon([(x + a * math.cos(t), y + b * math.sin(t)) for t in turns], fill)
 
     def line(self, points: Sequence[Point], fill: str, width: float) -> None:
-        """An open line of the given width."""
+        """Draw an open line of a given width."""
         self.draw.line(
             self._pixels(points), fill=fill, width=max(1, round(width * self.radius)), joint="curve"
         )
@@ -208,14 +210,14 @@ def _marker_stroke(pen: MotifPen) -> None:
 
 @dataclass(frozen=True)
 class Motif:
-    """What a label is strewn with.
+    """What a label is covered with.
 
     Attributes:
-        draw_piece: draws one piece.
-        radius: of a piece, as a share of the shorter side of the picture.
-        random_orientation: every piece lies as it fell; else all are upright.
-        background: behind the pieces; the label's accent colour when empty.
-        plastic_lid: a can of it is closed by a lid with its title; else by a metal one.
+        draw_piece: Draws one piece.
+        radius: Radius of a piece, as a fraction of the shorter side of the picture.
+        random_orientation: Whether pieces are scattered with random rotations, or upright in rows.
+        background: Color behind the pieces; the label's accent color when empty.
+        plastic_lid: Whether a can has a plastic lid with its title instead of a metal end.
     """
 
     draw_piece: Callable[[MotifPen], None]
@@ -242,12 +244,20 @@ MOTIFS: dict[str, Motif] = {
     "crisps": Motif(_crisp, 0.22, plastic_lid=True),
     "marker": Motif(_marker_stroke, 0.30, random_orientation=False),
 }
+"""The motifs by name."""
 
 
 def scatter_motif(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], motif: Motif, accent: str
 ) -> None:
-    """Fills a picture of `size` (width, height) pixels with the motif's pieces; the same picture every time."""
+    """Fill a picture with the pieces of a motif. The result is deterministic.
+
+    Args:
+        draw: The picture.
+        size: Width and height of the picture [pixels].
+        motif: The motif.
+        accent: Accent color of the label.
+    """
     width, height = size
     draw.rectangle((0, 0, width, height), fill=motif.background or accent)
     radius = motif.radius * min(size)
@@ -259,10 +269,10 @@ def scatter_motif(
         for i in range(columns + motif.random_orientation)
     ]
     if motif.random_orientation:
-        rng.shuffle(cells)  # pieces overlap in no order
+        rng.shuffle(cells)  # so that pieces overlap in random order
     for i, j in cells:
         jitter = 0.18 * radius if motif.random_orientation else 0.0
-        # Strewn pieces run over the edge; upright ones are centred in their cells.
+        # Scattered pieces run over the edge; upright ones are centered in their cells.
         offset = 0.0 if motif.random_orientation else 0.5
         center = (
             (i + offset) * width / columns + rng.uniform(-jitter, jitter),

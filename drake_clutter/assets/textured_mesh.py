@@ -1,7 +1,7 @@
-"""Visual geometry with texture coordinates, written as a self-contained glTF 2.0 file.
+"""Visual geometry with texture coordinates, as a self-contained glTF 2.0 file.
 
-Texture coordinates follow glTF: (0, 0) is the picture's upper left corner, (1, 1) its lower right one. A region
-(u0, v0, u1, v1) is a rectangle of the picture.
+Texture coordinates follow glTF: (0, 0) is the upper left corner of the picture, (1, 1) the lower
+right one. A region (u0, v0, u1, v1) is a rectangle of the picture.
 """
 
 import base64
@@ -15,10 +15,14 @@ import trimesh
 from numpy.typing import NDArray
 
 Region = tuple[float, float, float, float]
+"""A rectangle (u0, v0, u1, v1) of a picture."""
 Floats = NDArray[np.float64]
+"""An array of floats."""
 
 _NUM_SEGMENTS = 48
-# Which way a face's picture runs to the right and up, in O; their cross product is the outward normal.
+"""Segments of a cylinder's circumference."""
+# Axes in O along which a face's picture runs to the right and up. Their cross product is the
+# outward normal.
 _FACE_AXES = {
     "front": ((0, 1, 0), (0, 0, 1)),
     "back": ((0, -1, 0), (0, 0, 1)),
@@ -34,10 +38,10 @@ class TexturedMesh:
     """A textured triangle mesh in O.
 
     Attributes:
-        points: (V, 3) m.
-        normals: (V, 3) unit vectors.
-        uv: (V, 2) texture coordinates.
-        triangles: (F, 3) indices of points, counter-clockwise seen from outside.
+        points: Vertices [m]. Shape (V, 3).
+        normals: Unit normals of the vertices. Shape (V, 3).
+        uv: Texture coordinates of the vertices. Shape (V, 2).
+        triangles: Vertex indices, counter-clockwise seen from outside. Shape (F, 3).
     """
 
     points: Floats
@@ -57,7 +61,12 @@ def _concatenate(parts: list[TexturedMesh]) -> TexturedMesh:
 
 
 def box_mesh(size: tuple[float, float, float], regions: dict[str, Region]) -> TexturedMesh:
-    """A box of `size` (3,) m; `regions` names the picture of front (+x), back, right (+y), left, top (+z) and bottom."""
+    """Return a textured box.
+
+    Args:
+        size: Extents [m]. Shape (3,).
+        regions: Regions for front (+x), back, right (+y), left, top (+z) and bottom.
+    """
     half = np.asarray(size) / 2
     parts = []
     for face, (right, up) in _FACE_AXES.items():
@@ -79,9 +88,14 @@ def box_mesh(size: tuple[float, float, float], regions: dict[str, Region]) -> Te
 
 
 def cylinder_mesh(size: tuple[float, float, float], regions: dict[str, Region]) -> TexturedMesh:
-    """A cylinder of `size` (diameter, diameter, height) m; `regions` names the picture of side, top and bottom.
+    """Return a textured cylinder.
 
-    The side's picture starts at -y and runs counter-clockwise seen from above, so that +x lies at a quarter of its width.
+    The picture of the side starts at -y and runs counter-clockwise seen from above, so that +x is
+    at a quarter of its width.
+
+    Args:
+        size: Diameter, diameter and height [m].
+        regions: Regions for side, top and bottom.
     """
     half = np.asarray(size) / 2
     turns = np.linspace(0, 1, _NUM_SEGMENTS + 1)
@@ -114,7 +128,10 @@ def cylinder_mesh(size: tuple[float, float, float], regions: dict[str, Region]) 
 
 
 def map_strip_texture(mesh: trimesh.Trimesh, region: Region) -> TexturedMesh:
-    """A user's mesh in O; its texture runs with the height, from the bottom of `region` to its top."""
+    """Return a mesh in O whose texture coordinates follow the height.
+
+    The bottom of the mesh has the color at the bottom of the region, its top that at the top.
+    """
     shaded = trimesh.graph.smooth_shade(mesh, angle=math.radians(30))
     points = np.asarray(shaded.vertices, float)
     low, high = mesh.bounds[:, 2]
@@ -131,10 +148,9 @@ def _data_uri(kind: str, data: bytes) -> str:
 
 
 def gltf_text(surface: TexturedMesh, texture_png: bytes) -> str:
-    """The surface with its PNG texture as the text of one glTF file that refers to no other file."""
-    y_up = np.array(
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-    )  # glTF's up is y, and Drake turns it back to z
+    """Return the content of one glTF file with an embedded PNG texture."""
+    # The y axis of glTF points up; Drake rotates it back to z.
+    y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     arrays: list[tuple[NDArray[Any], str, int]] = [
         ((surface.points @ y_up.T).astype("<f4"), "VEC3", 34962),
         ((surface.normals @ y_up.T).astype("<f4"), "VEC3", 34962),
@@ -183,7 +199,8 @@ def gltf_text(surface: TexturedMesh, texture_png: bytes) -> str:
             }
         ],
         "textures": [{"sampler": 0, "source": 0}],
-        # Linear, without mipmaps: with them, Mesa's software renderer never returns from a face that is seen exactly edge-on.
+        # Linear, without mipmaps: with mipmaps, Mesa's software renderer hangs on a face that is
+        # seen exactly edge-on.
         "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
         "images": [{"uri": _data_uri("image/png", texture_png)}],
         "accessors": accessors,

@@ -1,7 +1,8 @@
-"""Draws the label of an object class: one picture that holds all its faces.
+"""The label of an object class: one picture with all its faces.
 
-A box's picture is front and two sides with the top above them; the back repeats the front, the bottom the top. A can's is
-the unrolled wrapper with the two ends above it. Everything is drawn larger and scaled down, which smooths the edges.
+The picture of a box holds front and two sides, with the top above them; the back repeats the front,
+the bottom the top. The picture of a can holds the unrolled wrapper with the two ends above it.
+Everything is drawn at a higher resolution and scaled down, which smooths the edges.
 """
 
 import io
@@ -32,11 +33,12 @@ _INK_COLOR = "#1c1c1c"
 
 @dataclass(frozen=True)
 class Texture:
-    """A drawn label.
+    """A label.
 
     Attributes:
-        image: all faces in one picture.
-        regions: of a box: front, back, right, left, top, bottom; of anything else: side, top, bottom.
+        image: All faces in one picture.
+        regions: Regions of a box's front, back, right, left, top and bottom, or of the side, top
+            and bottom of other shapes.
     """
 
     image: Image.Image
@@ -45,7 +47,12 @@ class Texture:
 
 @dataclass(frozen=True)
 class _Panel:
-    """One face while it is drawn; `pixels_per_mm` is the number of pixels per millimetre."""
+    """One face while it is drawn.
+
+    Attributes:
+        image: The picture.
+        pixels_per_mm: Resolution.
+    """
 
     image: Image.Image
     pixels_per_mm: float
@@ -66,7 +73,7 @@ class _Panel:
     def draw_rectangle(
         self, left: float, top: float, right: float, bottom: float, fill: str
     ) -> None:
-        """Sides as shares of the panel's width and height."""
+        """Draw a rectangle; the sides are fractions of the panel's width and height."""
         w, h = self.size
         ImageDraw.Draw(self.image).rectangle(
             (left * w, top * h, right * w - 1, bottom * h - 1), fill=fill
@@ -93,7 +100,11 @@ class _Panel:
         *,
         allow_rotation: bool = True,
     ) -> None:
-        """As large as fits: in one line or one word a line, and turned to read upwards where that is larger."""
+        """Draw text as large as possible.
+
+        It is set in one line, or with one word in each line, and rotated to read upwards where it
+        is larger then. The sides of the area are fractions of the panel's width and height.
+        """
         w, h = self.size
         box = ((right - left) * w, (bottom - top) * h)
         choices = [
@@ -144,7 +155,7 @@ def _text_mask(lines: str, size: int) -> Image.Image:
 
 
 def _draw_nutrition_table(width: int, height: int) -> Image.Image:
-    """A white table: heading, rule, rows of grey words and numbers."""
+    """Return a white table: heading, rule, rows of gray words and numbers."""
     table = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(table)
     w, h = table.size
@@ -178,7 +189,7 @@ def _draw_barcode(width: int, height: int) -> Image.Image:
 
 
 def _draw_front(panel: _Panel, label: LabelDesign, title: str, mass: float) -> None:
-    """Title above, picture below, weight at the foot."""
+    """Draw the title on top, the motif below, and the weight at the bottom."""
     panel.draw_rectangle(0, 0, 1, 0.035, label.accent)
     slim = panel.size[1] > 2.5 * panel.size[0]
     foot = 0.42 if slim else 0.36
@@ -218,7 +229,7 @@ def _box_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str,
 
 
 def _draw_wrapper(panel: _Panel, label: LabelDesign, title: str, mass: float) -> None:
-    """Two fronts, between them the nutrition table and the bar code."""
+    """Draw two fronts, and between them the nutrition table and the bar code."""
     w, h = panel.size
     panel.draw_motif(label.motif, label.accent, 0, 0.5, 1, 0.92)
     panel.draw_rectangle(0, 0.47, 1, 0.5, label.accent)
@@ -240,7 +251,7 @@ def _draw_wrapper(panel: _Panel, label: LabelDesign, title: str, mass: float) ->
 
 
 def _draw_metal_end(panel: _Panel) -> None:
-    """Concentric pressed rings."""
+    """Draw concentric pressed rings."""
     draw = ImageDraw.Draw(panel.image)
     w = panel.size[0]
     rings = (
@@ -291,7 +302,10 @@ def _can_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str,
 
 
 def _marker_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str, _Panel]:
-    """A barrel with the title along it, a cap on the upper third and a plug below."""
+    """Return the faces of a marker.
+
+    The barrel has the title along it, a cap on the upper third, and a plug at the bottom.
+    """
     label = object_class.label
     diameter, _, height = (1000 * side for side in object_class.size)
     side = _Panel.blank(math.pi * diameter, height, unit, label.base)
@@ -305,20 +319,24 @@ def _marker_panels(object_class: ObjectClass, title: str, unit: float) -> dict[s
 
 
 def _mesh_panels(object_class: ObjectClass, unit: float) -> dict[str, _Panel]:
-    """A strip over the height: the body's colour with a band of the accent below the top."""
+    """Return a strip over the height, with a band in the accent color below the top."""
     side = _Panel.blank(20, 200, unit, object_class.label.base)
     side.draw_rectangle(0, 0.12, 1, 0.30, object_class.label.accent)
     return {"side": side, "top": side, "bottom": side}
 
 
 def _check_label(object_class: ObjectClass) -> tuple[LabelDesign, str]:
-    """Its label, and the title to draw."""
+    """Return the label of a class, and the title to draw.
+
+    Raises:
+        InputError: A field of the label cannot be drawn.
+    """
     label = object_class.label
     where = f"{catalog_path(object_class.folder.parent)}: classes.{object_class.name}.label"
     for field in ("base", "accent"):
         if not re.fullmatch(r"#[0-9a-fA-F]{6}", getattr(label, field)):
             raise InputError(
-                f'{where}.{field}: {getattr(label, field)!r}; allowed is a colour such as "#c8102e"'
+                f'{where}.{field}: {getattr(label, field)!r}; allowed is a color such as "#c8102e"'
             )
     if label.motif not in MOTIFS:
         raise InputError(f"{where}.motif: {label.motif!r}; allowed are {', '.join(MOTIFS)}")
@@ -330,7 +348,7 @@ def _check_label(object_class: ObjectClass) -> tuple[LabelDesign, str]:
 
 
 def _atlas_size(object_class: ObjectClass) -> tuple[float, float]:
-    """Width and height of all faces together, mm."""
+    """Return the width and height of all faces together [mm]."""
     x, y, z = (1000 * side for side in object_class.size)
     if object_class.shape is Shape.BOX:
         return y + 2 * x, z + x
@@ -340,10 +358,10 @@ def _atlas_size(object_class: ObjectClass) -> tuple[float, float]:
 
 
 def draw_texture(object_class: ObjectClass) -> Texture:
-    """Draws the label of a class; the same picture every time.
+    """Return the label of a class. The result is deterministic.
 
     Raises:
-        InputError: a field of its label that cannot be drawn.
+        InputError: A field of the label cannot be drawn.
     """
     label, title = _check_label(object_class)
     scale = min(_MAX_PIXELS_PER_MM, _TEXTURE_SIDE / max(_atlas_size(object_class)))
@@ -370,7 +388,7 @@ def draw_texture(object_class: ObjectClass) -> Texture:
         for name in row:
             image = panels[name].image
             atlas.paste(image, (x, y))
-            # Half a pixel of the final picture in from the edge, or the neighbour's colour bleeds in.
+            # Half a final pixel inside of the edge, so that colors of neighbors do not bleed in.
             inset = _OVERSAMPLING / 2
             edges = (x + inset, y + inset, x + image.width - inset, y + image.height - inset)
             regions[name] = (
@@ -387,7 +405,7 @@ def draw_texture(object_class: ObjectClass) -> Texture:
 
 
 def encode_png(image: Image.Image) -> bytes:
-    """The picture as a PNG with a palette, which keeps it small."""
+    """Return a picture as a PNG file with a palette, which keeps it small."""
     buffer = io.BytesIO()
     image.quantize(_PALETTE_SIZE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

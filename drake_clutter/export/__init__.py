@@ -1,4 +1,4 @@
-"""A scene as a folder that other programs open: Drake, SDFormat simulators, MuJoCo, glTF viewers."""
+"""Export of a scene as a folder for Drake, SDFormat simulators, MuJoCo or glTF viewers."""
 
 from drake_clutter.export.export_folder import ExportFormat, export_scene
 

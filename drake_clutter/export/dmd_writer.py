@@ -1,4 +1,4 @@
-"""A scene as Drake model directives, with the models that they name."""
+"""Export of a scene as Drake model directives, with the models that they name."""
 
 import shutil
 from pathlib import Path
@@ -13,7 +13,7 @@ from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 PACKAGE = "drake_clutter_scene"
-"""The name of the package that an exported folder is."""
+"""Name of the package that an exported folder forms."""
 
 _PACKAGE_XML = f"""<?xml version="1.0"?>
 <package format="2">
@@ -27,14 +27,16 @@ _PACKAGE_XML = f"""<?xml version="1.0"?>
 
 
 def write_dmd(scene: Scene, folder: Path) -> Path:
-    """Writes `scene.dmd.yaml`, `package.xml`, `tray.sdf` and a folder per class; the models are the classes' own."""
+    """Write `scene.dmd.yaml`, `package.xml`, `tray.sdf` and a folder for each class.
+
+    The models are those of the catalog. Returns the path of `scene.dmd.yaml`.
+    """
     for object_class in classes_in_scene(scene):
         target = folder / object_class.name
         target.mkdir()
         for file in object_class.folder.iterdir():
-            shutil.copyfile(
-                file, target / file.name
-            )  # not copytree: an installed package's modes may be read-only
+            # copytree would copy the modes too, which may be read-only in an installed package.
+            shutil.copyfile(file, target / file.name)
     (folder / "tray.sdf").write_text(support_sdf(scene.support), encoding="utf-8")
     (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
     directives = [

@@ -1,4 +1,4 @@
-"""The folder of an export: written aside, and filled in one go."""
+"""The folder of an export, which appears complete or not at all."""
 
 import os
 import re
@@ -22,7 +22,7 @@ _RESERVED_NAME = re.compile(
 
 
 class ExportFormat(Enum):
-    """What a scene can be exported as."""
+    """Formats in which a scene can be exported."""
 
     DMD = "dmd"
     SDF = "sdf"
@@ -39,34 +39,36 @@ _WRITERS = {
 
 
 def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
-    """Writes a scene as a folder that refers to nothing outside of it, so that it may be moved or sent.
+    """Write a scene to a folder that refers to no files outside of it.
 
-    The world frame of every format is the tray frame T.
+    The world frame of every format is the support's frame T.
 
     Args:
-        scene: the scene; the tray and every object at its X_TO are written.
-        format: of which program.
-        out: an existing, empty folder; stays empty when the export fails.
+        scene: The scene: the support, and every object at its X_TO.
+        format: The format.
+        out: An existing, empty folder. It stays empty if the export fails.
 
     Returns:
         The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml` or `scene.glb` in `out`.
 
     Raises:
-        InputError: an object's name that not every program could take, or a class without built assets.
+        InputError: A format does not allow an object's name, or a class has no built assets.
     """
     for name in scene.names:
         if not _VALID_NAME.fullmatch(name) or _RESERVED_NAME.fullmatch(name):
+            reserved = _RESERVED_NAME.pattern.replace("|", ", ")
             raise InputError(
-                f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, and . - or blanks "
-                f"between them, and no name that a format reserves ({_RESERVED_NAME.pattern.replace('|', ', ')})"
+                f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, "
+                "and . - or blanks between them, "
+                f"and no name that a format reserves ({reserved})"
             )
     for object_class in classes_in_scene(scene):
-        _ = object_class.model_path  # says what is wrong before anything is written
+        _ = object_class.model_path  # raises before anything is written
     staging = out / f".export.{secrets.token_hex(4)}"
     staging.mkdir()
     try:
         main_file = _WRITERS[format](scene, staging)
-        # The file to open comes last: where it is, the export is complete.
+        # The file to open is moved last, so that its presence means a complete export.
         for entry in sorted(staging.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
             os.replace(entry, out / entry.name)
     finally:

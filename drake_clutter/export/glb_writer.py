@@ -1,4 +1,4 @@
-"""A scene as one binary glTF file, for viewers, modelling programs and web pages."""
+"""Export of a scene as a binary glTF file, for viewers, modeling programs and web pages."""
 
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
@@ -19,14 +19,14 @@ from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 ROOT_NODE = "tray_frame"
-"""The node of the tray frame T."""
+"""Name of the node of the support's frame T."""
 
 
 def _add_tray(picture: trimesh.Scene, support: Support) -> None:
     picture.graph.update(frame_to=TRAY, frame_from=ROOT_NODE, matrix=np.eye(4))
     for tray_box in support_boxes(support):
         box = trimesh.creation.box(tray_box.size)
-        # glTF takes for metal whatever does not say otherwise.
+        # A glTF material is metallic by default.
         material = trimesh.visual.material.PBRMaterial(
             baseColorFactor=tray_box.color, metallicFactor=0.0, roughnessFactor=0.8
         )
@@ -38,9 +38,10 @@ def _add_tray(picture: trimesh.Scene, support: Support) -> None:
 
 
 def write_glb(scene: Scene, folder: Path) -> Path:
-    """Writes `scene.glb`: the tray and every object as a named node below the node `tray_frame`.
+    """Write `scene.glb`: the support and every object as a named node below the node `tray_frame`.
 
-    glTF's up is y; `tray_frame` turns T's z there. The pose of an object's node in `tray_frame` is X_TO.
+    The y axis of glTF points up; `tray_frame` maps T's z axis to it. The pose of an object's node
+    in `tray_frame` is X_TO. Returns the path of `scene.glb`.
     """
     picture = trimesh.Scene()
     picture.graph.update(frame_to=ROOT_NODE, matrix=np.linalg.inv(Y_UP_TO_Z_UP))

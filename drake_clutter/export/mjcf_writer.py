@@ -1,4 +1,4 @@
-"""A scene as an MJCF model for MuJoCo."""
+"""Export of a scene as an MJCF model for MuJoCo."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,12 +20,14 @@ from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 
 def _add_defaults(root: Element) -> None:
     default = SubElement(root, "default")
-    # Masses come from the inertials alone; a shell's are found for any mesh, also for one that is not closed.
+    # Masses come from the inertials. The shell inertia avoids an error for meshes that are not
+    # closed.
     SubElement(default, "mesh", inertia="shell")
     visual = SubElement(default, "default", {"class": "visual"})
     SubElement(visual, "geom", type="mesh", group="2", contype="0", conaffinity="0")
     collision = SubElement(default, "default", {"class": "collision"})
-    # MuJoCo's own torsional and rolling coefficients; a contact has the larger friction of its two geoms.
+    # The torsional and rolling coefficients are MuJoCo's defaults. A contact gets the larger
+    # friction of its two geoms.
     SubElement(
         collision, "geom", group="3", friction=format_numbers([SURFACE_FRICTION, 0.005, 0.0001])
     )
@@ -49,7 +51,7 @@ def _add_tray(worldbody: Element, support: Support) -> None:
             "pos": format_numbers(box.p_TG),
             "rgba": format_numbers(box.color),
         }
-        # Seen as well as touched, so it is in the group of the visuals.
+        # The geometry is visible, too, so it is in the group of the visuals.
         SubElement(
             tray,
             "geom",
@@ -90,7 +92,10 @@ def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[
 
 
 def write_mjcf(scene: Scene, folder: Path) -> Path:
-    """Writes `scene.xml` and a folder of meshes per class. Visuals are in group 2, collision geometry in group 3."""
+    """Write `scene.xml` and a folder of meshes for each class, and return the path of `scene.xml`.
+
+    Visuals are in group 2, collision geometry is in group 3.
+    """
     root = Element("mujoco", model="scene")
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     _add_defaults(root)

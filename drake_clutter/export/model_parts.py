@@ -1,4 +1,4 @@
-"""What the formats share: the parts of built class models and of the tray, as data and as files."""
+"""Parts of built models and of the support that the exporters share."""
 
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
@@ -20,9 +20,10 @@ from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
+"""An array of floats."""
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""(4, 4): points of a glTF file, whose up is y by its specification, in a frame whose up is z."""
+"""Transform (4, 4) from a glTF file, whose y axis points up, to a frame whose z axis does."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Inertial:
     """Mass properties of a body with frame O.
 
     Attributes:
-        mass: kg.
-        com: (3,) m, p_OBcm.
-        inertia: kg m^2 about the centre of mass, expressed in O: ixx, iyy, izz, ixy, ixz, iyz.
+        mass: Mass [kg].
+        com: Center of mass p_OBcm [m]. Shape (3,).
+        inertia: ixx, iyy, izz, ixy, ixz, iyz about the center of mass, expressed in O [kg m^2].
     """
 
     mass: float
@@ -42,13 +43,13 @@ class Inertial:
 
 @dataclass(frozen=True)
 class SupportBox:
-    """One of the boxes that make the tray.
+    """One of the boxes that make up the support.
 
     Attributes:
-        name: unique in the tray.
-        size: (3,) m.
-        p_TG: (3,) m, its centre; its axes are T's.
-        color: (4,) red, green, blue, alpha in 0 to 1.
+        name: Unique name in the support.
+        size: Extents [m]. Shape (3,).
+        p_TG: Center; the axes are those of T [m]. Shape (3,).
+        color: Red, green, blue and alpha in [0, 1]. Shape (4,).
     """
 
     name: str
@@ -58,25 +59,25 @@ class SupportBox:
 
 
 def classes_in_scene(scene: Scene) -> list[ObjectClass]:
-    """The classes in a scene, each once, by name."""
+    """Return the classes of a scene, each once, ordered by name."""
     return sorted(
         {scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name
     )
 
 
 def format_numbers(numbers: Iterable[float]) -> str:
-    """Numbers with all their digits, separated by blanks."""
+    """Return numbers with all their digits, separated by spaces."""
     return " ".join(repr(float(number)) for number in numbers)
 
 
 def write_xml(path: Path, root: ElementTree.Element) -> None:
-    """Writes an indented XML document."""
+    """Write an indented XML document."""
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
 def load_inertial(object_class: ObjectClass) -> Inertial:
-    """The mass properties in the class's built model."""
+    """Return the mass properties in the built model of a class."""
     inertial = ElementTree.parse(object_class.model_path).find("model/link/inertial")
     assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
     moments = (
@@ -88,14 +89,17 @@ def load_inertial(object_class: ObjectClass) -> Inertial:
 
 
 def load_visual(object_class: ObjectClass) -> Any:
-    """The class's mesh in O, a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture."""
+    """Return the textured mesh of a class in O.
+
+    It is a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture.
+    """
     (mesh,) = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
     mesh.apply_transform(Y_UP_TO_Z_UP)
     return mesh
 
 
 def support_boxes(support: Support) -> list[SupportBox]:
-    """The boxes of a support."""
+    """Return the boxes of a support."""
     boxes = []
     for visual in ElementTree.fromstring(support_sdf(support)).iter("visual"):
         pose, size, color = (
@@ -107,17 +111,18 @@ def support_boxes(support: Support) -> list[SupportBox]:
 
 
 def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:
-    """Writes the class's meshes to `<folder>/<class>/`: `visual.obj` with its MTL and PNG, and the convex pieces.
+    """Write the meshes of a class to `<folder>/<class>/`.
 
-    Simulators other than Drake read no glTF.
+    These are `visual.obj` with its MTL and PNG files, and the convex pieces. Simulators other than
+    Drake read no glTF.
 
     Returns:
-        The names of the convex pieces without `.obj`, in order; none for a box or a cylinder.
+        Names of the convex pieces without `.obj`, in order; none for a box or a cylinder.
     """
     target = folder / object_class.name
     target.mkdir()
     visual = load_visual(object_class)
-    # Full white, or simulators that multiply the texture by the material's colour show it dark.
+    # White, because some simulators multiply the texture by the material's color.
     visual.visual.material = trimesh.visual.material.SimpleMaterial(
         image=visual.visual.material.baseColorTexture.convert("RGB"),
         diffuse=[255] * 4,

@@ -1,4 +1,4 @@
-"""A scene as one SDFormat world, for PyBullet, Gazebo and Drake."""
+"""Export of a scene as an SDFormat world, for PyBullet, Gazebo and Drake."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -19,7 +19,10 @@ _DRAKE = "drake.mit.edu"
 
 
 def _use_standard_friction(collision: ElementTree.Element) -> None:
-    """Drake's own friction element moves to the standard one, which Drake reads too; it refuses to have both."""
+    """Replace Drake's friction element by the standard one.
+
+    Drake reads the standard element, too, but does not allow both.
+    """
     properties = collision.find(f"{{{_DRAKE}}}proximity_properties")
     assert properties is not None
     surface = ElementTree.SubElement(collision, "surface")
@@ -46,17 +49,19 @@ def _pose_text(pose: Pose) -> str:
 
 
 def write_sdf(scene: Scene, folder: Path) -> Path:
-    """Writes `scene.sdf`, a world in which every object is a model of its own, and a folder of meshes per class."""
-    ElementTree.register_namespace(
-        "drake", _DRAKE
-    )  # else the prefix is renamed, and Drake no longer knows it
+    """Write `scene.sdf`, a world with one model for each object, and the meshes of each class.
+
+    Returns the path of `scene.sdf`.
+    """
+    # Without this, the prefix would be renamed, and Drake would not recognize it.
+    ElementTree.register_namespace("drake", _DRAKE)
     for object_class in classes_in_scene(scene):
         write_class_meshes(object_class, folder)
     root = ElementTree.Element("sdf", version="1.10")
     world = ElementTree.SubElement(root, "world", name="scene")
     tray = _model(support_sdf(scene.support), TRAY)
     static = ElementTree.Element("static")
-    static.text = "1"  # PyBullet knows no "true"
+    static.text = "1"  # PyBullet does not accept "true"
     tray.insert(0, static)
     world.append(tray)
     for scene_object in scene.objects:

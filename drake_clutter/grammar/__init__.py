@@ -1,4 +1,4 @@
-"""The scene grammar: graphs, production rules, derivations. It knows nothing of poses on the tray or of physics."""
+"""The scene grammar: graphs, production rules and derivations, independent of poses and physics."""
 
 from drake_clutter.grammar.clutter_graph import ClutterGraph, canonical_form
 from drake_clutter.grammar.orientation import Orientation, resting_rotation

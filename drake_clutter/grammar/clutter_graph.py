@@ -1,4 +1,4 @@
-"""The paper's scene graph: a tray, what stands on it, and what stands on that."""
+"""The scene graph of Kumar et al. (2022): a tray, objects on it, and objects on those."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -15,25 +15,33 @@ END = "end"
 DUMMY = "dummy"
 NON_TERMINAL_KINDS = frozenset({OBJECT_SLOT, OPEN_SLOT})
 STRUCTURE_KINDS = frozenset({TRAY, END, DUMMY}) | NON_TERMINAL_KINDS
-"""Kinds of nodes that are no objects; every other kind is the name of an object class."""
+"""Kinds of nodes that are not objects; every other kind is the name of an object class."""
 
 PRIMITIVE = "primitive"
-"""The non-terminal edge. Every other edge is the `Orientation` of the node it leads to, or of the pair it joins to a dummy."""
+"""Kind of a non-terminal edge.
+
+Every other edge has the `Orientation` of the node it leads to, or of the pair it joins to a dummy.
+"""
 
 EdgeKind = Orientation | str
+"""Kind of an edge: an orientation, or `PRIMITIVE`."""
 
 
 class ClutterGraph:
-    """A directed graph whose nodes have a `kind` and whose edges have a `kind`, rooted at the tray, node 0.
+    """A directed graph of nodes and edges with kinds, rooted at the tray (node 0).
 
-    An edge leads from what carries to what is carried. The children of a node keep the order in which they were added.
-    A primitive edge into an `end` carries no orientation, so it counts as terminal as it stands.
+    An edge leads from an object to one that it carries. The children of a node keep the order in
+    which they were added. A primitive edge into an `end` node carries no orientation and counts as
+    terminal.
+
+    Attributes:
+        nx: The networkx graph, with attributes `kind` of nodes and edges.
     """
 
     TRAY_NODE = 0
 
     def __init__(self) -> None:
-        """The start graph S: one tray."""
+        """Create the start graph S: one tray."""
         self.nx = nx.DiGraph()
         self.nx.add_node(self.TRAY_NODE, kind=TRAY)
 
@@ -41,11 +49,15 @@ class ClutterGraph:
     def from_parts(
         cls, nodes: Mapping[int, str], edges: Mapping[tuple[int, int], EdgeKind]
     ) -> "ClutterGraph":
-        """A graph of the given kinds.
+        """Return a graph with the given kinds of nodes and edges.
+
+        Args:
+            nodes: Kinds by node.
+            edges: Kinds by (parent, child).
 
         Raises:
-            ValueError: node 0 is not the only tray, an edge's end is unknown, a node cannot be reached from the tray, or
-                something stands on an end.
+            ValueError: Node 0 is not the only tray, an edge has an unknown end, a node cannot be
+                reached from the tray, or an `end` node has children.
         """
         if [node for node, kind in nodes.items() if kind == TRAY] != [cls.TRAY_NODE]:
             raise ValueError("nodes: allowed is exactly one tray, with id 0")
@@ -67,36 +79,37 @@ class ClutterGraph:
         return graph
 
     def __len__(self) -> int:
-        """The graph's size: its nodes, all kinds counted."""
+        """Return the number of nodes of all kinds."""
         return len(self.nx)
 
     def copy(self) -> "ClutterGraph":
-        """A graph of its own with the same nodes, edges and order."""
+        """Return an independent copy with the same order of nodes and edges."""
         copied = ClutterGraph.__new__(ClutterGraph)
         copied.nx = self.nx.copy()
         return copied
 
     def kind(self, node: int) -> str:
-        """The kind of a node."""
+        """Return the kind of a node."""
         return str(self.nx.nodes[node]["kind"])
 
     def kinds(self) -> list[str]:
-        """The kind of every node, in order of creation."""
+        """Return the kinds of all nodes, in order of creation."""
         return [node["kind"] for node in self.nx._node.values()]
 
     def edge_kind(self, parent: int, child: int) -> EdgeKind:
-        """The kind of an edge."""
+        """Return the kind of an edge."""
         kind: EdgeKind = self.nx.edges[parent, child]["kind"]
         return kind
 
     def children(self, node: int) -> list[int]:
-        """What a node carries, in order."""
+        """Return the nodes that a node carries, in order."""
         return list(self.nx.successors(node))
 
     def breadth_first_order(self) -> list[int]:
-        """All nodes that the tray leads to, breadth first, siblings in order."""
-        # networkx's own walk costs several times as much, and is taken at every rule.
-        edges, order = self.nx._adj, [self.TRAY_NODE]
+        """Return all nodes reachable from the tray, breadth first, siblings in order."""
+        # networkx's own traversal takes several times as long, and this runs for every rule.
+        edges = self.nx._adj
+        order = [self.TRAY_NODE]
         reached = {self.TRAY_NODE}
         for node in order:
             for child in edges[node]:
@@ -106,7 +119,7 @@ class ClutterGraph:
         return order
 
     def stack_bases(self) -> list[list[int]]:
-        """The nodes that stand on the tray, stack by stack: one, or the two of a pair."""
+        """Return the nodes on the tray by stack: one object, or the two of a pair."""
         bases: dict[int, list[int]] = {}
         for node in self.children(self.TRAY_NODE):
             base = next((child for child in self.children(node) if self.kind(child) == DUMMY), node)
@@ -114,7 +127,7 @@ class ClutterGraph:
         return list(bases.values())
 
     def stack_objects(self) -> list[list[int]]:
-        """The object nodes of every stack, in the stacks' order."""
+        """Return the object nodes of every stack, in the order of the stacks."""
         stacks = []
         for bottom in self.stack_bases():
             members = set(bottom).union(*(nx.descendants(self.nx, node) for node in bottom))
@@ -124,19 +137,19 @@ class ClutterGraph:
         return stacks
 
     def largest_stack_fraction(self) -> float:
-        """Of the objects, the share that the stack with most of them holds; 0 without objects."""
+        """Return the fraction of the objects in the largest stack; 0 without objects."""
         sizes = [len(stack) for stack in self.stack_objects()]
         return max(sizes) / sum(sizes) if sizes else 0.0
 
     def objects(self) -> Iterator[tuple[int, str]]:
-        """(node, class) of every object node, in order of creation."""
+        """Return (node, class name) of every object node, in order of creation."""
         return (
             (node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS
         )
 
     @property
     def is_terminal(self) -> bool:
-        """Whether every attribute is terminal, so that the graph can become a scene."""
+        """Whether all attributes are terminal, so that the graph can become a scene."""
         return not any(
             kind in NON_TERMINAL_KINDS for _, kind in self.nx.nodes(data="kind")
         ) and not any(
@@ -146,13 +159,22 @@ class ClutterGraph:
 
 
 def canonical_form(graph: ClutterGraph, classes: Mapping[str, ObjectClass]) -> str:
-    """A digest, equal for two terminal graphs exactly when they differ only by sibling order and by symmetric orientations."""
+    """Return a hash that identifies a terminal graph up to symmetries.
+
+    Graphs have equal hashes if they differ only by the order of siblings and by orientations that
+    look the same, see `symmetry_key`.
+
+    Args:
+        graph: A terminal graph.
+        classes: Object classes by name.
+    """
     digests: dict[int, str] = {}
     for node in reversed(list(nx.topological_sort(graph.nx))):
         children = []
         for child in graph.children(node):
-            edge, kind = graph.edge_kind(node, child), graph.kind(child)
-            # An edge into an end or a dummy says nothing that its neighbours do not.
+            edge = graph.edge_kind(node, child)
+            kind = graph.kind(child)
+            # The edge into an end or dummy node follows from the neighboring edges.
             is_oriented = isinstance(edge, Orientation) and kind in classes
             label = str(symmetry_key(classes[kind], Orientation(edge))) if is_oriented else ""
             children.append(label + digests[child])

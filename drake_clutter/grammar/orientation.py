@@ -10,10 +10,10 @@ from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 
 
 class Orientation(Enum):
-    """A terminal edge of the grammar: the orientation of the object it leads to (SPEC section 2).
+    """Orientation of an object, the kind of a terminal edge.
 
-    The value's first part is the rest, its second the yaw in degrees. At yaw 0 the longer horizontal axis lies along the
-    tray's x.
+    The value is the resting orientation and the yaw in degrees. At yaw 0, the longer horizontal
+    axis is along the tray's x axis. Kumar et al. (2022) have the same ten orientations.
     """
 
     FLAT_0 = ("flat", 0)
@@ -34,13 +34,13 @@ class Orientation(Enum):
 
     @property
     def yaw(self) -> float:
-        """Radians."""
+        """Yaw about the tray's z axis [rad]."""
         return float(np.radians(self.value[1]))
 
 
 def _resting_axes(object_class: ObjectClass, rest: RestOrientation) -> tuple[int, int]:
-    """Indices of O's axes that lie along the tray's x, and point up."""
-    # A mesh is made to stand on its z, whatever sticks out of it.
+    """Return the indices of O's axes that point along the tray's x axis, and up."""
+    # A mesh keeps its axes: it is modeled standing on its z axis, whatever its extents.
     by_extent = (
         range(3)
         if object_class.shape is Shape.MESH
@@ -58,7 +58,7 @@ def _resting_axes(object_class: ObjectClass, rest: RestOrientation) -> tuple[int
 @lru_cache(maxsize=4096)
 def _cached_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
     along_x, up = _resting_axes(object_class, orientation.rest)
-    R_AO = np.zeros((3, 3))  # A: the tray's axes before the yaw
+    R_AO = np.zeros((3, 3))  # A is the tray's frame before the yaw
     R_AO[0, along_x] = R_AO[2, up] = 1.0
     R_AO[1] = np.cross(R_AO[2], R_AO[0])
     cosine, sine = np.cos(orientation.yaw), np.sin(orientation.yaw)
@@ -68,16 +68,16 @@ def _cached_rotation(object_class: ObjectClass, orientation: Orientation) -> NDA
 
 
 def resting_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
-    """R_TO, (3, 3): the rotation of an object of the class in the tray frame when it rests in the orientation."""
+    """Return R_TO (3, 3) of an object of a class that rests in an orientation."""
     return _cached_rotation(object_class, orientation)
 
 
 def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[int, ...]:
-    """Equal for two orientations exactly when objects of the class look the same in both (up to the class's symmetry)."""
+    """Return a key that is equal for orientations in which objects of a class look the same."""
     R_TO = resting_rotation(object_class, orientation)
     if object_class.shape is Shape.CYLINDER:
         axis = R_TO[:, 2]
-        description = np.outer(axis, axis)  # the axis up to its sign
+        description = np.outer(axis, axis)  # identifies the axis up to its sign
     elif object_class.shape is Shape.BOX:
         description = (
             R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T

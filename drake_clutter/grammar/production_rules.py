@@ -1,7 +1,8 @@
-"""The production rules as data: each a pair of small graphs (G_L, G_R), as on the authors' rule sheet.
+"""The production rules as data: each is a pair of small graphs (G_L, G_R).
 
-Nodes that both graphs name are kept, nodes that only G_L names are removed, nodes that only G_R names are new. In G_L a
-node or edge states the kinds it may match. In G_R it states the kind it gets, `KEEP` for the one it had.
+Nodes in both graphs are kept, nodes only in G_L are removed, and nodes only in G_R are new. In G_L,
+nodes and edges state the kinds that they match. In G_R, they state the kind that they get, or
+`KEEP` for an unchanged kind.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,22 +21,24 @@ from drake_clutter.grammar.clutter_graph import (
 from drake_clutter.grammar.orientation import Orientation
 
 KEEP = "keep"
+"""Kind in G_R of a node that keeps its kind."""
 
 PAIR_ORIENTATION = {
     PairArrangement.LYING: Orientation.FLAT_0,
     PairArrangement.STANDING: Orientation.UPRIGHT_0,
 }
-"""The predefined orientation of a pair; it tells the two arrangements of a class apart."""
+"""Orientation of a pair, which also distinguishes the two arrangements of a class."""
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """G_L: a tree, its root first.
+    """The left-hand side G_L of a rule: a tree, its root first.
 
     Attributes:
-        nodes: allowed kinds by the node's name in the rule.
-        edges: (parent, child) in an order in which the parent of each edge is the root or an earlier child; all primitive.
-        rewritten: the node that the rules are about: they replace it, orient it, or, of the tray, put something on it.
+        nodes: Kinds that match, by the node's name in the rule.
+        edges: (parent, child), all primitive. The parent of each edge is the root or an earlier
+            child.
+        rewritten: The node that the rules replace or orient, or on which they put something.
     """
 
     nodes: Mapping[str, frozenset[str]]
@@ -48,12 +51,10 @@ class ProductionRule:
     """A rule G_L -> G_R.
 
     Attributes:
-        name: unique in its grammar, e.g. `insert_meta_pudding_box_1`.
+        name: Unique name in the grammar, such as `insert_meta_pudding_box_1`.
         left: G_L.
-        right_nodes: G_R's nodes, the kind of each, or KEEP.
-        right_edges: G_R's edges, the kind of each.
-        nodes_added: nodes that it adds.
-        open_slots_added: open slots that it adds.
+        right_nodes: Kind of each node of G_R, or `KEEP`.
+        right_edges: Kind of each edge of G_R.
     """
 
     name: str
@@ -63,19 +64,23 @@ class ProductionRule:
 
     @property
     def nodes_added(self) -> int:
+        """Number of nodes that the rule adds."""
         return len(self.right_nodes) - len(self.left.nodes)
 
     @property
     def open_slots_added(self) -> int:
+        """Number of open slots that the rule adds."""
         before = sum(kinds == {OPEN_SLOT} for kinds in self.left.nodes.values())
         return sum(kind == OPEN_SLOT for kind in self.right_nodes.values()) - before
 
 
 def make_production_rules(classes: Sequence[ObjectClass]) -> tuple[ProductionRule, ...]:
-    """The rules for a set of object classes: 3 of structure, the insertions of singles and pairs, 10 orientations.
+    """Return the rules for a set of object classes.
 
-    Source: `paper/grammar_rules.png`; 30 rules for the paper's 7 objects, 49 for 14. Beyond the sheet, an insertion asks that
-    its slot's parent be terminal: an object placed below a slot that is filled already would find its outgoing edge oriented.
+    There are 3 structural rules, one insertion for each class and pair, and 10 orientations: 30
+    rules for the 7 objects of Kumar et al. (2022), 49 for 14. Unlike the paper's rules, an
+    insertion requires a terminal parent; otherwise the outgoing edges of an object could be
+    oriented before the object itself is chosen.
     """
     names = frozenset(object_class.name for object_class in classes)
     terminal_parents = names | {TRAY, DUMMY}

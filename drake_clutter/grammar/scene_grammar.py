@@ -1,4 +1,4 @@
-"""Matching and applying production rules under a budget of nodes."""
+"""Matching and applying production rules within a budget of nodes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,16 +16,17 @@ from drake_clutter.grammar.production_rules import (
     make_production_rules,
 )
 
-MIN_NODES = 3  # tray, one object, end
+MIN_NODES = 3
+"""Size of the smallest scene: tray, one object, end."""
 
 
 @dataclass(frozen=True)
 class NodeBudget:
-    """How large a derived graph may become.
+    """Size that a derived graph may reach.
 
     Attributes:
-        nodes: the largest size, all kinds of nodes counted.
-        exact: whether the graph must reach it. If not, a derivation may end one node short.
+        nodes: Largest number of nodes of all kinds.
+        exact: Whether the graph must reach it. Otherwise a derivation may end one node short.
     """
 
     nodes: int
@@ -40,25 +41,30 @@ class NodeBudget:
 
 @dataclass(frozen=True)
 class Derivation:
-    """A terminal graph and the names of the rules that derived it, in order."""
+    """A terminal graph and the names of the rules that derived it, in order.
+
+    Attributes:
+        graph: The terminal graph.
+        rules: Names of the rules.
+    """
 
     graph: ClutterGraph
     rules: tuple[str, ...]
 
 
 Match = Mapping[str, int]
-"""The graph's node for each node of a G_L, by its name in the rule."""
+"""Node of the graph for each node of a G_L, by its name in the rule."""
 
 
 class SceneGrammar:
-    """G = (N_NT, N_T, E, R, S) for a set of object classes (paper, eq. 1).
+    """The grammar G = (N_NT, N_T, E, R, S) for a set of object classes (Kumar et al. 2022, eq. 1).
 
     Attributes:
-        classes: by name.
-        rules: in the order of the sheet.
-        rule_indices: of each rule, by name.
-        patterns: the few left-hand sides that the rules share.
-        pattern_indices: (rules,) each rule's left-hand side among them.
+        classes: Object classes by name.
+        rules: All rules.
+        rule_indices: Index of each rule by name.
+        patterns: The different left-hand sides of the rules.
+        pattern_indices: Index of each rule's left-hand side in `patterns`.
     """
 
     def __init__(self, classes: Sequence[ObjectClass]) -> None:
@@ -74,29 +80,33 @@ class SceneGrammar:
         self._open_slots_added = np.array([rule.open_slots_added for rule in self.rules])
 
     def find_match(self, graph: ClutterGraph, left: Pattern) -> Match | None:
-        """The first subgraph that G_L matches: the tray leads to its root first, breadth first, siblings in order.
+        """Return the first match of G_L in a graph, or None.
 
-        Returns:
-            The graph's node for each node of G_L, or None if nothing matches.
+        The root of the match is the first possible node, breadth first; siblings are tried in
+        order.
         """
         return _first_match(graph, left, graph.breadth_first_order())
 
     def find_matches(self, graph: ClutterGraph) -> list[Match | None]:
-        """The first match of each of `patterns`."""
+        """Return the first match of each of `patterns`, or None."""
         order = graph.breadth_first_order()
         return [_first_match(graph, left, order) for left in self.patterns]
 
     def feasible_rules(
         self, graph: ClutterGraph, budget: NodeBudget, matches: Sequence[Match | None] | None = None
     ) -> NDArray[np.bool_]:
-        """(rules,) which rules match and neither overrun the budget nor, if it is exact, leave it unfillable.
+        """Return which rules match and keep the graph within its budget.
 
-        What is left can be filled unless it is one node with no open slot to stack on: a drop and a pair both add two.
+        With an exact budget, the rest must also be fillable. It is, unless a single node remains
+        and there is no open slot to stack on: an object on the tray and a pair add two nodes each.
 
         Args:
-            graph: a derived graph.
-            budget: how large it may become.
-            matches: of the graph, if they are known.
+            graph: A derived graph.
+            budget: Size that the graph may reach.
+            matches: Result of `find_matches` for the graph, if known.
+
+        Returns:
+            One bool for each rule. Shape (rules,).
         """
         open_slots = sum(kind == OPEN_SLOT for kind in graph.kinds())
         remaining = budget.nodes - len(graph) - self._nodes_added
@@ -107,10 +117,10 @@ class SceneGrammar:
         return np.asarray(allowed & has_match[self.pattern_indices])
 
     def apply_rule(self, graph: ClutterGraph, rule: ProductionRule) -> ClutterGraph:
-        """A new graph in which the first match of G_L is replaced by G_R.
+        """Return a new graph in which the first match of G_L is replaced by G_R.
 
         Raises:
-            ValueError: the rule does not match.
+            ValueError: The rule does not match.
         """
         match = self.find_match(graph, rule.left)
         if match is None:
@@ -121,7 +131,7 @@ class SceneGrammar:
 
     @staticmethod
     def rewrite_in_place(graph: ClutterGraph, rule: ProductionRule, match: Match) -> None:
-        """Replaces a match of G_L by G_R, in place."""
+        """Replace a match of G_L by G_R in a graph."""
         nodes = dict(match)
         for parent, child in rule.left.edges:
             if (parent, child) not in rule.right_edges:
@@ -137,10 +147,13 @@ class SceneGrammar:
             graph.nx.add_edge(nodes[parent], nodes[child], kind=edge_kind)
 
     def replay(self, rules: Sequence[str]) -> ClutterGraph:
-        """The graph that a sequence of rules, by name, derives from the start graph.
+        """Return the graph that a sequence of rules derives from the start graph.
+
+        Args:
+            rules: Names of the rules.
 
         Raises:
-            ValueError: an unknown rule, or one that does not match when its turn comes.
+            ValueError: A rule is unknown, or does not match.
         """
         graph = ClutterGraph()
         for name in rules:
@@ -154,11 +167,12 @@ class SceneGrammar:
     def derive(
         self, budget: NodeBudget, choose: Callable[[ClutterGraph, NDArray[np.bool_]], int]
     ) -> Derivation:
-        """Applies rules from the start graph on, until none is feasible.
+        """Apply rules to the start graph until no rule is feasible.
 
         Args:
-            budget: how large the graph may become.
-            choose: given the graph and the mask of feasible rules, the index of the rule to apply.
+            budget: Size that the graph may reach.
+            choose: Returns the index of the next rule, given the graph and the mask of feasible
+                rules.
         """
         graph, names = ClutterGraph(), []
         while (
@@ -173,16 +187,21 @@ class SceneGrammar:
 
 
 def uniform_choice(rng: np.random.Generator) -> Callable[[ClutterGraph, NDArray[np.bool_]], int]:
-    """The baseline RG: uniform over the feasible rules."""
+    """Return the baseline policy RG, which chooses uniformly among the feasible rules."""
     return lambda _, mask: int(rng.choice(np.flatnonzero(mask)))
 
 
 def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Match | None:
-    """The match whose root is the first possible of the given nodes. Children are tried in order, with backtracking."""
-    nodes, edges = (
-        graph.nx._node,
-        graph.nx._adj,
-    )  # as networkx's own loops do: its views cost more than the matching
+    """Return the match with the first possible root, by backtracking.
+
+    Args:
+        graph: The graph.
+        left: G_L.
+        roots: Candidates for the root, in order.
+    """
+    # networkx's views would take longer than the matching itself.
+    nodes = graph.nx._node
+    edges = graph.nx._adj
     root_name, root_kinds = next(iter(left.nodes.items()))
 
     def extend(match: Match, pattern_edges: tuple[tuple[str, str], ...]) -> Match | None:

@@ -1,4 +1,4 @@
-"""A camera in Drake: rendered images of a scene, and the share of each object that it sees."""
+"""A camera in Drake: rendered images of a scene, and the visible fraction of each object."""
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
@@ -31,7 +31,8 @@ from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.scene_plant import ScenePlant, add_scene_plant, rigid_transform
 
 RENDERER_NAME = "vtk"
-# Two lamps beside the camera; the second keeps what turns away from the first from going black.
+"""Name of the render engine in the scene graph."""
+
 RENDER_ENGINE_PARAMS = RenderEngineVtkParams(
     backend="EGL",
     lights=[
@@ -43,17 +44,22 @@ RENDER_ENGINE_PARAMS = RenderEngineVtkParams(
         ),
     ],
 )
+"""Render engine with two lights beside the camera.
+
+The second light keeps faces that are turned away from the first one from being black.
+"""
 _NO_OBJECT = -1
 
 
 @dataclass(frozen=True)
 class RenderedImages:
-    """What the camera renders of a scene.
+    """Rendered images of a scene.
 
     Attributes:
-        color: (height, width, 3) uint8, sRGB.
-        depth: (height, width) float32, m along the camera's axis, inf where nothing is seen.
-        label: (height, width) int, the object's index in the scene, -1 for the tray and the background.
+        color: sRGB image, uint8. Shape (height, width, 3).
+        depth: Depth along the camera's axis, inf where nothing is seen [m]. Shape (height, width).
+        label: Index of the object in the scene, -1 for the support and the background. Shape
+            (height, width).
     """
 
     color: NDArray[np.uint8]
@@ -63,11 +69,13 @@ class RenderedImages:
 
 @dataclass(frozen=True)
 class RenderCameras:
-    """A camera for Drake: what it renders with, and where it is.
+    """Drake's render cameras for one `Camera`.
 
     Attributes:
-        color, depth, label: cameras.
-        X_TC: its pose.
+        color: Camera for color images.
+        depth: Camera for depth images.
+        label: Camera for label images of objects on the support.
+        X_TC: Pose of the camera.
     """
 
     color: ColorRenderCamera
@@ -77,7 +85,7 @@ class RenderCameras:
 
     @staticmethod
     def from_camera(config: Camera) -> "RenderCameras":
-        """Of a config."""
+        """Return the render cameras of a camera."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(
             RENDERER_NAME, info, ClippingRange(0.05, 20.0), RigidTransform()
@@ -95,35 +103,44 @@ class RenderCameras:
 
 
 def _tray_clipping_range(X_TC: RigidTransform) -> ClippingRange:
-    """Tight about whatever stands on the tray.
+    """Return a narrow clipping range around everything on the support.
 
-    Where two surfaces meet at the middle of a pixel, the engine lets the one win that it draws first, and its order changes
-    with every engine. The tighter the range, the finer the depth, the rarer such a tie: 0.1 um instead of 3.
+    Where two surfaces meet at the center of a pixel, the engine shows the one that it draws first,
+    and its order differs between engines. A narrow range makes the depth buffer finer (0.1 um
+    instead of 3 um) and such ties rare.
     """
     X_CT = X_TC.inverse()
-    middle, tilt = X_CT.translation()[2], float(np.hypot(*X_CT.rotation().matrix()[2, :2]))
-    return ClippingRange(max(0.05, middle - 0.7 - tilt), max(0.1, middle + 0.5 + tilt))
+    center = X_CT.translation()[2]
+    tilt = float(np.hypot(*X_CT.rotation().matrix()[2, :2]))
+    return ClippingRange(max(0.05, center - 0.7 - tilt), max(0.1, center + 0.5 + tilt))
 
 
 class CameraRenderer:
-    """Renders scenes with one engine that is kept alive, its objects moved from scene to scene."""
+    """Renders scenes with one persistent engine, in which the objects are moved.
+
+    Attributes:
+        camera: The camera.
+    """
 
     def __init__(
         self, camera: Camera, engine: RenderEngineVtkParams = RENDER_ENGINE_PARAMS
     ) -> None:
-        """Makes a camera; `engine` sets light, background and shadows."""
+        """Create a renderer.
+
+        Args:
+            camera: The camera.
+            engine: Light, background and shadows.
+        """
         self.camera = camera
         self._engine = engine
         self._counts: Counter[ObjectClass] = Counter()
         self._support: Support | None = None
         render_cameras = RenderCameras.from_camera(camera)
-        self._color_camera, self._depth_camera, self._label_camera, self._X_TC = (
-            render_cameras.color,
-            render_cameras.depth,
-            render_cameras.label,
-            render_cameras.X_TC,
-        )
-        # Behind the camera.
+        self._color_camera = render_cameras.color
+        self._depth_camera = render_cameras.depth
+        self._label_camera = render_cameras.label
+        self._X_TC = render_cameras.X_TC
+        # Objects that are not shown are behind the camera.
         self._X_T_parked = RigidTransform(render_cameras.X_TC @ [0.0, 0.0, -5.0])
 
     def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
@@ -134,17 +151,18 @@ class CameraRenderer:
         self._scene_plant.scene_graph.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(self._engine))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._counts, self._support = counts, support
+        self._counts = counts
+        self._support = support
 
-    def _place_objects(self, scene: Scene, shown: Collection[str]) -> dict[int, int]:
-        """Puts the named objects of the scene before the camera, and no others.
+    def _place_objects(self, scene: Scene, names: Collection[str]) -> dict[int, int]:
+        """Show the named objects of the scene to the camera, and no others.
 
         Returns:
-            The index in the scene of each object shown, by its render label.
+            Index in the scene of each shown object, by its render label.
         """
         needed = Counter(o.object_class for o in scene.objects)
         if scene.support != self._support or any(needed[c] > self._counts[c] for c in needed):
-            # Half as many again are made, so that scene after scene does not mean engine after engine.
+            # Half as many again are added, so that not every scene needs a new engine.
             grown = Counter({c: n + (n + 1) // 2 for c, n in needed.items() if n > self._counts[c]})
             self._build(self._counts | grown, scene.support)
         plant = self._scene_plant.plant
@@ -155,7 +173,7 @@ class CameraRenderer:
         for index, scene_object in enumerate(scene.objects):
             name = f"{scene_object.object_class.name}.{free[scene_object.object_class]}"
             free[scene_object.object_class] += 1
-            if scene_object.name in shown:
+            if scene_object.name in names:
                 poses[name] = rigid_transform(scene_object.X_TO)
                 labels[int(self._scene_plant.bodies[name].index())] = index
         for name, X_TO in poses.items():
@@ -179,11 +197,11 @@ class CameraRenderer:
         return self._scene_plant.scene_graph.world_frame_id()
 
     def render(self, scene: Scene, X_TC: Pose | None = None) -> RenderedImages:
-        """The three images of a scene.
+        """Return the images of a scene.
 
         Args:
-            scene: what to render.
-            X_TC: another place to look from, for pictures; None for the camera's own.
+            scene: The scene.
+            X_TC: Another pose of the camera, or None for its own.
         """
         labels = self._place_objects(scene, scene.names)
         X = self._X_TC if X_TC is None else rigid_transform(X_TC)
@@ -194,22 +212,29 @@ class CameraRenderer:
         )
 
     def render_depth_and_label(self, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """The depth image and the label image, without the colour image, which takes longer than both; see `Images`."""
+        """Return the depth and label images, see `RenderedImages`.
+
+        Rendering the color image would take longer than both.
+        """
         labels = self._place_objects(scene, scene.names)
         depth = self._query().RenderDepthImage(self._depth_camera, self._world_frame(), self._X_TC)
         return depth.data[..., 0].copy(), self._label_image(labels, self._X_TC)
 
     def render_label(self, scene: Scene) -> NDArray[np.int64]:
-        """The label image alone, see `Images`."""
+        """Return the label image, see `RenderedImages`."""
         return self._label_image(self._place_objects(scene, scene.names), self._X_TC)
 
     def visible_fractions(
         self, scene: Scene, label: NDArray[np.int64] | None = None
     ) -> dict[str, float]:
-        """Of the pixels that each object would cover alone on the tray, the share that the camera sees, by name.
+        """Return the visible fraction of each object, by name.
 
-        An object that is out of the camera's frame is not hidden: its share is 1. `label` is the scene's label image, if it is
-        there already.
+        It is the fraction of the pixels that the object covers alone on the support which it also
+        covers in the scene. Objects outside of the image have fraction 1.
+
+        Args:
+            scene: The scene.
+            label: Label image of the scene, if it was rendered before.
         """
         visible = np.bincount(
             (self.render_label(scene) if label is None else label).ravel() + 1,
@@ -228,15 +253,18 @@ class CameraRenderer:
         }
 
     def hidden_objects(self, fractions: Mapping[str, float]) -> tuple[str, ...]:
-        """The names whose visible share is below the config's threshold, in order."""
+        """Return the names whose visible fraction is below the camera's threshold, in order."""
         return tuple(
-            name for name, share in fractions.items() if share < self.camera.visibility_threshold
+            name
+            for name, fraction in fractions.items()
+            if fraction < self.camera.visibility_threshold
         )
 
     def _non_overlapping_groups(self, scene: Scene) -> list[list[int]]:
-        """Indices of the scene's objects in groups whose bounding rectangles in the image do not overlap."""
+        """Return the objects in groups whose bounding rectangles in the image do not overlap."""
         corners = [self.camera.project(o.corners_T) for o in scene.objects]
-        lower, upper = [c.min(axis=0) - 2 for c in corners], [c.max(axis=0) + 2 for c in corners]
+        lower = [c.min(axis=0) - 2 for c in corners]
+        upper = [c.max(axis=0) + 2 for c in corners]
         overlapping = nx.Graph()
         overlapping.add_nodes_from(range(len(corners)))
         for i in range(len(corners)):

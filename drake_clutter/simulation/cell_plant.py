@@ -1,6 +1,7 @@
 """The work cell in a plant: robot on its pedestal, gripper, cameras and fixtures.
 
-Frames: T the support, which is the world; B the robot's base; F its flange; G the gripper's cup.
+Frames: T is the support's frame and the world, B the robot's base, F its flange, G the gripper's
+cup.
 """
 
 from collections.abc import Sequence
@@ -25,14 +26,15 @@ from drake_clutter.robots.robot_plant import PEDESTAL_NAME, add_robot, filter_co
 
 @dataclass(frozen=True)
 class Arm:
-    """The arm in a plant, and what stands around it.
+    """The arm in a plant, and the bodies around it.
 
     Attributes:
         robot: Model instance of the robot.
         tool: Model instance of the gripper.
         joints: Names of the robot's joints, in the order of q.
-        bodies: Of robot and gripper.
-        fixed: The world, which bears the boxes of the cell, and bodies of fixtures with a model.
+        bodies: Bodies of robot and gripper.
+        fixed: The world, to which the boxes of the cell are fixed, and bodies of fixtures with a
+            model.
         flange: Frame F.
         cup: Frame G.
     """
@@ -48,9 +50,9 @@ class Arm:
 
 _PEDESTAL_COLOR = (0.45, 0.46, 0.48, 1.0)
 _FIXTURE_PREFIX = "fixtures."
-"""Before a fixture's name in that of its model instance, which no other model has."""
+"""Prefix of the model instances of fixtures, which no other model instance has."""
 _CAMERA_HOUSING_RADIUS = 0.06
-"""Radius of the sphere that stands for a camera's housing, behind its lens [m]."""
+"""Radius of the sphere that represents a camera's housing behind its lens [m]."""
 
 
 def add_work_cell(
@@ -64,11 +66,11 @@ def add_work_cell(
     """Add everything of a cell but its support to a plant that is not finalized.
 
     Args:
-        plant: What to add to.
-        scene_graph: Its geometry.
-        cell: What to add.
-        compliant: Whether the gripper's cup gives way, see `Gripper`.
-        visuals: Whether cameras are to see it, see `add_scene_plant`.
+        plant: The plant.
+        scene_graph: Its geometry engine.
+        cell: The work cell.
+        compliant: Whether the gripper's cup is compliant, see `Gripper`.
+        visuals: Whether to add visual geometry, see `add_scene_plant`.
 
     Raises:
         InputError: A model file cannot be used.
@@ -76,8 +78,8 @@ def add_work_cell(
     model = load_robot(cell.robot)
     robot = add_robot(plant, model, visuals=visuals)
     if not any(plant.GetCollisionGeometriesForBody(body) for body in _bodies(plant, robot)):
-        found = f"robot.model: {cell.robot.model!r}: no link has a shape for collisions"
-        raise InputError(f"{found}; allowed is one that can hit something")
+        problem = f"robot.model: {cell.robot.model!r}: no link has a shape for collisions"
+        raise InputError(f"{problem}; allowed is one that can hit something")
     (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=compliant), "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
@@ -108,10 +110,10 @@ def fixture_name(plant: MultibodyPlant, body: RigidBody) -> str:
 
 
 def validate_models(cell: WorkCell) -> None:
-    """Read all models of a cell.
+    """Parse all models of a cell.
 
     Raises:
-        InputError: One of them cannot be used, or does not fit what the cell says of it.
+        InputError: A model cannot be used, or does not fit the cell's description of it.
     """
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.001)
     add_work_cell(plant, scene_graph, cell, compliant=False, visuals=True)
@@ -142,8 +144,8 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     bodies = _bodies(plant, instance)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if any(joint.parent_body().index() == plant.world_body().index() for joint in joints):
-        found = f"{field}: {fixture.model!r} is fixed to the world"
-        raise InputError(f"{found}; allowed is a model that its pose fixes there")
+        problem = f"{field}: {fixture.model!r} is fixed to the world"
+        raise InputError(f"{problem}; allowed is a model that its pose fixes there")
     has_model_frame = plant.HasFrameNamed("__model__", instance)
     frame = (
         plant.GetFrameByName("__model__", instance) if has_model_frame else bodies[0].body_frame()
@@ -160,7 +162,7 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
 def joint_state_indices(
     plant: MultibodyPlant, arm: Arm
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where q (n,) and v (n,) of the arm lie in the finalized plant's."""
+    """Return the indices of the arm's q (n,) and v (n,) in the finalized plant's state."""
     joints = [plant.GetJointByName(name, arm.robot) for name in arm.joints]
     return np.array([j.position_start() for j in joints]), np.array(
         [j.velocity_start() for j in joints]
@@ -168,7 +170,7 @@ def joint_state_indices(
 
 
 def set_joint_angles(plant: MultibodyPlant, context: Context, arm: Arm, q: Sequence[float]) -> None:
-    """Put the arm at q (n,) [rad]; the rest of the plant stays as it is."""
+    """Set the arm's joint angles q (n,) [rad]; the rest of the plant is unchanged."""
     positions = plant.GetPositions(context)
     positions[joint_state_indices(plant, arm)[0]] = q
     plant.SetPositions(context, positions)

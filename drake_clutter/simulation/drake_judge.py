@@ -1,4 +1,4 @@
-"""The judge that every published number comes from: settled in hydroelastic contact, seen by the rendered camera."""
+"""The reference judge: hydroelastic contact simulation and rendered images."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,15 +16,16 @@ from drake_clutter.simulation.settle import SettleResult, settle
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 TOUCHING_MARGIN = 0.003
-"""m; objects further apart than this, random offsets included, settle without each other."""
+"""Objects farther apart than this, random offsets included, settle independently [m]."""
 
 
 class DrakeJudge:
-    """Settles a scene and looks at it (a `SceneJudge`).
+    """Settles a scene in Drake and renders its camera image (a `SceneJudge`).
 
-    Groups of objects that do not touch as laid out are settled apart. The first that falls decides, since a scene is stable
-    only if all are; what a falling stack would do to its neighbours changes no verdict. Those that the fast judge expects to
-    fall, or cannot judge, come first: the sooner a fall is seen, the less is simulated.
+    Groups of objects that do not touch are settled separately. The first group that falls decides,
+    as a scene is stable only if all groups are; the effect of a fall on other groups changes no
+    verdict. Groups that the static judge expects to fall, or cannot judge, come first, because an
+    early fall saves the other simulations.
     """
 
     def __init__(self, config: ClutterConfig) -> None:
@@ -36,7 +37,7 @@ class DrakeJudge:
         ] = {}
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
-        """The verdict. See `SceneJudge.judge`."""
+        """Return the verdict; see `SceneJudge.judge`."""
         settled: dict[str, Pose] = dict(scene.poses)
         for _, result in self.settle_groups(scene, rng):
             settled |= result.poses
@@ -47,7 +48,15 @@ class DrakeJudge:
     def settle_groups(
         self, scene: Scene, rng: np.random.Generator
     ) -> Iterator[tuple[tuple[SceneObject, ...], SettleResult]]:
-        """Settles group after group of objects that may touch, random offsets added; each with how it settled."""
+        """Settle groups of touching objects one after the other.
+
+        Args:
+            scene: The scene.
+            rng: Draws the random offsets of the objects.
+
+        Yields:
+            The objects of a group, offsets included, and the result of settling them.
+        """
         config = self._config.settle
         groups = group_touching_objects(
             perturb_poses(scene.objects, config.jitter, rng), TOUCHING_MARGIN
@@ -58,16 +67,16 @@ class DrakeJudge:
                 self._static_judge.find_instability(replace(scene, objects=tuple(group))) is None
             ),
         ):
-            is_single = len(group) == 1 and _well_inside(group[0], scene.support)
-            yield (
-                tuple(group),
-                self._settle_single(group[0], scene.support)
-                if is_single
-                else settle(group, scene.support, config),
-            )
+            if len(group) == 1 and _is_clear_of_rim(group[0], scene.support):
+                yield tuple(group), self._settle_single(group[0], scene.support)
+            else:
+                yield tuple(group), settle(group, scene.support, config)
 
     def _settle_single(self, single: SceneObject, support: Support) -> SettleResult:
-        """An object on its own settles alike wherever it is on the tray: it is simulated once, at the centre."""
+        """Settle an object that touches no other one.
+
+        The result does not depend on its position, so it is simulated once, at the center.
+        """
         x, y, z = single.X_TO.translation
         key = (single.object_class, support, z, single.X_TO.quaternion)
         if key not in self._single_results:
@@ -75,18 +84,18 @@ class DrakeJudge:
             self._single_results[key] = settle([centered], support, self._config.settle)
         settled = self._single_results[key]
         (pose,) = settled.poses.values()
-        instability = (
-            replace(settled.instability, object=single.name) if settled.instability else None
-        )
+        instability = settled.instability
+        if instability is not None:
+            instability = replace(instability, object=single.name)
         return SettleResult(instability, {single.name: pose.translated((x, y, 0.0))}, ())
 
     def judge_at_rest(self, scene: Scene) -> Verdict:
-        """The verdict on a scene that is known to be at rest: what it hides."""
-        shares = self._renderer.visible_fractions(scene)
-        return Verdict(None, scene.poses, shares, self._renderer.hidden_objects(shares))
+        """Return the verdict on a scene that is at rest: which objects it hides."""
+        fractions = self._renderer.visible_fractions(scene)
+        return Verdict(None, scene.poses, fractions, self._renderer.hidden_objects(fractions))
 
 
-def _well_inside(scene_object: SceneObject, support: Support) -> bool:
-    """Whether an object is clear of the rim."""
+def _is_clear_of_rim(scene_object: SceneObject, support: Support) -> bool:
+    """Return whether an object is clear of the rim of the support."""
     lower, upper = scene_object.bounds_T
     return bool((np.abs([lower[:2], upper[:2]]) < support.half_size - TOUCHING_MARGIN).all())

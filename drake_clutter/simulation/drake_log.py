@@ -1,4 +1,4 @@
-"""Keeping Drake's log from telling users what is none of their business."""
+"""Suppression of Drake's log messages."""
 
 import logging
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def suppress_drake_log(level: int) -> Iterator[None]:
-    """Within it Drake logs nothing that is less than a level of `logging`."""
+    """Suppress Drake's log messages below a level of `logging` while the context is active."""
     logger = logging.getLogger("drake")
     previous_level = logger.level
     logger.setLevel(level)

@@ -1,4 +1,4 @@
-"""Heaps: objects that were dropped on the tray."""
+"""Random heaps: objects dropped on the support."""
 
 from collections.abc import Sequence
 
@@ -13,40 +13,52 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.scene_plant import add_scene_plant
 
 _START_RANGE = 0.3
-"""Of the tray's side: objects start this far from its middle, each way; the tray's rim alone does not keep them."""
-_MIN_START_GAP, _MAX_START_GAP = 0.01, 0.06
-"""m, between an object and what it starts above."""
+"""Largest distance of a start position from the center, as a fraction of the support's size.
+
+The rim alone does not keep dropped objects on the support.
+"""
+_MIN_START_GAP = 0.01
+"""Smallest gap between an object and those it starts above [m]."""
+_MAX_START_GAP = 0.06
+"""Largest gap between an object and those it starts above [m]."""
 
 
 def sample_drop_scene(
     classes: Sequence[ObjectClass], support: Support, rng: np.random.Generator
 ) -> Scene:
-    """Objects of the classes in the air over the tray, turned at random, each above those whose way down it shares."""
+    """Return objects in the air over the support, with random rotations and positions.
+
+    Each object starts above those that it would meet on its way down.
+
+    Args:
+        classes: Class of each object.
+        support: The support.
+        rng: Random generator.
+    """
     objects = list[SceneObject]()
     for number, object_class in enumerate(classes):
         R_TO = Rotation.random(rng=rng).as_matrix()
         x, y = rng.uniform(-_START_RANGE, _START_RANGE, 2) * support.size
-        loose = SceneObject(
-            f"{object_class.name}_{number}", object_class, Pose.from_rotation(R_TO, (x, y, 0.0))
-        )
-        lower, upper = loose.bounds_T
+        name = f"{object_class.name}_{number}"
+        at_floor = SceneObject(name, object_class, Pose.from_rotation(R_TO, (x, y, 0.0)))
+        lower, upper = at_floor.bounds_T
         below = [
             top[2]
             for bottom, top in (o.bounds_T for o in objects)
             if (np.minimum(upper, top)[:2] > np.maximum(lower, bottom)[:2]).all()
         ]
         z = max(below, default=0.0) + rng.uniform(_MIN_START_GAP, _MAX_START_GAP) - lower[2]
-        objects.append(SceneObject(loose.name, object_class, Pose.from_rotation(R_TO, (x, y, z))))
+        objects.append(SceneObject(name, object_class, Pose.from_rotation(R_TO, (x, y, z))))
     return Scene(tuple(objects), support)
 
 
 def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> list[Scene]:
-    """What Drake makes of objects that are let go where they are: at each moment (s), those that are on the tray.
+    """Return the objects that are on the support at given times after their release.
 
     Args:
-        scene: objects at rest in the air.
-        time_step: s.
-        times: s after they were let go, increasing.
+        scene: Objects at rest in the air.
+        time_step: Time step of the simulation [s].
+        times: Increasing times after the release [s].
     """
     builder = DiagramBuilder()
     names = [(o.name, o.object_class) for o in scene.objects]
@@ -57,12 +69,11 @@ def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> lis
     scene_plant.set_poses(context, scene.objects)
     simulator.Initialize()
     scenes = []
-    for moment in times:
-        simulator.AdvanceTo(moment)
+    for time in times:
+        simulator.AdvanceTo(time)
         snapshot = scene.with_poses(scene_plant.poses(context))
-        scenes.append(
-            Scene(tuple(o for o in snapshot.objects if _on_tray(o, scene.support)), scene.support)
-        )
+        on_tray = tuple(o for o in snapshot.objects if _on_tray(o, scene.support))
+        scenes.append(Scene(on_tray, scene.support))
     return scenes
 
 

@@ -1,4 +1,4 @@
-"""The fast judge and executor where they can tell, Drake where they cannot."""
+"""A judge and an executor that use the static model, and Drake where it does not apply."""
 
 import numpy as np
 
@@ -18,34 +18,39 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
 class HybridJudge:
-    """Judges fast, and asks Drake about what the fast judge cannot judge (a `SceneJudge`)."""
+    """Judges scenes statically, and in Drake where that is inconclusive (a `SceneJudge`)."""
 
     def __init__(self, config: ClutterConfig) -> None:
-        self._static, self._drake = StaticStabilityJudge(config), DrakeJudge(config)
+        self._static = StaticStabilityJudge(config)
+        self._drake = DrakeJudge(config)
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict:
-        """See `SceneJudge.judge`."""
+        """Return the verdict; see `SceneJudge.judge`."""
         verdict = self._static.judge(scene, rng)
-        return (
-            self._drake.judge(scene, rng) if isinstance(verdict, InconclusiveVerdict) else verdict
-        )
+        if isinstance(verdict, InconclusiveVerdict):
+            return self._drake.judge(scene, rng)
+        return verdict
 
 
 class HybridExecutor:
-    """Carries moves out fast, and asks Drake about what the fast judge cannot judge (a `MoveExecutor`)."""
+    """Executes moves statically, and in Drake where that is inconclusive (a `MoveExecutor`)."""
 
     def __init__(self, config: ClutterConfig, *, simulate_collapse: bool = True) -> None:
-        """Makes both; `simulate_collapse` is Drake's, see `SettleExecutor`."""
-        self._static, self._settle = (
-            StaticExecutor(config),
-            SettleExecutor(config, simulate_collapse=simulate_collapse),
-        )
+        """Create both executors.
+
+        Args:
+            config: The simulated world.
+            simulate_collapse: See `SettleExecutor`.
+        """
+        self._static = StaticExecutor(config)
+        self._settle = SettleExecutor(config, simulate_collapse=simulate_collapse)
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """See `MoveExecutor.execute`."""
+        """Return the outcome of a command; see `MoveExecutor.execute`."""
         state = rng.bit_generator.state
         outcome = self._static.execute(scene, command, rng)
         if outcome.result is MoveResult.INCONCLUSIVE:
-            rng.bit_generator.state = state  # the same offsets as if Drake had been asked first
+            # The offsets are the same as if Drake executed the command directly.
+            rng.bit_generator.state = state
             return self._settle.execute(scene, command, rng)
         return outcome

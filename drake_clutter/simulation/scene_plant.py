@@ -1,4 +1,4 @@
-"""A scene as a MultibodyPlant diagram: the tray welded to the world, every object a free body."""
+"""A scene as a MultibodyPlant: the support is welded to the world, every object is free."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,28 +18,31 @@ from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_DAMPING_TIME = 0.05
-"""s, time constant with which a free cylinder that may lie stops rolling: a real marker has a clip and a soft barrel, while
-an ideal cylinder rocks on the facets of its contact mesh for seconds. The damping is far too weak to hold up a fall."""
+"""Time constant with which a cylinder that may lie stops rolling [s].
+
+A real marker has a clip and a soft barrel, while an ideal cylinder rocks on the facets of its
+contact mesh for seconds. The damping is far too weak to hold up a fall.
+"""
 
 
 def rigid_transform(pose: Pose) -> RigidTransform:
-    """The pose as Drake's type."""
+    """Return a pose as a Drake `RigidTransform`."""
     return RigidTransform(RotationMatrix(pose.rotation), pose.p)
 
 
 def pose_from_transform(X_AB: RigidTransform) -> Pose:
-    """Drake's type as a pose."""
+    """Return a Drake `RigidTransform` as a pose."""
     return Pose.from_rotation(X_AB.rotation().matrix(), X_AB.translation())
 
 
 @dataclass(frozen=True)
 class ScenePlant:
-    """A plant with objects on a tray, not finalized.
+    """A plant with objects on a support, not yet finalized.
 
     Attributes:
-        plant: the world frame W is the tray frame T.
-        scene_graph: Drake's geometry engine.
-        bodies: the free body of each object, by name.
+        plant: The plant; its world frame is the support's frame T.
+        scene_graph: The geometry engine.
+        bodies: Free body of each object, by name.
     """
 
     plant: MultibodyPlant
@@ -47,21 +50,26 @@ class ScenePlant:
     bodies: dict[str, RigidBody]
 
     def set_poses(self, context: Context, objects: Sequence[SceneObject]) -> None:
-        """Puts the objects at their X_TO, in the plant's context; velocities are untouched."""
+        """Set the poses of objects in the plant's context; velocities are unchanged."""
         for scene_object in objects:
             self.plant.SetFreeBodyPose(
                 context, self.bodies[scene_object.name], rigid_transform(scene_object.X_TO)
             )
 
     def poses(self, context: Context, names: Iterable[str] | None = None) -> dict[str, Pose]:
-        """X_TO of all objects, or of those that are named, by name; from the plant's context."""
+        """Return X_TO of all or of the named objects, by name.
+
+        Args:
+            context: Context of the plant.
+            names: Names of objects, or None for all.
+        """
         return {
             n: pose_from_transform(self.bodies[n].EvalPoseInWorld(context))
             for n in (self.bodies if names is None else names)
         }
 
     def speeds(self, context: Context, names: Iterable[str]) -> dict[str, float]:
-        """Speed of the origin of each object that is named, m/s."""
+        """Return the speeds of the origins of the named objects [m/s]."""
         return {
             n: float(
                 np.linalg.norm(self.bodies[n].EvalSpatialVelocityInWorld(context).translational())
@@ -71,7 +79,7 @@ class ScenePlant:
 
 
 def get_support_body(plant: MultibodyPlant) -> RigidBody:
-    """The support's body; others may have its name in models of their own."""
+    """Return the body of the support; models may have other bodies of the same name."""
     return plant.GetBodyByName("tray", plant.GetModelInstanceByName("tray"))
 
 
@@ -82,17 +90,19 @@ def add_scene_plant(
     time_step: float,
     *,
     visuals: bool,
-    jointed: str = "",
+    object_with_joint: str = "",
 ) -> ScenePlant:
-    """Adds a plant with the tray and the named objects to a diagram.
+    """Add a plant with the support and the named objects to a diagram.
+
+    Contact is hydroelastic where possible, with Drake's lagged discrete contact approximation.
 
     Args:
-        builder: the diagram's.
-        objects: (name, class) of each.
-        support: what the objects stand on.
-        time_step: s; hydroelastic contact, lagged approximation, as DRAKE_NOTES found to be the truth.
-        visuals: whether the textured meshes are added, for cameras and Meshcat.
-        jointed: the name of an object that the caller gives a joint.
+        builder: The diagram's builder.
+        objects: Name and class of each object.
+        support: What the objects stand on.
+        time_step: Time step of the simulation [s].
+        visuals: Whether to add the textured meshes, for cameras and Meshcat.
+        object_with_joint: Name of an object to which the caller adds a joint of its own.
     """
     config = MultibodyPlantConfig(
         time_step=time_step,
@@ -100,7 +110,9 @@ def add_scene_plant(
         discrete_contact_approximation="lagged",
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    return add_objects(plant, scene_graph, objects, support, visuals=visuals, jointed=jointed)
+    return add_objects(
+        plant, scene_graph, objects, support, visuals=visuals, object_with_joint=object_with_joint
+    )
 
 
 def add_objects(
@@ -110,9 +122,18 @@ def add_objects(
     support: Support,
     *,
     visuals: bool,
-    jointed: str = "",
+    object_with_joint: str = "",
 ) -> ScenePlant:
-    """Adds the tray and the named objects to a plant; arguments as of `add_scene_plant`."""
+    """Add the support and the named objects to a plant.
+
+    Args:
+        plant: The plant.
+        scene_graph: Its geometry engine.
+        objects: See `add_scene_plant`.
+        support: See `add_scene_plant`.
+        visuals: See `add_scene_plant`.
+        object_with_joint: See `add_scene_plant`.
+    """
     (tray,) = Parser(plant).AddModelsFromString(support_sdf(support), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
@@ -121,14 +142,13 @@ def add_objects(
         (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
         if (
-            name != jointed
+            name != object_with_joint
             and object_class.shape is Shape.CYLINDER
             and object_class.only_rest is not RestOrientation.UPRIGHT
         ):
+            # Inertia of a solid cylinder about its line of contact.
             radius = object_class.size[0] / 2
-            rolling_inertia = (
-                1.5 * object_class.mass * radius**2
-            )  # of a solid cylinder about its line of contact
+            rolling_inertia = 1.5 * object_class.mass * radius**2
             plant.AddJoint(
                 QuaternionFloatingJoint(
                     f"{name}_floating",

@@ -1,4 +1,4 @@
-"""Settling objects in Drake until they have fallen, come to rest, or the time is up."""
+"""Settling objects in Drake until they fall, come to rest, or the time is up."""
 
 import math
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
 from drake_clutter.simulation.scene_plant import add_scene_plant
 
 SAMPLE_PERIOD = 0.05
-"""s between two looks at whether the objects have come to rest; at every second one, at whether they have fallen."""
+"""Time between two checks for rest [s]; every second check also looks for falls."""
 REST_SAMPLES = 10
-"""Samples over which what is at rest may not drift: half a second."""
+"""Samples (0.5 s) over which an object at rest must not move."""
 
 
 @dataclass(frozen=True)
 class SettleResult:
-    """How objects settled.
+    """Result of settling objects.
 
     Attributes:
-        instability: None if they stayed.
-        poses: X_TO by name at the end.
-        motion: frames at 40 Hz, if asked for.
+        instability: The object that fell or kept moving, or None.
+        poses: X_TO at the end, by name.
+        motion: Recorded motion at 40 Hz, if requested.
     """
 
     instability: Instability | None
@@ -39,7 +39,14 @@ class SettleResult:
 def find_instability(
     before: SceneObject, after: Pose, support: Support, config: SettleConfig
 ) -> Instability | None:
-    """How an object has fallen that was before, and is now; None if it stayed within the limits."""
+    """Return how an object fell, or None if it stayed within the limits.
+
+    Args:
+        before: The object at its initial pose.
+        after: Its present pose.
+        support: What it stands on.
+        config: Limits of displacement and tilt.
+    """
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
     x, y, z = after.translation
@@ -62,17 +69,19 @@ def settle(
     record: bool = False,
     simulate_collapse: bool = False,
 ) -> SettleResult:
-    """Simulates objects alone on the tray, from rest where they are.
+    """Simulate objects on a support from rest.
 
-    Ends when an object has fallen, when all have been calm or still for a while, or when the config's time is up. A single lying
-    cylinder that carries something starts to roll slowly: it must be still for longer.
+    The simulation ends when an object falls, when all have been calm or nearly motionless for a
+    while, or when the time is up. A lying cylinder that carries something starts to roll slowly, so
+    it must be motionless for longer.
 
     Args:
-        objects: what to settle.
-        support: what they stand on.
-        config: time step and limits.
-        record: whether to keep the motion.
-        simulate_collapse: go on after an object has fallen, until everything is calm or the time is up.
+        objects: The objects to settle.
+        support: What they stand on.
+        config: Time step and limits.
+        record: Whether to record the motion.
+        simulate_collapse: Whether to go on after a fall until all objects are at rest or the time
+            is up.
     """
     builder = DiagramBuilder()
     scene_plant = add_scene_plant(
@@ -92,7 +101,8 @@ def settle(
     motion = [MotionSample(0.0, history[0])] if record else []
     may_roll_slowly = _may_roll_slowly(objects)
     num_window_samples = REST_SAMPLES * (2 if may_roll_slowly else 1)
-    num_calm_samples, instability = 0, None
+    num_calm_samples = 0
+    instability = None
     last = math.ceil(config.max_time / SAMPLE_PERIOD)
     for sample in range(1, last + 1):
         if record:
@@ -100,20 +110,22 @@ def settle(
             motion.append(
                 MotionSample(simulator.get_context().get_time(), scene_plant.poses(context))
             )
-        # Half a step is added so that rounding never leaves a step out.
+        # Half a step is added, so that rounding never skips a step.
         simulator.AdvanceTo(sample * SAMPLE_PERIOD + config.time_step / 2)
-        poses, speeds = scene_plant.poses(context), scene_plant.speeds(context, scene_plant.bodies)
+        poses = scene_plant.poses(context)
+        speeds = scene_plant.speeds(context, scene_plant.bodies)
         history.append(poses)
         if record:
             motion.append(MotionSample(sample * SAMPLE_PERIOD, poses))
-        # Every second time: by then what topples has turned so far that it is not taken for something that slides.
+        # Every second sample: after 0.1 s, a toppling object has rotated far enough not to be
+        # mistaken for a sliding one.
         if instability is None and (sample % 2 == 0 or sample == last):
             instabilities = [
                 found
                 for o in objects
                 if (found := find_instability(o, poses[o.name], support, config)) is not None
             ]
-            instability = max(instabilities, key=lambda f: f.displacement, default=None)
+            instability = max(instabilities, key=lambda item: item.displacement, default=None)
             if instability is not None and not simulate_collapse:
                 return SettleResult(instability, poses, tuple(motion))
         reference = history[-2] if instability else history[0]
@@ -143,7 +155,7 @@ def settle(
 def _stayed_close(
     objects: Sequence[SceneObject], history: Sequence[dict[str, Pose]], config: SettleConfig
 ) -> bool:
-    """Whether all objects have been close to where they are now."""
+    """Return whether all objects stayed close to their last poses."""
     *earlier, now = history
     return all(
         _distance(poses[o.name], now[o.name]) < config.chatter_displacement
@@ -164,7 +176,14 @@ def _find_motion(
     earlier: dict[str, Pose],
     config: SettleConfig,
 ) -> Instability | None:
-    """The object that went furthest since the earlier poses, if further than the config allows one at rest."""
+    """Return the object that moved farthest since earlier poses, if it moved too far.
+
+    Args:
+        objects: The objects at their initial poses.
+        poses: Present poses, by name.
+        earlier: Poses half a second earlier, by name.
+        config: Limits.
+    """
     furthest = max(objects, key=lambda o: _distance(poses[o.name], earlier[o.name]))
     pose = poses[furthest.name]
     if _distance(pose, earlier[furthest.name]) <= config.max_rest_displacement:
@@ -176,7 +195,10 @@ def _find_motion(
 
 
 def _may_roll_slowly(objects: Sequence[SceneObject]) -> bool:
-    """Whether a lying cylinder may carry something: its axis is level and something reaches higher above it."""
+    """Return whether a lying cylinder may carry something.
+
+    The cylinder's axis is level, and another object overlaps it seen from above and is higher.
+    """
     for o in objects:
         if o.object_class.shape is not Shape.CYLINDER or abs(o.X_TO.rotation[2, 2]) > 0.5:
             continue

@@ -1,4 +1,4 @@
-"""Moves by teleport: the picked object appears at its place, Drake settles what the move touched."""
+"""Pick-and-place moves by teleport, after which Drake settles the affected objects."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,44 +13,51 @@ from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import SettleResult, settle
 
 _COLLAPSE_TIME_STEP = 0.005
-"""s; what a fall does to the rest of the scene decides nothing any more, it is only shown."""
+"""Time step for the aftermath of a fall, which is only shown and decides nothing [s]."""
 
 
 class SettleExecutor:
-    """Carries out a move at fidelity `settle` (a `MoveExecutor`).
+    """Executes moves by teleport and settles the affected objects in Drake (a `MoveExecutor`).
 
-    A scene collapses when, after the move, any object but the picked one has moved or turned past the limits that define
-    "stable", or the picked one past them from where it was let go. Less than that is harmless settling. What the picked
-    object carried falls. Only the groups of objects that touch the picked one before or after the move are settled; if one
-    of them falls, the whole scene is settled again, so that neighbours are hit as they would be.
+    The picked object appears at its placement, and objects that it carried fall. The scene
+    collapses when any other object moves or rotates past the limits of stability, or the picked
+    object does, relative to its pose of release. Only the groups of objects that touch the picked
+    one before or after the move are settled. If one of them falls, the whole scene is settled
+    again, so that it can hit its neighbors.
     """
 
     def __init__(self, config: ClutterConfig, *, simulate_collapse: bool = True) -> None:
-        """Makes an executor.
+        """Create an executor.
 
         Args:
-            config: the world.
-            simulate_collapse: whether to simulate what a collapse does to the whole scene; if not, the scene
-                afterwards and the motion are those of the stack that fell, up to the moment when it is known to fall.
+            config: The simulated world.
+            simulate_collapse: Whether to simulate the effect of a fall on the whole scene.
+                Otherwise, the scene and motion of the outcome contain only the falling group, up to
+                the detection of the fall. The result is the same.
         """
-        self._config, self._simulate_collapse = config, simulate_collapse
+        self._config = config
+        self._simulate_collapse = simulate_collapse
 
     def execute(self, scene: Scene, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """See `MoveExecutor.execute`. Random offsets are added to the pose of release."""
-        pick, X_TO = command.move.pick, command.X_TO_place
-        # What is let go sinks by the height of release; else it would never count as calm.
-        sinks = (
+        """Return the outcome of a command; see `MoveExecutor.execute`.
+
+        The pose of release gets a random offset.
+        """
+        pick = command.move.pick
+        # The released object sinks by the release height and must count as calm afterwards.
+        displacement = (
             self._config.settle.early_stop_displacement + self._config.exploration.release_height
         )
-        settle_config = replace(self._config.settle, early_stop_displacement=sinks)
-        (released,) = perturb_poses([replace(scene[pick], X_TO=X_TO)], settle_config.jitter, rng)
+        settle_config = replace(self._config.settle, early_stop_displacement=displacement)
+        placed = replace(scene[pick], X_TO=command.X_TO_place)
+        (released,) = perturb_poses([placed], settle_config.jitter, rng)
         moved = scene.with_poses({pick: released.X_TO})
 
         groups = group_touching_objects(scene.objects, TOUCHING_MARGIN)
-        touched = next(names for group in groups if pick in (names := {o.name for o in group}))
+        affected = next(names for group in groups if pick in (names := {o.name for o in group}))
         settled = []
         for group in _groups_to_settle(moved, released):
-            if touched.isdisjoint(o.name for o in group):
+            if affected.isdisjoint(o.name for o in group):
                 continue
             settled.append(settle(group, scene.support, settle_config, record=True))
             if settled[-1].instability is not None:
@@ -64,9 +71,9 @@ class SettleExecutor:
                         motion,
                         X_TO_released=released.X_TO,
                     )
-                coarse = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
+                coarse_config = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
                 whole = settle(
-                    moved.objects, scene.support, coarse, record=True, simulate_collapse=True
+                    moved.objects, scene.support, coarse_config, record=True, simulate_collapse=True
                 )
                 fall = settled[-1].instability
                 return Outcome(
@@ -87,7 +94,10 @@ class SettleExecutor:
 
 
 def _groups_to_settle(scene: Scene, released: SceneObject) -> list[list[SceneObject]]:
-    """Objects that may touch each other; what is let go may fall onto all that is below it, however far."""
+    """Return groups of objects that may touch each other.
+
+    The released object may fall on all objects below it, however far, so these share its group.
+    """
     lower, upper = (bound[:2] for bound in released.bounds_T)
     with_released, others = list[SceneObject](), []
     for group in group_touching_objects(scene.objects, TOUCHING_MARGIN):
@@ -107,7 +117,10 @@ def _merge_poses(settled: Sequence[SettleResult]) -> dict[str, Pose]:
 def _merge_motions(
     start: dict[str, Pose], settled: Sequence[SettleResult]
 ) -> tuple[MotionSample, ...]:
-    """The motions of groups that settled apart, as one motion of the whole scene; a group that has ended stays."""
+    """Return the motions of separately settled groups as one motion of the scene.
+
+    Groups whose motion has ended keep their last poses.
+    """
     longest = max((result.motion for result in settled), key=len)
     poses, frames = dict(start), []
     for index, frame in enumerate(longest):

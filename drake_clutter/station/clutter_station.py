@@ -96,7 +96,12 @@ class ClutterStation(Diagram):
         self._weldable_object = weldable_object
         builder = DiagramBuilder()
         self.scene_plant: ScenePlant = add_scene_plant(
-            builder, objects, cell.support, time_step, visuals=False, jointed=weldable_object
+            builder,
+            objects,
+            cell.support,
+            time_step,
+            visuals=False,
+            object_with_joint=weldable_object,
         )
         self.plant = plant = self.scene_plant.plant
         graph = self.scene_plant.scene_graph
@@ -146,7 +151,7 @@ class ClutterStation(Diagram):
             objects,
             self.cell.support,
             visuals=True,
-            jointed=self._weldable_object,
+            object_with_joint=self._weldable_object,
         ).bodies
         arm = add_work_cell(visual_plant, visual_graph, self.cell, compliant=True, visuals=True)
         # The joint of a `WeldGrasp` makes the states of both plants equal.
