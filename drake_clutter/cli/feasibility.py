@@ -15,6 +15,7 @@ from drake_clutter.cli.options import (
     CatalogOption,
     ConfigOption,
     JsonOption,
+    ResumableOutOption,
     SeedOption,
     SetOption,
     WorkersOption,
@@ -40,14 +41,7 @@ def feasibility(
     scenes: Annotated[
         list[Path], typer.Argument(metavar="SCENES...", help="Scene files, or folders of them.")
     ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Output folder: new, empty, or of the same study, which resumes.",
-        ),
-    ],
+    out: ResumableOutOption,
     cell_files: Annotated[
         list[Path] | None,
         typer.Option("--cell", metavar="FILE", help="Work cell to study. May be repeated."),

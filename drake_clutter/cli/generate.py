@@ -13,8 +13,8 @@ from drake_clutter.cli.options import (
     JsonOption,
     NodesOption,
     ObjectsOption,
-    OutOption,
     RayOption,
+    ResumableOutOption,
     SeedOption,
     SetOption,
     WorkersOption,
@@ -23,7 +23,7 @@ from drake_clutter.cli.output import print_result, progress_bar
 
 
 def generate(
-    out: OutOption,
+    out: ResumableOutOption,
     agent: Annotated[
         str,
         typer.Option(

@@ -19,6 +19,14 @@ SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Scene
 OutOption = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Output folder; must be new or empty.")
 ]
+ResumableOutOption = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Output folder: new, empty, or of the same job, which resumes.",
+    ),
+]
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Random seed; the same seed gives the same result.")
 ]

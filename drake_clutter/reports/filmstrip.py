@@ -53,7 +53,7 @@ def select_key_frames(frames: Sequence[MotionSample], pick: str) -> list[MotionS
     moving = np.flatnonzero(np.abs(height - height[-1]) > _MIN_HEIGHT_CHANGE)
     placed = min(int(moving[-1]) + 1, len(frames) - 1) if len(moving) else len(frames) - 1
     carry = (lift_start + arrival) // 2
-    retreat = (placed + len(frames)) // 2
+    retreat = (placed + 3 * len(frames)) // 4
     return [frames[k] for k in (max(lift_start - 2, 0), carry, placed, retreat)]
 
 
