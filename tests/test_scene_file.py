@@ -245,7 +245,7 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("objects", 1, "name"), "", "objects[1].name: ''; allowed is a text"),
     (("objects", 1, "name"), None, "objects[1].name: None"),
     (("objects", 1, "name"), "tray", "objects[1].name: 'tray'; allowed is any name but tray"),
-    (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is there twice"),
+    (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is used twice"),
     (
         ("objects", 1, "colour"),
         "red",

@@ -108,14 +108,14 @@ class _Panel:
         w, h = self.size
         box = ((right - left) * w, (bottom - top) * h)
         choices = [
-            (lines, turned)
+            (lines, rotate)
             for lines in {words, words.replace(" ", "\n")}
-            for turned in ((False, True) if allow_rotation else (False,))
+            for rotate in ((False, True) if allow_rotation else (False,))
         ]
         size, lines, is_rotated = max(
             (
-                (_font_size(lines, box[::-1] if turned else box), lines, turned)
-                for lines, turned in sorted(choices)
+                (_font_size(lines, box[::-1] if rotate else box), lines, rotate)
+                for lines, rotate in sorted(choices)
             )
         )
         if size < 4:

@@ -211,9 +211,9 @@ def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Ma
         kinds = left.nodes[child]
         for node, edge in edges[match[parent]].items():
             if edge["kind"] == PRIMITIVE and nodes[node]["kind"] in kinds:
-                found = extend({**match, child: node}, rest)
-                if found is not None:
-                    return found
+                extended = extend({**match, child: node}, rest)
+                if extended is not None:
+                    return extended
         return None
 
     for root in roots:

@@ -215,10 +215,10 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
     height, width = depth.shape
     n, m = len(x), len(y)
     state = np.zeros((n, m), np.int8)  # 0: not checked yet, 1: free, 2: not free
-    found = np.empty(len(cells), np.int64)
+    fitting = np.empty(len(cells), np.int64)
     count = 0
     for position in range(len(cells)):
-        if count and cost[position] > cost[found[0]] + 1e-9:
+        if count and cost[position] > cost[fitting[0]] + 1e-9:
             break
         fits = True
         for k in range(len(footprint)):
@@ -246,9 +246,9 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
                 fits = False
                 break
         if fits:
-            found[count] = position
+            fitting[count] = position
             count += 1
-    return found[:count]
+    return fitting[:count]
 
 
 def top_height(detection: Detection) -> float:

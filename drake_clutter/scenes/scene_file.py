@@ -193,8 +193,8 @@ def _scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
     objects = tuple(_objects(document.objects, path, catalog))
     depth, first, second = max_penetration(objects)
     if depth > MAX_PENETRATION:
-        found = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
-        raise input_error(path, f"{found}; allowed is {1000 * MAX_PENETRATION:g} mm")
+        problem = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
+        raise input_error(path, f"{problem}; allowed is {1000 * MAX_PENETRATION:g} mm")
     graph = None if document.graph is None else _graph(document.graph, objects, path)
     cell = document.work_cell
     scene = Scene(objects, cell.support, graph, document.derivation, document.seed)
@@ -207,17 +207,17 @@ def _refusal(path: str, field: str, value: Any, what: str) -> InputError:
 
 
 def _objects(entries: Sequence[_ObjectEntry], path: str, catalog: Catalog) -> list[SceneObject]:
-    made: dict[str, SceneObject] = {}
+    objects: dict[str, SceneObject] = {}
     for k, entry in enumerate(entries):
         object_class = catalog.classes.get(entry.object_class)
         if object_class is None:
-            known = f"one of {', '.join(catalog.classes)}"
-            raise _refusal(path, f"objects[{k}].class", entry.object_class, known)
-        if entry.name in made:
-            found = f"objects[{k}].name: {format_value(entry.name)} is there twice"
-            raise input_error(path, f"{found}; allowed are names without repeats")
-        made[entry.name] = SceneObject(entry.name, object_class, entry.X_TO.pose, entry.node)
-    return list(made.values())
+            allowed_classes = f"one of {', '.join(catalog.classes)}"
+            raise _refusal(path, f"objects[{k}].class", entry.object_class, allowed_classes)
+        if entry.name in objects:
+            problem = f"objects[{k}].name: {format_value(entry.name)} is used twice"
+            raise input_error(path, f"{problem}; allowed are names without repeats")
+        objects[entry.name] = SceneObject(entry.name, object_class, entry.X_TO.pose, entry.node)
+    return list(objects.values())
 
 
 def _graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> ClutterGraph:
@@ -242,11 +242,11 @@ def _graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> Clu
         raise input_error(path, f"graph.{error}") from error
     for o in objects:
         if o.node is not None and nodes.get(o.node) != o.object_class.name:
-            found = f"graph.nodes: the node of {o.name}, {o.node}, is missing or of another kind"
-            raise input_error(path, f"{found}; allowed is {o.object_class.name}")
+            problem = f"graph.nodes: the node of {o.name}, {o.node}, is missing or of another kind"
+            raise input_error(path, f"{problem}; allowed is {o.object_class.name}")
     if not graph.is_terminal:
-        found = "graph: holds slots or edges without orientation"
-        raise input_error(path, f"{found}; allowed is a terminal graph")
+        problem = "graph: holds slots or edges without orientation"
+        raise input_error(path, f"{problem}; allowed is a terminal graph")
     return graph
 
 
@@ -258,13 +258,13 @@ def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     named = {"settled": set(entry.settled), "visible_fractions": set(entry.visible_fractions)}
     named |= {"hidden": set(entry.hidden), "instability.object": {why.object} if why else set()}
     for field, names in named.items():
-        if strangers := sorted(names - set(scene.names)):
-            found = f"verdict.{field}: {format_value(strangers[0])} is no object"
-            raise input_error(path, f"{found}; allowed are {', '.join(scene.names)}")
+        if unknown_names := sorted(names - set(scene.names)):
+            problem = f"verdict.{field}: {format_value(unknown_names[0])} is no object"
+            raise input_error(path, f"{problem}; allowed are {', '.join(scene.names)}")
     for field in ("settled", "visible_fractions") if entry.stable else ("settled",):
         if missing := sorted(set(scene.names) - named[field]):
-            found = f"verdict.{field}: {missing[0]} is missing"
-            raise input_error(path, f"{found}; allowed is an entry for every object")
+            problem = f"verdict.{field}: {missing[0]} is missing"
+            raise input_error(path, f"{problem}; allowed is an entry for every object")
     instability = None
     if why is not None:
         instability = Instability(why.reason, why.object, why.displacement, why.tilt)

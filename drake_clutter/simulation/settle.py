@@ -121,9 +121,9 @@ def settle(
         # mistaken for a sliding one.
         if instability is None and (sample % 2 == 0 or sample == last):
             instabilities = [
-                found
+                item
                 for o in objects
-                if (found := find_instability(o, poses[o.name], support, config)) is not None
+                if (item := find_instability(o, poses[o.name], support, config)) is not None
             ]
             instability = max(instabilities, key=lambda item: item.displacement, default=None)
             if instability is not None and not simulate_collapse:

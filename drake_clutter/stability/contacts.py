@@ -162,7 +162,7 @@ def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[
     """
     top, count = records[shape].top, records[shape].top_count
     outline, outline_count = records[above].footprint, records[above].footprint_count
-    found = np.empty((0, 2))
+    corners = np.empty((0, 2))
     for k in range(outline_count):  # add the part of the top beyond each side of the outline
         after = (k + 1) % outline_count
         ex, ey = outline[after, 0] - outline[k, 0], outline[after, 1] - outline[k, 1]
@@ -178,8 +178,8 @@ def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[
             ex / length,
             -margin,
         )
-        found = np.vstack((found, polygon[:beyond]))
-    return found
+        corners = np.vstack((corners, polygon[:beyond]))
+    return corners
 
 
 @njit(cache=True)
@@ -263,8 +263,8 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
             count += 1
             supported = True
         # Whether another object ends at the height of this one's bottom, near it or below it.
-        beside = False
-        above = False
+        is_near = False
+        is_above = False
         for i in range(n):
             if i == j:
                 continue
@@ -281,8 +281,8 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
                 if overlap > MAX_OVERLAP and fault == NO_FAULT:
                     fault, faulty = OVERLAPPING, j
                 continue
-            beside |= overlap > -MAX_MISS_DISTANCE
-            above |= overlap > 0
+            is_near |= overlap > -MAX_MISS_DISTANCE
+            is_above |= overlap > 0
             if overlap <= 0:
                 continue
             # Faces as large as the footprints are in contact where the footprints overlap.
@@ -297,5 +297,5 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
                         stack[k] = new
         if not supported and fault == NO_FAULT:
             faulty = j
-            fault = EDGE if above else UNSUPPORTED if beside else FLOATING
+            fault = EDGE if is_above else UNSUPPORTED if is_near else FLOATING
     return fault, faulty, pairs[:count], stack

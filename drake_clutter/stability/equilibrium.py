@@ -273,7 +273,7 @@ def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, ma
         Position in its stack of the object farthest from equilibrium, or -1, and whether it rolls.
         Shape (k, 2).
     """
-    found = np.empty((len(selected), 2), np.int64)
+    results = np.empty((len(selected), 2), np.int64)
     for k in range(len(selected)):
         rows = order[first[selected[k]] : first[selected[k] + 1]]
         position = np.full(len(shapes) + 1, -2)
@@ -286,7 +286,7 @@ def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, ma
             if position[lower] != -2 and position[upper] != -2:
                 within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
                 contacts += 1
-        found[k, 0], found[k, 1] = least_stable_object(
+        results[k, 0], results[k, 1] = least_stable_object(
             records, shapes[rows], p_T[rows], within[:contacts], margin, friction
         )
-    return found
+    return results

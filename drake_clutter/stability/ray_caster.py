@@ -308,7 +308,7 @@ class RayCaster:
             objects: Convex objects.
         """
         fractions = self.visible_fractions_of_rows(*self._shapes.rows_and_positions(objects))
-        return {o.name: share for o, share in zip(objects, fractions, strict=True)}
+        return {o.name: fraction for o, fraction in zip(objects, fractions, strict=True)}
 
     def occluder_sets(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
         """Return by which sets of objects an object is occluded, with numbers of rays.
@@ -353,8 +353,8 @@ class RayCaster:
             depth[rectangle] = 1 / self._nearest[rectangle]
         detections = tuple(
             Detection(o.name, o.object_class, o.X_TO, mask)
-            for index, (o, share) in enumerate(zip(scene.objects, fractions, strict=True))
-            if share >= self.camera.visibility_threshold
+            for index, (o, fraction) in enumerate(zip(scene.objects, fractions, strict=True))
+            if fraction >= self.camera.visibility_threshold
             and (mask := self._mask(index, rectangle)).any()
         )
         return Observation(depth, detections, self.camera, scene.support), dict(

@@ -289,17 +289,17 @@ class ShapeTable:
         if len(self._row) > _MAX_ROWS:
             self._start()
             self.generation += 1
-        known = self._row
+        row_by_shape = self._row
         try:
             return np.array(
-                [known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
+                [row_by_shape[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
             )
         except KeyError:
             for o in objects:
-                if (o.object_class, o.X_TO.quaternion) not in known:
+                if (o.object_class, o.X_TO.quaternion) not in row_by_shape:
                     self._add(o)
             return np.array(
-                [known[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
+                [row_by_shape[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
             )
 
     def rows_and_positions(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:

@@ -42,10 +42,12 @@ class StaticExecutor:
         (x, y, _) = sample_offsets(1, self._config.settle.jitter, rng)[0]
         resting = command.X_TO_place.translated((x, y, -self._config.exploration.release_height))
         moved = scene.with_poses({command.move.pick: resting})
-        found = self._judge_move(scene, moved, command.move)
-        if isinstance(found, InconclusiveVerdict):
-            return Outcome(MoveResult.INCONCLUSIVE, scene, inconclusive=found)
-        return Outcome(MoveResult.PLACED if found is None else MoveResult.COLLAPSED, moved, found)
+        verdict = self._judge_move(scene, moved, command.move)
+        if isinstance(verdict, InconclusiveVerdict):
+            return Outcome(MoveResult.INCONCLUSIVE, scene, inconclusive=verdict)
+        return Outcome(
+            MoveResult.PLACED if verdict is None else MoveResult.COLLAPSED, moved, verdict
+        )
 
     def _judge_move(
         self, before: Scene, after: Scene, move: Move
@@ -56,11 +58,11 @@ class StaticExecutor:
         before the move although the static model lets it fall, the verdict is inconclusive.
         """
         for name in (move.pick,) if move.place == TRAY else (move.pick, move.place):
-            found = self._judge.find_instability(self._judge.contact_group(before, name))
-            if isinstance(found, Instability):
-                return InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, found.object)
-            if found is not None:
-                return found
+            verdict = self._judge.find_instability(self._judge.contact_group(before, name))
+            if isinstance(verdict, Instability):
+                return InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, verdict.object)
+            if verdict is not None:
+                return verdict
         losing = self._judge.objects_losing_support(before, move.pick)
         if isinstance(losing, InconclusiveVerdict):
             return losing
