@@ -161,7 +161,7 @@ def _merge_over(base: Any, given: Any) -> Any:
     return {**base, **{key: _merge_over(base.get(key), value) for key, value in given.items()}}
 
 
-def upgrade_record_head(given: Any) -> Any:
+def upgrade_header_configs(given: Any) -> Any:
     """Return the header of a results file of version 0.1 in the form of this version.
 
     Configs in it get the current names of fields, and complete cells instead of cameras and arms.

@@ -12,7 +12,7 @@ from drake_clutter.config import (
     SettleConfig,
     load_config,
     upgrade_config,
-    upgrade_record_head,
+    upgrade_header_configs,
 )
 from drake_clutter.files import InputError
 from drake_clutter.systems.scenario import Scenario
@@ -66,7 +66,7 @@ def test_fields_under_their_earlier_names(tmp_path: Path) -> None:
     )
     assert config.layout.placement_attempts == 7
     head = {"world": {"settle": {"rest_drift": 0.1}, "layout": {"placement_tries": 7}}}
-    assert upgrade_record_head(head) == {
+    assert upgrade_header_configs(head) == {
         "world": {"settle": {"max_rest_displacement": 0.1}, "layout": {"placement_attempts": 7}}
     }
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import CATALOG, DEFAULT_CELL, training_script
 
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.config import ClutterConfig, upgrade_cell, upgrade_config, upgrade_record_head
+from drake_clutter.config import ClutterConfig, upgrade_cell, upgrade_config, upgrade_header_configs
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.records import read_jsonl
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
@@ -89,7 +89,7 @@ def configs_in(document: Any) -> Iterator[tuple[str, Any]]:
 def test_results(path: Path) -> None:
     is_record_file = path.name.endswith(".jsonl.gz")
     document = read_jsonl(path)[0] if is_record_file else json.loads(path.read_text())
-    upgrade_record_head(document)
+    upgrade_header_configs(document)
     for key, value in configs_in(document):
         if isinstance(value, str):  # YAML, or the name of a config
             value = parse_yaml(value, str(path))

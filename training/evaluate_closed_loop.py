@@ -26,7 +26,7 @@ import typer
 
 from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
-from drake_clutter.config import upgrade_record_head
+from drake_clutter.config import upgrade_header_configs
 from drake_clutter.files import InputError, file_sha256
 from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.scenes.interfaces import MoveResult
@@ -227,7 +227,7 @@ def collect_episodes(
 
 def upgrade_scenario(header: Any) -> Any:
     """Return the header of a record file of an earlier version with today's names of fields."""
-    header = upgrade_record_head(header)
+    header = upgrade_header_configs(header)
     scenario = to_plain(override_config(Scenario(), header["scenario"], "scenario"))
     scenario.pop("seed")
     return header | {"scenario": scenario}

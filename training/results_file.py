@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import drake_clutter
-from drake_clutter.config import upgrade_record_head
+from drake_clutter.config import upgrade_header_configs
 from drake_clutter.files import InputError, write_json
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
@@ -33,7 +33,7 @@ def provenance() -> dict[str, str]:
 
 def upgrade_record_header(header: Any) -> Any:
     """Return the header of a file of an earlier version with today's names of fields."""
-    upgraded = upgrade_record_head(header)
+    upgraded = upgrade_header_configs(header)
     if isinstance(upgraded, dict) and "fidelity" in upgraded:
         upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
     return upgraded

@@ -51,6 +51,7 @@ class TexturedMesh:
 
 
 def _concatenate(parts: list[TexturedMesh]) -> TexturedMesh:
+    """Return several meshes as one."""
     starts = np.cumsum([0] + [len(part.points) for part in parts[:-1]])
     return TexturedMesh(
         np.vstack([part.points for part in parts]),

@@ -58,16 +58,20 @@ class _Panel:
     pixels_per_mm: float
 
     @staticmethod
-    def blank(width_mm: float, height_mm: float, unit: float, color: str) -> "_Panel":
+    def blank(width_mm: float, height_mm: float, pixels_per_mm: float, color: str) -> "_Panel":
+        """Return a panel of one color."""
         return _Panel(
             Image.new(
-                "RGB", (max(1, round(width_mm * unit)), max(1, round(height_mm * unit))), color
+                "RGB",
+                (max(1, round(width_mm * pixels_per_mm)), max(1, round(height_mm * pixels_per_mm))),
+                color,
             ),
-            unit,
+            pixels_per_mm,
         )
 
     @property
     def size(self) -> tuple[int, int]:
+        """Width and height [pixels]."""
         return self.image.size
 
     def draw_rectangle(
@@ -82,6 +86,7 @@ class _Panel:
     def draw_motif(
         self, name: str, accent: str, left: float, top: float, right: float, bottom: float
     ) -> None:
+        """Draw a motif; the sides are fractions of the panel's width and height."""
         w, h = self.size
         area = Image.new(
             "RGB", (max(1, round((right - left) * w)), max(1, round((bottom - top) * h)))
@@ -128,6 +133,7 @@ class _Panel:
 
 @lru_cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
+    """Return the font of the labels in a size [pixels]."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
     )
@@ -135,17 +141,20 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @lru_cache
 def _text_extent(lines: str, size: int) -> tuple[float, float, float, float]:
+    """Return the bounding box of text in a font size: left, top, right, bottom [pixels]."""
     return ImageDraw.Draw(Image.new("L", (1, 1))).multiline_textbbox(
         (0, 0), lines, font=_font(size), align="center", spacing=size * 0.1
     )
 
 
 def _font_size(lines: str, box: tuple[float, float]) -> int:
+    """Return the largest font size [pixels] in which text fits into a box of width and height."""
     left, top, right, bottom = _text_extent(lines, 100)
     return int(100 * min(box[0] / max(1, right - left), box[1] / max(1, bottom - top)))
 
 
 def _text_mask(lines: str, size: int) -> Image.Image:
+    """Return an image of text, to be used as a mask."""
     left, top, right, bottom = _text_extent(lines, size)
     mask = Image.new("L", (max(1, math.ceil(right - left)), max(1, math.ceil(bottom - top))))
     ImageDraw.Draw(mask).multiline_text(
@@ -172,6 +181,7 @@ def _draw_nutrition_table(width: int, height: int) -> Image.Image:
 
 
 def _draw_barcode(width: int, height: int) -> Image.Image:
+    """Return a picture of a bar code."""
     code = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(code)
     w, h = code.size
@@ -201,6 +211,7 @@ def _draw_front(panel: _Panel, label: LabelDesign, title: str, mass: float) -> N
 
 
 def _draw_side(panel: _Panel, label: LabelDesign, title: str, *, nutrition: bool) -> None:
+    """Draw a side of a box, with the nutrition table or the bar code."""
     w, h = panel.size
     panel.draw_rectangle(0, 0, 1, 0.035, label.accent)
     panel.draw_rectangle(0, 0.90, 1, 1, label.accent)
@@ -213,15 +224,16 @@ def _draw_side(panel: _Panel, label: LabelDesign, title: str, *, nutrition: bool
     panel.image.paste(info, (round(0.1 * w), round(0.72 * h - info.height / 2)))
 
 
-def _box_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str, _Panel]:
+def _box_panels(object_class: ObjectClass, title: str, pixels_per_mm: float) -> dict[str, _Panel]:
+    """Return the faces of a box."""
     label = object_class.label
     depth, width, height = (1000 * side for side in object_class.size)
-    front = _Panel.blank(width, height, unit, label.base)
+    front = _Panel.blank(width, height, pixels_per_mm, label.base)
     _draw_front(front, label, title, object_class.mass)
-    sides = [_Panel.blank(depth, height, unit, label.base) for _ in range(2)]
+    sides = [_Panel.blank(depth, height, pixels_per_mm, label.base) for _ in range(2)]
     for side, nutrition in zip(sides, (True, False), strict=True):
         _draw_side(side, label, title, nutrition=nutrition)
-    top = _Panel.blank(width, depth, unit, label.base)
+    top = _Panel.blank(width, depth, pixels_per_mm, label.base)
     top.draw_rectangle(0, 0, 0.05, 1, label.accent)
     top.draw_rectangle(0.95, 0, 1, 1, label.accent)
     top.draw_text(title, label.accent, 0.1, 0.12, 0.9, 0.88)
@@ -270,6 +282,7 @@ def _draw_metal_end(panel: _Panel) -> None:
 
 
 def _draw_plastic_lid(panel: _Panel, label: LabelDesign, title: str) -> None:
+    """Draw a plastic lid with the title."""
     draw = ImageDraw.Draw(panel.image)
     w = panel.size[0]
     for fraction, color in (
@@ -283,14 +296,15 @@ def _draw_plastic_lid(panel: _Panel, label: LabelDesign, title: str) -> None:
     panel.draw_text(title, label.base, 0.2, 0.3, 0.8, 0.7, allow_rotation=False)
 
 
-def _can_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str, _Panel]:
+def _can_panels(object_class: ObjectClass, title: str, pixels_per_mm: float) -> dict[str, _Panel]:
+    """Return the faces of a can."""
     label = object_class.label
     diameter, _, height = (1000 * side for side in object_class.size)
-    side = _Panel.blank(math.pi * diameter, height, unit, label.base)
+    side = _Panel.blank(math.pi * diameter, height, pixels_per_mm, label.base)
     _draw_wrapper(side, label, title, object_class.mass)
     rim = min(0.03, 3 / height)
     side.draw_rectangle(0, 1 - rim, 1, 1, _METAL_COLOR)
-    top, bottom = (_Panel.blank(diameter, diameter, unit, _METAL_COLOR) for _ in range(2))
+    top, bottom = (_Panel.blank(diameter, diameter, pixels_per_mm, _METAL_COLOR) for _ in range(2))
     _draw_metal_end(bottom)
     if MOTIFS[label.motif].plastic_lid:
         _draw_plastic_lid(top, label, title)
@@ -301,26 +315,28 @@ def _can_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str,
     return {"side": side, "top": top, "bottom": bottom}
 
 
-def _marker_panels(object_class: ObjectClass, title: str, unit: float) -> dict[str, _Panel]:
+def _marker_panels(
+    object_class: ObjectClass, title: str, pixels_per_mm: float
+) -> dict[str, _Panel]:
     """Return the faces of a marker.
 
     The barrel has the title along it, a cap on the upper third, and a plug at the bottom.
     """
     label = object_class.label
     diameter, _, height = (1000 * side for side in object_class.size)
-    side = _Panel.blank(math.pi * diameter, height, unit, label.base)
+    side = _Panel.blank(math.pi * diameter, height, pixels_per_mm, label.base)
     side.draw_rectangle(0, 0, 1, 0.36, label.accent)
     side.draw_rectangle(0, 0.375, 1, 0.39, label.accent)
     side.draw_rectangle(0, 0.94, 1, 1, label.accent)
     for third in range(3):
         side.draw_text(title, label.accent, third / 3 + 0.06, 0.44, third / 3 + 0.27, 0.88)
-    top, bottom = (_Panel.blank(diameter, diameter, unit, label.accent) for _ in range(2))
+    top, bottom = (_Panel.blank(diameter, diameter, pixels_per_mm, label.accent) for _ in range(2))
     return {"side": side, "top": top, "bottom": bottom}
 
 
-def _mesh_panels(object_class: ObjectClass, unit: float) -> dict[str, _Panel]:
+def _mesh_panels(object_class: ObjectClass, pixels_per_mm: float) -> dict[str, _Panel]:
     """Return a strip over the height, with a band in the accent color below the top."""
-    side = _Panel.blank(20, 200, unit, object_class.label.base)
+    side = _Panel.blank(20, 200, pixels_per_mm, object_class.label.base)
     side.draw_rectangle(0, 0.12, 1, 0.30, object_class.label.accent)
     return {"side": side, "top": side, "bottom": side}
 

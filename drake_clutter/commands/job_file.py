@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.config import ClutterConfig, upgrade_record_head
+from drake_clutter.config import ClutterConfig, upgrade_header_configs
 from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.validation import to_plain, validate
 
@@ -45,7 +45,7 @@ def _read_job(path: Path) -> dict[str, Any]:
     source = str(path)
     if "config" in job:
         job["config"] = to_plain(
-            validate(ClutterConfig, upgrade_record_head(job["config"]), source)
+            validate(ClutterConfig, upgrade_header_configs(job["config"]), source)
         )
     if "setups" in job:
         job["setups"] = {

@@ -19,6 +19,15 @@ class InstabilityReason(Enum):
     """Why a scene is not stable.
 
     A simulation reports the first four, the static judge the last three.
+
+    Attributes:
+        TOPPLED: The object rotated past the limit.
+        SLID: The object moved past the limit without rotating past its limit.
+        LEFT_TRAY: The object fell off the support.
+        NOT_AT_REST: The object was still moving when the time was up.
+        UNBALANCED: No contact forces hold the object.
+        ROLLS: The object is held only on the line on which a lying cylinder carries.
+        UNSUPPORTED: Nothing is below the object; it misses another object that ends at its height.
     """
 
     TOPPLED = "toppled"
@@ -79,7 +88,18 @@ class Verdict:
 
 
 class InconclusiveReason(Enum):
-    """What a judge's model of a scene does not cover."""
+    """What a judge's model of a scene does not cover.
+
+    Attributes:
+        LEANING: No face of the object is level.
+        NOT_CONVEX: The object has several convex pieces.
+        OUTSIDE_TRAY: The object reaches beyond the support.
+        INTERPENETRATING: The object overlaps another one or the support.
+        FLOATING: Nothing is below or beside the object's bottom.
+        EDGE_CONTACT: The object touches others only on an edge or a curved surface.
+        UNSUPPORTED: The object misses another one that ends at its height.
+        RESTS_NEVERTHELESS: The object rests in the given scene, but the model lets it fall.
+    """
 
     LEANING = "leans"
     NOT_CONVEX = "is not convex"
@@ -151,7 +171,16 @@ class PickPlaceCommand:
 
 
 class MoveResult(Enum):
-    """How a move ended."""
+    """How a move ended.
+
+    Attributes:
+        PLACED: The object is at its placement, and the scene is stable.
+        COLLAPSED: The scene is unstable after the move.
+        NO_FREE_PLACEMENT: No placement is known to be free.
+        INCONCLUSIVE: The executor's model does not cover the scene.
+        NOT_PLANNED: No motion plan was found.
+        DROPPED: The gripper lost the object on the way.
+    """
 
     PLACED = "placed"
     COLLAPSED = "collapsed"

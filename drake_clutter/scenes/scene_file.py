@@ -62,12 +62,14 @@ class SceneFile:
 
 
 class _PoseEntry(StrictModel):
+    """A pose in a scene file."""
+
     translation: Vector3
     quaternion: tuple[Finite, Finite, Finite, Finite]
 
     @field_validator("quaternion")
     @classmethod
-    def _normalized(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    def _normalize(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
         norm = math.sqrt(sum(value * value for value in quaternion))
         if abs(norm - 1) > _QUATERNION_TOLERANCE:
             raise allowed_error(f"w, x, y, z of length 1 (this one's is {norm:.6g})")
@@ -81,6 +83,8 @@ class _PoseEntry(StrictModel):
 
 
 class _ObjectEntry(StrictModel):
+    """An object in a scene file."""
+
     name: NonEmptyText
     object_class: Annotated[NonEmptyText, Field(alias="class")]
     X_TO: _PoseEntry
@@ -88,29 +92,37 @@ class _ObjectEntry(StrictModel):
 
     @field_validator("name")
     @classmethod
-    def _not_the_tray(cls, name: str) -> str:
+    def _check_name(cls, name: str) -> str:
         if name == TRAY:
             raise allowed_error(f"any name but {TRAY}")
         return name
 
 
 class _NodeEntry(StrictModel):
+    """A node of the graph in a scene file."""
+
     id: Integer
     kind: NonEmptyText
 
 
 class _EdgeEntry(StrictModel):
+    """An edge of the graph in a scene file."""
+
     parent: Integer
     child: Integer
     kind: NonEmptyText
 
 
 class _GraphEntry(StrictModel):
+    """The graph in a scene file."""
+
     nodes: tuple[_NodeEntry, ...]
     edges: tuple[_EdgeEntry, ...]
 
 
 class _InstabilityEntry(StrictModel):
+    """The instability of a verdict in a scene file."""
+
     reason: InstabilityReason
     object: NonEmptyText
     displacement: Finite
@@ -118,6 +130,8 @@ class _InstabilityEntry(StrictModel):
 
 
 class _VerdictEntry(StrictModel):
+    """A verdict in a scene file."""
+
     stable: Flag
     settled: dict[str, _PoseEntry]
     visible_fractions: Annotated[
@@ -129,6 +143,8 @@ class _VerdictEntry(StrictModel):
 
 
 class _TrayEntry(StrictModel):
+    """The square tray in a scene file of version 1."""
+
     side: Side
 
 
@@ -145,7 +161,7 @@ class _Document(StrictModel):
     verdict: _VerdictEntry | None = None
 
     @model_validator(mode="after")
-    def _tray_or_cell(self) -> Self:
+    def _check_tray_or_cell(self) -> Self:
         if self.tray is not None and self.cell is not None:
             raise allowed_error("a tray or a cell, which has one")
         return self
@@ -171,7 +187,7 @@ def load_scene(path: Path, catalog: Catalog) -> SceneFile:
     Raises:
         InputError: The file is not a valid scene. The message names the field and what is allowed.
     """
-    return _scene_file(read_yaml(path, "a scene file"), str(path), catalog)
+    return _build_scene_file(read_yaml(path, "a scene file"), str(path), catalog)
 
 
 def scene_from_yaml(text: str, source: str, catalog: Catalog) -> SceneFile:
@@ -185,34 +201,39 @@ def scene_from_yaml(text: str, source: str, catalog: Catalog) -> SceneFile:
     Raises:
         InputError: See `load_scene`.
     """
-    return _scene_file(parse_yaml(text, source, "a scene file"), source, catalog)
+    return _build_scene_file(parse_yaml(text, source, "a scene file"), source, catalog)
 
 
-def _scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
+def _build_scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
+    """Return the content of a validated document."""
     document = validate(_Document, given, path)
-    objects = tuple(_objects(document.objects, path, catalog))
+    objects = tuple(_build_objects(document.objects, path, catalog))
     depth, first, second = max_penetration(objects)
     if depth > MAX_PENETRATION:
         problem = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
         raise input_error(path, f"{problem}; allowed is {1000 * MAX_PENETRATION:g} mm")
-    graph = None if document.graph is None else _graph(document.graph, objects, path)
+    graph = None if document.graph is None else _build_graph(document.graph, objects, path)
     cell = document.work_cell
     scene = Scene(objects, cell.support, graph, document.derivation, document.seed)
     entry = document.verdict
-    return SceneFile(scene, cell, None if entry is None else _verdict(entry, scene, path))
+    return SceneFile(scene, cell, None if entry is None else _build_verdict(entry, scene, path))
 
 
-def _refusal(path: str, field: str, value: Any, what: str) -> InputError:
+def _value_error(path: str, field: str, value: Any, what: str) -> InputError:
+    """Return the error for a field with a value that is not allowed."""
     return input_error(path, f"{field}: {format_value(value)}; allowed is {what}")
 
 
-def _objects(entries: Sequence[_ObjectEntry], path: str, catalog: Catalog) -> list[SceneObject]:
+def _build_objects(
+    entries: Sequence[_ObjectEntry], path: str, catalog: Catalog
+) -> list[SceneObject]:
+    """Return the objects of a scene file."""
     objects: dict[str, SceneObject] = {}
     for k, entry in enumerate(entries):
         object_class = catalog.classes.get(entry.object_class)
         if object_class is None:
             allowed_classes = f"one of {', '.join(catalog.classes)}"
-            raise _refusal(path, f"objects[{k}].class", entry.object_class, allowed_classes)
+            raise _value_error(path, f"objects[{k}].class", entry.object_class, allowed_classes)
         if entry.name in objects:
             problem = f"objects[{k}].name: {format_value(entry.name)} is used twice"
             raise input_error(path, f"{problem}; allowed are names without repeats")
@@ -220,21 +241,24 @@ def _objects(entries: Sequence[_ObjectEntry], path: str, catalog: Catalog) -> li
     return list(objects.values())
 
 
-def _graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> ClutterGraph:
+def _build_graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> ClutterGraph:
+    """Return the graph of a scene file, if it fits the objects."""
     classes = {o.node: o.object_class.name for o in objects if o.node is not None}
     nodes: dict[int, str] = {}
     for k, node in enumerate(entry.nodes):
         if node.id in nodes:
-            raise _refusal(path, f"graph.nodes[{k}].id", node.id, "an id that no other node has")
+            raise _value_error(
+                path, f"graph.nodes[{k}].id", node.id, "an id that no other node has"
+            )
         if node.kind not in STRUCTURE_KINDS and classes.get(node.id) != node.kind:
             what = "a structure node, or the class of the object that names this node"
-            raise _refusal(path, f"graph.nodes[{k}].kind", node.kind, what)
+            raise _value_error(path, f"graph.nodes[{k}].kind", node.kind, what)
         nodes[node.id] = node.kind
     edges: dict[tuple[int, int], EdgeKind] = {}
     for k, edge in enumerate(entry.edges):
         if edge.kind not in _EDGE_KINDS:
             what = f"one of {', '.join(_EDGE_KINDS)}"
-            raise _refusal(path, f"graph.edges[{k}].kind", edge.kind, what)
+            raise _value_error(path, f"graph.edges[{k}].kind", edge.kind, what)
         edges[edge.parent, edge.child] = _EDGE_KINDS[edge.kind]
     try:
         graph = ClutterGraph.from_parts(nodes, edges)
@@ -250,29 +274,38 @@ def _graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) -> Clu
     return graph
 
 
-def _verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
-    why = entry.instability
-    if entry.stable == (why is not None):
+def _build_verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
+    """Return the verdict of a scene file, if it fits the scene."""
+    failure = entry.instability
+    if entry.stable == (failure is not None):
         what = "allowed is one for an unstable scene, and none for a stable one"
         raise input_error(path, f"verdict.instability: {what}")
-    named = {"settled": set(entry.settled), "visible_fractions": set(entry.visible_fractions)}
-    named |= {"hidden": set(entry.hidden), "instability.object": {why.object} if why else set()}
-    for field, names in named.items():
+    names_by_field = {
+        "settled": set(entry.settled),
+        "visible_fractions": set(entry.visible_fractions),
+    }
+    names_by_field |= {
+        "hidden": set(entry.hidden),
+        "instability.object": {failure.object} if failure else set(),
+    }
+    for field, names in names_by_field.items():
         if unknown_names := sorted(names - set(scene.names)):
             problem = f"verdict.{field}: {format_value(unknown_names[0])} is no object"
             raise input_error(path, f"{problem}; allowed are {', '.join(scene.names)}")
     for field in ("settled", "visible_fractions") if entry.stable else ("settled",):
-        if missing := sorted(set(scene.names) - named[field]):
+        if missing := sorted(set(scene.names) - names_by_field[field]):
             problem = f"verdict.{field}: {missing[0]} is missing"
             raise input_error(path, f"{problem}; allowed is an entry for every object")
     instability = None
-    if why is not None:
-        instability = Instability(why.reason, why.object, why.displacement, why.tilt)
+    if failure is not None:
+        instability = Instability(
+            failure.reason, failure.object, failure.displacement, failure.tilt
+        )
     settled = {name: pose.pose for name, pose in entry.settled.items()}
     return Verdict(instability, settled, entry.visible_fractions, entry.hidden)
 
 
-def _pose_fields(pose: Pose) -> dict[str, list[float]]:
+def _pose_to_dict(pose: Pose) -> dict[str, list[float]]:
     return {"translation": list(pose.translation), "quaternion": list(pose.quaternion)}
 
 
@@ -289,7 +322,7 @@ def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) 
         entry: dict[str, Any] = {
             "name": o.name,
             "class": o.object_class.name,
-            "X_TO": _pose_fields(o.X_TO),
+            "X_TO": _pose_to_dict(o.X_TO),
         }
         if o.node is not None:
             entry["node"] = o.node
@@ -312,22 +345,22 @@ def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) 
     if scene.derivation:
         document["derivation"] = list(scene.derivation)
     if verdict is not None:
-        document["verdict"] = _verdict_fields(verdict)
+        document["verdict"] = _verdict_to_dict(verdict)
     return document
 
 
-def _verdict_fields(verdict: Verdict) -> dict[str, Any]:
+def _verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
     fields: dict[str, Any] = {"stable": verdict.stable}
     if verdict.instability is not None:
-        why = verdict.instability
+        failure = verdict.instability
         fields["instability"] = {
-            "reason": why.reason.value,
-            "object": why.object,
-            "displacement": why.displacement,
-            "tilt": why.tilt,
+            "reason": failure.reason.value,
+            "object": failure.object,
+            "displacement": failure.displacement,
+            "tilt": failure.tilt,
         }
     settled: Mapping[str, Any] = {
-        name: _pose_fields(pose) for name, pose in verdict.settled.items()
+        name: _pose_to_dict(pose) for name, pose in verdict.settled.items()
     }
     return fields | {
         "hidden": list(verdict.hidden),

@@ -281,15 +281,15 @@ class ShapeTable:
         self._start()
 
     def _start(self) -> None:
-        self._row: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
+        self._row_by_shape: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
         self.arrays = _allocate(64, 512, 4096)
 
     def find_rows(self, objects: Sequence[SceneObject]) -> Ints:
         """Return the table's row of each object. Shape (n,)."""
-        if len(self._row) > _MAX_ROWS:
+        if len(self._row_by_shape) > _MAX_ROWS:
             self._start()
             self.generation += 1
-        row_by_shape = self._row
+        row_by_shape = self._row_by_shape
         try:
             return np.array(
                 [row_by_shape[o.object_class, o.X_TO.quaternion] for o in objects], dtype=np.int64
@@ -310,7 +310,7 @@ class ShapeTable:
 
     def _add(self, scene_object: SceneObject) -> None:
         shape = orient_shape(scene_object.object_class, scene_object.X_TO.quaternion)
-        row = len(self._row)
+        row = len(self._row_by_shape)
         face = int(self.arrays.records["last_face"].max())
         corner = self.arrays.first_corner[face]
         last_face = face + len(shape.surface.counts)
@@ -359,4 +359,4 @@ class ShapeTable:
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal
         table.corner[corner:last_corner] = shape.surface.corner
-        self._row[scene_object.object_class, scene_object.X_TO.quaternion] = row
+        self._row_by_shape[scene_object.object_class, scene_object.X_TO.quaternion] = row
