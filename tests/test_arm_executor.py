@@ -1,4 +1,4 @@
-"""Plans carried out in Drake: placed where they should be, let go when they must, the same again from a cloned context."""
+"""Simulated plans: placement errors, lost objects, guarded descents, and determinism."""
 
 import itertools
 import math
@@ -60,55 +60,55 @@ def run(
     )
 
 
-def test_placed_where_it_should_be(plan: PickPlacePlan) -> None:
-    carried = run(plan)
-    assert carried.grasped
-    assert math.isnan(carried.drop_time)
-    assert carried.position_error < 0.003
-    assert carried.orientation_error < math.radians(1)
-    assert carried.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), (
+def test_an_object_is_placed_at_its_place_pose(plan: PickPlacePlan) -> None:
+    result = run(plan)
+    assert result.grasped
+    assert math.isnan(result.drop_time)
+    assert result.position_error < 0.003
+    assert result.orientation_error < math.radians(1)
+    assert result.poses["sugar_box"].translation[2] == pytest.approx(0.0875, abs=0.001), (
         "it stands on the tray"
     )
-    assert carried.slip < 0.001
-    assert max(carried.displacements.values()) < 0.001
-    assert carried.max_tracking_error < 0.02
-    assert 0.1 < carried.max_load_ratio < 1
+    assert result.slip < 0.001
+    assert max(result.displacements.values()) < 0.001
+    assert result.max_tracking_error < 0.02
+    assert 0.1 < result.max_load_ratio < 1
 
 
-def test_a_locked_joint_does_not_slip(plan: PickPlacePlan) -> None:
-    carried = run(plan, weldable_object=plan.pick)
-    assert carried.grasped
-    assert carried.slip < 1e-9
+def test_a_weld_grasp_does_not_slip(plan: PickPlacePlan) -> None:
+    result = run(plan, weldable_object=plan.pick)
+    assert result.grasped
+    assert result.slip < 1e-9
 
 
-def test_a_vacuum_that_fails_drops_the_object(plan: PickPlacePlan) -> None:
-    """Planned with 80 % of the atmosphere, carried out with 10 %: 5 N of pull for a weight of 5 N."""
-    carried = run(plan, cell_with("gripper.vacuum=0.1"))
-    assert carried.grasped
+def test_an_object_is_dropped_if_the_vacuum_is_too_weak(plan: PickPlacePlan) -> None:
+    """The plan assumes a vacuum of 80 %; the simulation has 10 %, or 5 N for a weight of 5 N."""
+    result = run(plan, cell_with("gripper.vacuum=0.1"))
+    assert result.grasped
     on = build_command_schedule(plan, DEFAULT_CELL).suction_on_time
-    assert on < carried.drop_time < on + DWELL_TIME + 0.5, "as soon as it is lifted"
-    assert carried.position_error > 0.2
+    assert on < result.drop_time < on + DWELL_TIME + 0.5, "as soon as it is lifted"
+    assert result.position_error > 0.2
 
 
-def test_without_a_seal_nothing_is_lifted(plan: PickPlacePlan) -> None:
-    carried = run(plan, cell_with("gripper.unevenness=0"))
-    assert not carried.grasped
-    assert carried.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
+def test_an_object_is_not_lifted_without_a_seal(plan: PickPlacePlan) -> None:
+    result = run(plan, cell_with("gripper.unevenness=0"))
+    assert not result.grasped
+    assert result.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
 
 
 @pytest.mark.parametrize(
     ("xy", "result"), [((0.2, -0.2), MoveResult.PLACED), ((0.2, 0.0), MoveResult.DROPPED)]
 )
-def test_what_comes_off_where_it_is_put_down_is_placed(
+def test_an_object_that_comes_off_at_its_place_pose_is_placed(
     xy: tuple[float, float], result: MoveResult, config: ClutterConfig
 ) -> None:
-    """The shock of touching down may break the seal, a moment before the vacuum is switched off."""
+    """The impact at touchdown may break the seal just before the vacuum is switched off."""
     after = SCENE.with_poses({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
     outcome = evaluate_outcome(SCENE, after, "sugar_box", PLACE, True, config.settle)
     assert (outcome.result, outcome.instability) == (result, None)
 
 
-def test_the_schedule(plan: PickPlacePlan) -> None:
+def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
     assert [name for name, _ in schedule.stage_starts] == [
         "approach",
@@ -128,10 +128,10 @@ def test_the_schedule(plan: PickPlacePlan) -> None:
 
 
 @pytest.mark.parametrize("too_tall", [0.065, 0.0])
-def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(
+def test_an_object_of_unknown_height_is_lowered_until_contact(
     too_tall: float,
 ) -> None:
-    """A pudding box that stands shows the top of a sugar box; or it is known, and 3 mm above where it will stand."""
+    """A pudding box is mistaken for a sugar box; or it is known, and 3 mm too high."""
     stands = resting("pudding_box", Orientation.UPRIGHT_0)
     taken_for = (
         resting("sugar_box", Orientation.UPRIGHT_0, floor=-too_tall, name=stands.name)
@@ -144,37 +144,37 @@ def test_what_is_not_as_tall_as_it_is_taken_for_is_lowered_until_it_touches(
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, PickPlacePlan)
-    carried = StationSimulation(DEFAULT_CELL, scene_of(stands)).execute(plan)
-    assert carried.lowered_distance == pytest.approx(too_tall + 0.003, abs=0.002)
-    assert carried.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
+    result = StationSimulation(DEFAULT_CELL, scene_of(stands)).execute(plan)
+    assert result.lowered_distance == pytest.approx(too_tall + 0.003, abs=0.002)
+    assert result.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
 
 
-def test_what_stands_higher_than_it_was_to_is_not_pressed_down() -> None:
-    """The support is believed 10.5 mm too low, more than the bellows give way; and a way that was optimised hits too hard."""
+def test_a_guarded_descent_stops_at_an_unexpectedly_high_support() -> None:
+    """The support is estimated 10.5 mm too low, which exceeds the stroke of the bellows."""
     box, support = SCENE["sugar_box"], resting("cracker_box", xy=(0.2, -0.2))
     top = support.top_height
     X_TO = Pose((0.2, -0.2, top - 0.0105 + 0.0875), box.X_TO.quaternion)
     slow = PlannerConfig(max_guarded_descent=0.08, optimize=False)
     plan = PickPlacePlanner(DEFAULT_CELL, slow).plan([box], box.name, X_TO)
     assert isinstance(plan, PickPlacePlan)
-    carried = StationSimulation(DEFAULT_CELL, scene_of(box, support)).execute(plan)
-    assert carried.lowered_distance < 0.002
-    assert carried.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
-    assert carried.displacements[support.name] < 0.005
+    result = StationSimulation(DEFAULT_CELL, scene_of(box, support)).execute(plan)
+    assert result.lowered_distance < 0.002
+    assert result.poses[box.name].p == pytest.approx([0.2, -0.2, top + 0.0875], abs=0.005)
+    assert result.displacements[support.name] < 0.005
 
 
-def test_with_nothing_on_the_cup_a_descent_ends_at_once(plan: PickPlacePlan) -> None:
+def test_a_guarded_descent_without_an_object_ends_at_once(plan: PickPlacePlan) -> None:
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08)).plan(
         SCENE.objects, "sugar_box", PLACE
     )
     assert isinstance(guarded, PickPlacePlan)
     assert guarded.max_descent == pytest.approx(0.08)
-    carried = StationSimulation(cell_with("gripper.unevenness=0"), SCENE).execute(guarded)
-    assert carried.lowered_distance < 0.002
+    result = StationSimulation(cell_with("gripper.unevenness=0"), SCENE).execute(guarded)
+    assert result.lowered_distance < 0.002
 
 
 @pytest.mark.parametrize("weldable_object", ["", "sugar_box"])
-def test_cameras_see_things_where_they_are(weldable_object: str) -> None:
+def test_visual_geometry_has_the_poses_of_the_bodies(weldable_object: str) -> None:
     classes = [(o.name, o.object_class) for o in SCENE.objects]
     options: dict[str, Any] = {
         "time_step": 0.01,
@@ -197,7 +197,7 @@ def test_cameras_see_things_where_they_are(weldable_object: str) -> None:
     assert compared >= len(SCENE.objects)
 
 
-def test_an_executor_without_a_plan_stays_at_home() -> None:
+def test_an_executor_without_a_plan_commands_the_home_configuration() -> None:
     executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
     assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(
@@ -207,8 +207,8 @@ def test_an_executor_without_a_plan_stays_at_home() -> None:
     assert executor.GetOutputPort("status").Eval(context) == ExecutorStatus()
 
 
-def test_a_cloned_context_goes_on_the_same(plan: PickPlacePlan) -> None:
-    """The executor's state is in its context, not in the system."""
+def test_a_cloned_context_continues_identically(plan: PickPlacePlan) -> None:
+    """All state of the executor is in its context."""
     executor = PickPlaceExecutor(cell=DEFAULT_CELL)
     context = executor.CreateDefaultContext()
     executor.GetInputPort("plan").FixValue(context, PlannedMove(1, plan))
@@ -229,14 +229,16 @@ def test_a_cloned_context_goes_on_the_same(plan: PickPlacePlan) -> None:
     )
 
 
-def test_the_same_plan_has_the_same_outcome(plan: PickPlacePlan) -> None:
+def test_simulation_is_deterministic(plan: PickPlacePlan) -> None:
     first, second = run(plan), run(plan)
     assert first.poses == second.poses
     assert first.max_load_ratio == second.max_load_ratio
 
 
-def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> None:
-    """What holds is placed, a marker is not planned, and neither is what carries something."""
+def test_moves_are_executed_or_refused_with_a_reason(
+    detector: LabelDetector, config: ClutterConfig
+) -> None:
+    """A box is placed; a marker and a box that carries another one are refused."""
     scene = scene_of(
         resting("pudding_box"),
         resting("gelatin_box", floor=0.035),
@@ -260,7 +262,7 @@ def test_moves_by_the_arm(detector: LabelDetector, config: ClutterConfig) -> Non
         assert not outcome.result.was_executed
 
 
-def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path) -> None:
+def test_images_and_recordings_show_the_arm(plan: PickPlacePlan, tmp_path: Path) -> None:
     motion = StationSimulation(DEFAULT_CELL, SCENE).execute(plan, record=True).motion
     assert motion[0].arm is not None
     assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)
@@ -285,23 +287,23 @@ def test_pictures_and_recording_show_the_arm(plan: PickPlacePlan, tmp_path: Path
     assert with_arm > without + 20_000, "its links, and their key frames"
 
 
-def test_pictures_are_taken_from_where_the_arm_is_not_in_the_way() -> None:
+def test_images_are_rendered_from_the_side_opposite_the_base() -> None:
     assert rotation_to_base_side(DEFAULT_CELL).tolist() == np.eye(3).tolist()
     other_side = rotation_to_base_side(cell_with("robot.base.x=0.65"))
     assert (other_side @ [-1.0, 0.0, 0.0]).tolist() == [1.0, 0.0, 0.0]
-    beside = rotation_to_base_side(cell_with("robot.base.x=0.1", "robot.base.y=-0.65"))
-    assert (beside @ [-1.0, 0.0, 0.0]).tolist() == [0.0, -1.0, 0.0]
+    side = rotation_to_base_side(cell_with("robot.base.x=0.1", "robot.base.y=-0.65"))
+    assert (side @ [-1.0, 0.0, 0.0]).tolist() == [0.0, -1.0, 0.0]
     above = rotation_to_base_side(cell_with("robot.base.x=0.0", "robot.base.y=0.0"))
     assert above.tolist() == np.eye(3).tolist()
 
 
-def test_what_is_put_on_an_edge_falls() -> None:
-    """A box is put on the edge of a slim one: it goes down when it is let go."""
+def test_an_object_placed_on_an_edge_falls() -> None:
+    """A box that is released on the edge of a slim one falls."""
     scene = scene_of(
         resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0))
     )
-    beside = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
-    plan = planned(scene, "gelatin_box", beside)
-    carried = StationSimulation(DEFAULT_CELL, scene).execute(plan)
-    assert carried.grasped
-    assert carried.poses["gelatin_box"].translation[2] < 0.1
+    X_TO_edge = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
+    plan = planned(scene, "gelatin_box", X_TO_edge)
+    result = StationSimulation(DEFAULT_CELL, scene).execute(plan)
+    assert result.grasped
+    assert result.poses["gelatin_box"].translation[2] < 0.1

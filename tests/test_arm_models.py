@@ -1,4 +1,4 @@
-"""The shipped models of arms: as their modules write them, physical, and covered by capsules."""
+"""Shipped arm models: up to date, physically valid, and covered by capsules."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ COLLISION_GEOMETRY = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_file_is_what_the_module_writes(name: str) -> None:
+def test_the_shipped_models_are_up_to_date(name: str) -> None:
     assert resource_path(f"models/robots/{name}.sdf").read_text() == MODELS[name]
 
 
@@ -52,10 +52,10 @@ def test_every_inertia_is_physical(name: str) -> None:
         ("iiwa14", 17.5, [320, 320, 176, 176, 110, 40, 40], [85, 85, 100, 75, 130, 135, 135]),
     ],
 )
-def test_masses_and_limits_are_the_published_ones(
+def test_masses_and_limits_equal_the_published_values(
     name: str, moving: float, torques: list[float], speeds_deg: list[float]
 ) -> None:
-    """Masses of the moving links [kg], torques [N m] and speeds [deg/s] of the joints."""
+    """Masses of links [kg], torque limits [N m] and velocity limits [deg/s] of joints."""
     plant = MultibodyPlant(0.0)
     (instance,) = Parser(plant).AddModels(str(resource_path(f"models/robots/{name}.sdf")))
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
@@ -67,7 +67,7 @@ def test_masses_and_limits_are_the_published_ones(
 
 
 def outside(points: NDArray[np.float64], rod: LinkPrimitive) -> float:
-    """Return by how much the outermost of some points is outside of a rod [m]."""
+    """Return the largest distance of points from a capsule's surface, outwards [m]."""
     start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     away = np.linalg.norm(points - start - along[:, None] * axis, axis=1)
@@ -75,8 +75,8 @@ def outside(points: NDArray[np.float64], rod: LinkPrimitive) -> float:
 
 
 @pytest.mark.parametrize("name", COLLISION_GEOMETRY)
-def test_the_capsules_cover_the_real_links(name: str) -> None:
-    """Each capsule holds the corners of the convex hull of its part, and is not 3 mm too thick."""
+def test_capsules_cover_the_collision_meshes(name: str) -> None:
+    """Capsules contain the convex hulls of their parts, with a margin below 3 mm."""
     with np.load(DATA / f"{name}_outline.npz") as corners:
         for number, rods in enumerate(COLLISION_GEOMETRY[name]):
             for part, rod in enumerate(rods):

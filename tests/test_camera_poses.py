@@ -1,4 +1,4 @@
-"""Cameras at any pose: the model, against Drake's images, and what they tell of free space."""
+"""Cameras at arbitrary poses: agreement with Drake's images, and free space."""
 
 import math
 from dataclasses import replace
@@ -44,12 +44,12 @@ OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9})
 
 @pytest.fixture(scope="module")
 def tilted() -> LabelDetector:
-    """One detector for all tests."""
+    """Return a detector for all tests."""
     return LabelDetector(CAMERA)
 
 
 def anywhere(seed: int) -> Camera:
-    """A camera at a random pose."""
+    """Return a camera at a random pose."""
     generator = rng(seed)
     translation, rpy_deg = (
         tuple(generator.uniform(-most, most, 3).tolist()) for most in (2.0, 180.0)
@@ -66,8 +66,8 @@ def anywhere(seed: int) -> Camera:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_points_are_found_again(seed: int) -> None:
-    """From pixels and depths to points and back, and by the compiled model as by the other."""
+def test_points_are_recovered_from_pixels_and_depths(seed: int) -> None:
+    """Backprojection inverts projection, and the compiled model agrees."""
     camera, generator = anywhere(seed), rng(seed)
     pixels, depth = generator.uniform(-50.0, 400.0, (40, 2)), generator.uniform(0.1, 5.0, 40)
     p_T = camera.backproject(pixels, depth)
@@ -98,8 +98,8 @@ def test_a_pose_in_the_camera_s_frame(seed: int) -> None:
     )
 
 
-def test_a_camera_that_looks_straight_down_is_exact() -> None:
-    """Not a bit is lost to its rotation: x, -y and the difference of heights, also in 32 bit."""
+def test_a_vertical_camera_is_exact() -> None:
+    """Its rotation is exact: x, -y and height differences, also with 32 bits."""
     camera, p_T = DEFAULT_CELL.camera, rng(0).uniform(-0.5, 0.5, (100, 3))
     assert camera.is_vertical
     assert not CAMERA.is_vertical
@@ -113,7 +113,7 @@ def test_a_camera_that_looks_straight_down_is_exact() -> None:
     assert (camera.floor_depth == np.float32(1.6)).all()
 
 
-def test_the_floor_s_depth_and_its_horizon() -> None:
+def test_floor_depth_and_horizon() -> None:
     pixels = pixel_grid((480, 640))
     assert CAMERA.backproject(pixels, CAMERA.floor_depth.astype(float))[..., 2] == pytest.approx(
         0.0, abs=1e-6
@@ -133,15 +133,17 @@ def test_the_floor_s_depth_and_its_horizon() -> None:
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: LabelDetector) -> None:
-    """As `test_rays.py` has it for a vertical one, by the same tolerances."""
-    look, rendered = tilted.perceive(scene), tilted.renderer.render_label(scene)
+    """Same tolerances as for a vertical camera in `test_rays.py`."""
+    perception, rendered = tilted.perceive(scene), tilted.renderer.render_label(scene)
     observation, shares = RAYS.observe(scene)
-    assert shares == pytest.approx(look.visible_fractions, abs=0.003)
-    assert [d.name for d in observation.detections] == [d.name for d in look.observation.detections]
+    assert shares == pytest.approx(perception.visible_fractions, abs=0.003)
+    assert [d.name for d in observation.detections] == [
+        d.name for d in perception.observation.detections
+    ]
     cast = labels(scene, OPEN_MINDED)
     assert (cast == rendered).mean() >= 0.9999
     errors = [
-        np.abs(observation.depth - look.observation.depth)[
+        np.abs(observation.depth - perception.observation.depth)[
             binary_erosion((rendered == k) & (cast == k))
         ]
         for k in range(len(scene.objects))
@@ -152,7 +154,7 @@ def test_rays_of_a_tilted_camera_meet_what_it_renders(scene: Scene, tilted: Labe
     assert error.max() < 1e-4
 
 
-def test_the_floor_of_a_tilted_camera_is_the_rendered_one(tilted: LabelDetector) -> None:
+def test_floor_depth_of_a_tilted_camera_equals_the_rendered_depth(tilted: LabelDetector) -> None:
     rendered = tilted.renderer.render(scene_of()).depth
     pixels = pixel_grid(rendered.shape)
     inside = (np.abs(CAMERA.backproject(pixels, CAMERA.floor_depth)[..., :2]) < 0.30).all(axis=-1)
@@ -160,8 +162,8 @@ def test_the_floor_of_a_tilted_camera_is_the_rendered_one(tilted: LabelDetector)
 
 
 @pytest.mark.parametrize("rpy_deg", [(215.0, 10.0, 70.0), (170.0, -20.0, -130.0)])
-def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]) -> None:
-    """Each at 1.3 m from a point above the tray's middle; some objects are cut off by the frame."""
+def test_rays_of_cameras_in_all_orientations(rpy_deg: tuple[float, float, float]) -> None:
+    """Cameras at 1.3 m from a point above the tray's center; the frame cuts off some objects."""
     axis = Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()[:, 2]
     pose = PoseSpec(
         translation=tuple((np.array([0.0, 0.0, 0.1]) - 1.3 * axis).tolist()), rpy_deg=rpy_deg
@@ -175,7 +177,7 @@ def test_rays_of_cameras_turned_in_every_way(rpy_deg: tuple[float, float, float]
 
 
 def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDetector) -> None:
-    """As `test_camera.py` has it; where a corner comes to a tip, no pixel's middle may be in it."""
+    """As in `test_camera_renderer.py`; no pixel center may lie in the tip of a corner."""
     label, shifts = tilted.renderer.render_label(SCATTERED), []
     for index, o in enumerate(SCATTERED.objects):
         corners, centroid = outline(tilted.renderer, o)
@@ -190,7 +192,7 @@ def test_project_agrees_with_the_label_image_of_a_tilted_camera(tilted: LabelDet
 def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(
     detector: LabelDetector, tilted: LabelDetector
 ) -> None:
-    """What stands close behind a high box, from where the camera is."""
+    """The object stands close behind a high box, seen from the camera."""
     scene = scene_of(
         resting("cracker_box", Orientation.UPRIGHT_0, (0.0, 0.0), name="wall"),
         resting("gelatin_box", xy=(0, 0.08)),
@@ -199,7 +201,7 @@ def test_hidden_from_a_tilted_camera_is_not_hidden_from_above(
     assert detector.perceive(scene).visible_fractions["gelatin_box"] == 1.0
 
 
-def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
+def test_an_object_that_reaches_behind_the_camera_is_not_visible() -> None:
     low = Camera(pose=PoseSpec(translation=(0.0, 0.0, 0.3), rpy_deg=(-100.0, 0.0, 0.0)))
     beneath = scene_of(
         resting("sugar_box", xy=(0.0, -0.05), name="beneath"), resting("gelatin_box", xy=(0.0, 0.9))
@@ -212,8 +214,8 @@ def test_an_object_that_reaches_behind_the_camera_is_out_of_its_sight() -> None:
 
 
 @pytest.mark.parametrize("name", ["cracker_box", "sugar_box", "tomato_soup_can", "gelatin_box"])
-def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelDetector) -> None:
-    """As well as from above, and the true pose explains the object's own pixels."""
+def test_poses_are_fitted_to_images_of_a_tilted_camera(name: str, tilted: LabelDetector) -> None:
+    """As accurately as from above; the true pose explains the object's pixels."""
     scene = scene_of(
         resting(name, Orientation.FLAT_30, (-0.15, 0.1), name="it"),
         resting("pudding_box", xy=(0.2, -0.1), name="another"),
@@ -232,7 +234,7 @@ def test_poses_are_fitted_to_what_a_tilted_camera_sees(name: str, tilted: LabelD
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DEFAULT_CELL.camera], ids=["tilted", "vertical"])
-def test_the_network_s_window_holds_the_tray(camera: Camera) -> None:
+def test_the_crop_of_the_network_contains_the_tray(camera: Camera) -> None:
     window = ImageWindow.around_support(camera, tray(0.70))
     corners = camera.project(
         np.array([[x, y, z] for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)])
@@ -251,8 +253,8 @@ def test_detections_are_drawn(tilted: LabelDetector) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetector) -> None:
-    """Free of what is seen and of what is hidden."""
+def test_placements_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetector) -> None:
+    """Placements are free of visible and of hidden objects."""
     scene = random_scene(seed)
     observation, generator = tilted.perceive(scene).observation, rng(seed)
     moves = legal_moves(observation)
@@ -265,8 +267,8 @@ def test_places_seen_by_a_tilted_camera_are_free(seed: int, tilted: LabelDetecto
     assert checked >= 5
 
 
-def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
-    """Behind a wall the air is unseen although nothing is above it, and so it is out of the frame."""
+def test_free_space_is_along_the_rays(tilted: LabelDetector) -> None:
+    """Space behind a wall and outside of the frame is unobserved, although nothing is above it."""
     observation = tilted.perceive(
         scene_of(resting("cracker_box", Orientation.UPRIGHT_0, name="wall"))
     ).observation
@@ -284,8 +286,8 @@ def test_seen_through_is_along_the_rays(tilted: LabelDetector) -> None:
     assert has_clear_top(observation, observation["wall"])
 
 
-def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
-    """All that a hidden object fills, save beside the known one, is in a block; nothing before it is."""
+def test_space_behind_known_objects_is_occluded(tilted: LabelDetector) -> None:
+    """Occluded boxes contain hidden objects, except next to known ones, and no observed space."""
     wall = resting("cracker_box", Orientation.UPRIGHT_0, name="wall")
     hidden = resting("gelatin_box", xy=(0.0, 0.072), name="hidden")
     empty = tilted.perceive(scene_of()).observation.depth
@@ -296,8 +298,10 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
         -1, 3
     )
     p_T = hidden.X_TO.apply(grid * np.asarray(hidden.object_class.size) / 2)
-    beside = (np.abs(p_T - wall.X_TO.p) < np.ptp(wall.corners_T, axis=0) / 2 + 0.03).all(axis=1)
-    unseen = p_T[~is_observed_free(observation, p_T) & ~beside & (p_T[:, 2] > 0.012)]
+    is_near_wall = (np.abs(p_T - wall.X_TO.p) < np.ptp(wall.corners_T, axis=0) / 2 + 0.03).all(
+        axis=1
+    )
+    unseen = p_T[~is_observed_free(observation, p_T) & ~is_near_wall & (p_T[:, 2] > 0.012)]
     full = np.zeros(len(unseen), bool)
     for block in blocks:
         c, s = math.cos(block.yaw), math.sin(block.yaw)
@@ -308,8 +312,8 @@ def test_space_behind_what_is_known_is_unseen(tilted: LabelDetector) -> None:
     assert all(block.center[1] > 0.03 for block in blocks)
 
 
-def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
-    """Something nameless of 28 mm is a block; floor and rim, at a depth that changes, are none."""
+def test_unidentified_flat_objects_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
+    """An unidentified object of 28 mm gives an occluded box; floor and rim give none."""
     empty = tilted.perceive(scene_of()).observation.depth
     assert occluded_boxes([], tilted.perceive(scene_of()).observation, empty) == ()
     stranger = resting("gelatin_box", xy=(0.1, 0.1), name="stranger")
@@ -334,14 +338,14 @@ def test_flat_things_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
         ),
     ],
 )
-def test_a_camera_that_sees_nothing_of_the_support_is_refused(setting: str, message: str) -> None:
+def test_a_camera_that_does_not_see_the_support_is_refused(setting: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         load_config_as(DEFAULT_CELL, settings=[setting])
     assert "\n" not in str(raised.value)
 
 
-def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
-    """Every camera of a cell is rendered, the names of its files begin with its own."""
+def test_a_second_camera_may_see_something_else(tmp_path: Path) -> None:
+    """All cameras of a cell are rendered to files with the camera's name as prefix."""
     aside = "{pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}, width: 64, height: 48}"
     world = world_with(f"cell.cameras.aside={aside}")
     assert world.cell.camera == DEFAULT_CELL.camera
@@ -358,7 +362,7 @@ def test_a_second_camera_may_look_elsewhere(tmp_path: Path) -> None:
         world_with(f"cell.cameras={{a/b: {aside}}}")
 
 
-def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
+def test_depth_noise_of_an_earlier_scenario_moves_to_the_camera() -> None:
     scenario = load_config_as(
         Scenario(),
         settings=["camera_noise=false", "world.cell.robot.base.x=-0.7"],
@@ -370,10 +374,10 @@ def test_the_noise_of_an_older_scenario_is_the_camera_s() -> None:
 
 
 @pytest.mark.parametrize("height", [0.10, 0.15, 0.30, 0.60])
-def test_blocks_of_what_is_unknown_end_with_the_support_however_low_the_camera(
+def test_occluded_boxes_end_at_the_support_for_low_cameras(
     height: float,
 ) -> None:
-    """A stranger that stands higher than the camera hides nothing behind the camera."""
+    """An unidentified object above the camera occludes nothing behind the camera."""
     camera = Camera(
         pose=PoseSpec(translation=(0.0, -1.0, height), rpy_deg=(-90.0 - 20.0 * height, 0.0, 0.0))
     )

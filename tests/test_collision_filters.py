@@ -1,4 +1,4 @@
-"""What is left out of collision checks: only what cannot collide."""
+"""Collision filters exclude only collisions that cannot occur."""
 
 from pathlib import Path
 
@@ -17,8 +17,12 @@ from drake_clutter.validation import override_config, to_plain
 
 _LINK = """
   <link name="{name}">
-    <inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><origin xyz="{x} 0 0.1"/><geometry><box size="{length} 0.1 0.1"/></geometry></collision>
+    <inertial>
+      <mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <collision>
+      <origin xyz="{x} 0 0.1"/><geometry><box size="{length} 0.1 0.1"/></geometry>
+    </collision>
   </link>"""
 _JOINT = """
   <joint name="{name}" type="{kind}">
@@ -28,15 +32,17 @@ _JOINT = """
 
 
 def arm(folder: Path, kind: str, axis: str, length: float) -> RobotSpec:
-    """Two links; the first is `length` long, and moved by a joint of a kind."""
+    """Return an arm of two links; the first has a length [m] and a joint of a type."""
     links = [("foot", 0.1), ("boom", length), ("end", 0.1)]
-    made = "".join(_LINK.format(name=name, length=size, x=size / 2 - 0.05) for name, size in links)
-    made += _JOINT.format(name="first", kind=kind, parent="foot", child="boom", x=0, axis=axis)
-    made += _JOINT.format(
+    elements = "".join(
+        _LINK.format(name=name, length=size, x=size / 2 - 0.05) for name, size in links
+    )
+    elements += _JOINT.format(name="first", kind=kind, parent="foot", child="boom", x=0, axis=axis)
+    elements += _JOINT.format(
         name="second", kind="revolute", parent="boom", child="end", x=length, axis="0 0 1"
     )
     path = folder / f"{kind}.urdf"
-    path.write_text(f'<robot name="arm">{made}</robot>')
+    path.write_text(f'<robot name="arm">{elements}</robot>')
     spec = {
         "model": str(path),
         "base_link": "foot",
@@ -56,7 +62,7 @@ def among_posts(spec: RobotSpec, p_TF: tuple[float, float, float]) -> WorkCell:
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_the_first_link_of_an_articulated_arm_stays_in_place(name: str) -> None:
+def test_the_first_link_of_an_articulated_arm_is_stationary(name: str) -> None:
     links = robot(name).link_depths
     assert set(stationary_links(robot(name))) == {
         link for link, moved_by in links.items() if moved_by <= 1
@@ -70,7 +76,7 @@ def test_the_first_link_of_an_articulated_arm_stays_in_place(name: str) -> None:
         ("prismatic", "0 1 0", 0.5, (-0.7, 0.5, 0.9)),
     ],
 )
-def test_a_first_link_that_reaches_out_or_slides_may_hit_a_fixture(
+def test_a_first_link_that_is_long_or_slides_is_checked_against_fixtures(
     kind: str, axis: str, q: float, p_TF: tuple[float, float, float], tmp_path: Path
 ) -> None:
     spec = arm(tmp_path, kind, axis, 0.7)
@@ -85,8 +91,8 @@ def test_a_first_link_that_reaches_out_or_slides_may_hit_a_fixture(
     assert close_to_boom(q) == {"post"}
 
 
-def test_an_object_may_have_the_name_of_a_link() -> None:
-    """Of how near it is, and how that changes with the joints, its name changes nothing."""
+def test_an_object_may_share_the_name_of_a_link() -> None:
+    """Distances and gradients do not depend on the name."""
     found = {}
     for name in ("cup", "other"):
         held, near = (

@@ -1,4 +1,4 @@
-"""Plans of other robots than the default one, checked at samples of the test's own."""
+"""Plans of several robots are checked at independent samples."""
 
 import math
 
@@ -44,9 +44,9 @@ def cell_of(name: str) -> WorkCell:
     return load_cell(resource_path(f"models/cells/{name}_epick_tray.yaml"))
 
 
-def place_of(o: SceneObject, x: float, y: float, turn: float) -> Pose:
-    """A millimeter above the tray, turned about the vertical [rad]."""
-    c, s = math.cos(turn), math.sin(turn)
+def place_pose(o: SceneObject, x: float, y: float, yaw: float) -> Pose:
+    """Return a place pose 1 mm above the tray, rotated about the vertical by yaw [rad]."""
+    c, s = math.cos(yaw), math.sin(yaw)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ o.X_TO.rotation
     return Pose.from_rotation(R, (x, y, o.X_TO.translation[2] + 0.001))
 
@@ -57,7 +57,7 @@ def samples(phase: TrajectorySegment, order: int = 0) -> np.ndarray:
     return np.array(values)
 
 
-def limits_hold(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
+def assert_limits(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
     robot, loaded = planner.tool.robot, Payload(plan.mass, plan.p_GCm)
     lower, upper = robot.position_limits.T
     for phase in plan.segments:
@@ -68,12 +68,12 @@ def limits_hold(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
         plant = dynamics_plant(planner.cell, loaded if phase.name == "carry" else Payload())
         assert np.abs(v / robot.velocity_limits).max() < 1.01
         assert np.abs(inverse_dynamics(plant, q, v, a) / robot.torque_limits).max() < 1.01
-        # A sure carry is softened, and so quicker at corners.
+        # Smoothing of the time scaling may exceed the limit in unoptimized segments.
         if phase.name != "carry" or phase.duration < phase.unoptimized_duration:
             assert np.abs(a / robot.acceleration_limits).max() < 1.01
 
 
-def nothing_is_hit(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
+def assert_collision_free(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
     scene = planner.collision_model(PILE)
     for phase in plan.segments:
         scene.set_object_poses(PILE)
@@ -89,7 +89,7 @@ def nothing_is_hit(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
                 assert here.distance > -0.001
 
 
-def ends_are_right(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
+def assert_endpoints(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
     home = planner.tool.robot.home
     approach, carry, retreat = (phase.trajectory for phase in plan.segments)
     assert approach.value(0.0).ravel() == pytest.approx(home)
@@ -101,31 +101,31 @@ def ends_are_right(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
         assert planner.tool.pose(carry.value(time).ravel()) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("optimise", [False, True])
+@pytest.mark.parametrize("optimize", [False, True])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_plan_of_another_robot_holds(name: str, optimise: bool) -> None:
-    planner = PickPlacePlanner(cell_of(name), PlannerConfig(optimize=optimise))
+def test_plans_of_other_robots_are_feasible(name: str, optimize: bool) -> None:
+    planner = PickPlacePlanner(cell_of(name), PlannerConfig(optimize=optimize))
     by_name = {o.name: o for o in PILE}
-    for pick, x, y, turn in MOVES:
-        place = place_of(by_name[pick], x, y, turn)
+    for pick, x, y, yaw in MOVES:
+        place = place_pose(by_name[pick], x, y, yaw)
         plan = planner.plan(PILE, pick, place)
         assert isinstance(plan, PickPlacePlan), f"{pick}: {plan}"
         assert rigid_transform(plan.X_TO_place).IsNearlyEqualTo(rigid_transform(place), 1e-12)
-        limits_hold(planner, plan)
-        nothing_is_hit(planner, plan)
-        ends_are_right(planner, plan)
+        assert_limits(planner, plan)
+        assert_collision_free(planner, plan)
+        assert_endpoints(planner, plan)
         axis = planner.tool.axis(samples(plan.segments[1]))
         tilt = np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), -axis[:, 2])
         assert np.degrees(tilt).max() < 1.0
-        assert plan.duration < (0.95 if optimise else 1.01) * plan.unoptimized_duration
+        assert plan.duration < (0.95 if optimize else 1.01) * plan.unoptimized_duration
 
 
 @pytest.mark.parametrize("name", ["iiwa14", "ur5e"])
-def test_an_object_is_lowered_by_another_robot(name: str) -> None:
+def test_other_robots_plan_guarded_descents(name: str) -> None:
     config = PlannerConfig(optimize=False, max_guarded_descent=0.04, descent_start_offset=0.02)
     planner = PickPlacePlanner(cell_of(name), config)
     box = PILE[0]
-    plan = planner.plan(PILE, box.name, place_of(box, 0.15, -0.15, 0.3))
+    plan = planner.plan(PILE, box.name, place_pose(box, 0.15, -0.15, 0.3))
     assert isinstance(plan, PickPlacePlan)
     assert plan.guarded_descent is not None
     assert plan.max_descent >= 0.02
@@ -137,11 +137,13 @@ def test_an_object_is_lowered_by_another_robot(name: str) -> None:
     assert p_TG[0, 2] - p_TG[-1, 2] == pytest.approx(plan.max_descent, abs=1e-4)
 
 
-def test_gradients_of_distances_of_seven_joints() -> None:
-    planner, draw, step = PickPlacePlanner(cell_of("iiwa14"), PlannerConfig()), rng(0), 1e-5
+def test_distance_gradients_of_seven_joints() -> None:
+    planner = PickPlacePlanner(cell_of("iiwa14"), PlannerConfig())
+    generator = rng(0)
+    step = 1e-5
     scene, checked = planner.collision_model(PILE[:2]), 0
     for _ in range(20):
-        q = planner.tool.robot.home + draw.normal(0.0, 0.2, 7)
+        q = planner.tool.robot.home + generator.normal(0.0, 0.2, 7)
         for here, gradient in scene.distances_and_gradients(q, 0.3):
             sides = []
             for joint in range(7):
@@ -165,8 +167,8 @@ def with_wall(translation: tuple[float, float, float], box: tuple[float, float, 
     return DEFAULT_CELL.model_copy(update={"fixtures": (*DEFAULT_CELL.fixtures, wall)})
 
 
-def test_a_fixture_of_the_cell_is_avoided() -> None:
-    box, X_TO = PILE[0], place_of(PILE[0], 0.20, -0.25, 0.0)
+def test_fixtures_of_the_cell_are_avoided() -> None:
+    box, X_TO = PILE[0], place_pose(PILE[0], 0.20, -0.25, 0.0)
     between = PickPlacePlanner(with_wall((0.12, -0.15, 0.13), (0.05, 0.05, 0.26)), PlannerConfig())
     free = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan([box], box.name, X_TO)
     passed = between.plan([box], box.name, X_TO)

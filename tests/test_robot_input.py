@@ -1,4 +1,4 @@
-"""What of a robot cannot be used is said in one line: field, value, and what is allowed."""
+"""Invalid robots are refused in one line with field, value and what is allowed."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ PLACES = "a value for each joint, here or in the model file"
 
 
 def changed(spec: RobotSpec, **fields: Any) -> RobotSpec:
-    """The specification with other fields; those of its limits begin with `limits_`."""
+    """Return the specification with other fields; those of the limits have the prefix `limits_`."""
     limits = {k.removeprefix("limits_"): v for k, v in fields.items() if k.startswith("limits_")}
     others = {k: v for k, v in fields.items() if not k.startswith("limits_")}
     return spec.model_copy(update={**others, "limits": spec.limits.model_copy(update=limits)})
@@ -66,12 +66,14 @@ def message(spec: RobotSpec) -> str:
         ),
     ],
 )
-def test_a_specification_that_does_not_fit_its_model(fields: dict[str, Any], expected: str) -> None:
+def test_a_specification_that_does_not_match_its_model_is_refused(
+    fields: dict[str, Any], expected: str
+) -> None:
     assert message(changed(robot("ur5e").spec, **fields)) == expected
 
 
 def test_a_frame_below_the_last_moving_joint_only(tmp_path: Path) -> None:
-    """The arm ends at the wrist: then the last joint moves something else."""
+    """If the tool frame is at the wrist, the last joint does not move it."""
     spec = changed(robot("ur5e").spec, tool_frame="wrist_2")
     allowed = "does not move the tool frame; allowed is an arm alone"
     assert message(spec).endswith(f"ur5e.sdf: joint 'wrist_3_joint' {allowed}")
@@ -85,7 +87,7 @@ def test_a_frame_below_the_last_moving_joint_only(tmp_path: Path) -> None:
         ('effort="150"', "torque"),
     ],
 )
-def test_a_joint_without_a_limit(tmp_path: Path, taken_out: str, kind: str) -> None:
+def test_a_joint_without_a_limit_is_refused(tmp_path: Path, taken_out: str, kind: str) -> None:
     before, after = ros_urdf().split('<joint name="elbow_joint"')
     text = before + '<joint name="elbow_joint"' + after.replace(taken_out, "", 1)
     if kind == "position":
@@ -99,8 +101,8 @@ def test_a_joint_without_a_limit(tmp_path: Path, taken_out: str, kind: str) -> N
     assert arm.joint_names[2] == "elbow_joint"
 
 
-def test_an_inverse_that_does_not_fit(tmp_path: Path) -> None:
-    """A seventh joint; and an elbow whose axis is not parallel to that of the shoulder."""
+def test_a_closed_form_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    """A seventh joint, or an elbow axis that is not parallel to the shoulder axis."""
     spec = changed(robot("iiwa14").spec, ik="ur")
     expected = "robot.ik: 'ur' (iiwa14.sdf is no arm of the UR family: 7 joints)"
     assert message(spec) == f"{expected}; allowed is 'numerical'"
@@ -112,7 +114,7 @@ def test_an_inverse_that_does_not_fit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["visual", "collision"])
-def test_a_mesh_that_is_missing(tmp_path: Path, kind: str) -> None:
+def test_a_missing_mesh_is_refused(tmp_path: Path, kind: str) -> None:
     mesh = f'<{kind}><geometry><mesh filename="package://arms/tool.obj"/></geometry></{kind}>'
     text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
     spec = ros_spec(tmp_path, text)
@@ -123,7 +125,7 @@ def test_a_mesh_that_is_missing(tmp_path: Path, kind: str) -> None:
     assert load_robot(changed(spec, payload=4.0)).num_joints == 6
 
 
-def test_files_that_are_no_models(tmp_path: Path) -> None:
+def test_other_model_files_are_refused(tmp_path: Path) -> None:
     spec = ros_spec(tmp_path, "<robot")
     text = message(spec)
     assert text.startswith(f"{spec.model}: is not XML (")
@@ -132,7 +134,7 @@ def test_files_that_are_no_models(tmp_path: Path) -> None:
     assert message(changed(spec, payload=3.0)).startswith(("robot.base_link:", f"{spec.model}:"))
 
 
-def test_an_stl_that_is_none(tmp_path: Path) -> None:
+def test_an_invalid_stl_is_refused(tmp_path: Path) -> None:
     mesh = '<visual><geometry><mesh filename="tool.stl"/></geometry></visual>'
     text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
     spec = ros_spec(tmp_path, text)
@@ -146,7 +148,7 @@ def test_an_stl_that_is_none(tmp_path: Path) -> None:
     assert load_robot(changed(spec, payload=2.0)).num_joints == 6
 
 
-def test_a_gripper_in_the_arms_file() -> None:
+def test_a_gripper_in_the_file_of_the_arm_is_refused() -> None:
     spec = bullet_iiwa()
     assert message(changed(spec, tool_frame="lbr_iiwa_link_5")).endswith(
         "model.urdf: joint 'lbr_iiwa_joint_6' does not move the tool frame; allowed is an arm alone"
@@ -178,15 +180,15 @@ def test_a_gripper_in_the_arms_file() -> None:
         ),
     ],
 )
-def test_a_damaged_arm(tmp_path: Path, before: str, after: str, expected: str) -> None:
+def test_a_damaged_arm_is_refused(tmp_path: Path, before: str, after: str, expected: str) -> None:
     spec = ros_spec(tmp_path, ros_urdf().replace(before, after, 1))
     text = message(spec)
     assert text.startswith(f"{spec.model}: ")
     assert expected in text
 
 
-def test_an_arm_that_can_hit_nothing(tmp_path: Path) -> None:
-    """Its motions would be planned through everything."""
+def test_an_arm_without_collision_geometry_is_refused(tmp_path: Path) -> None:
+    """Its plans would pass through obstacles."""
     spec = ros_spec(tmp_path, ros_urdf())
     with pytest.raises(InputError) as raised:
         validate_models(DEFAULT_CELL.model_copy(update={"robot": spec}))

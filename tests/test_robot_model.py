@@ -1,4 +1,4 @@
-"""Robots as data: kinematics and limits of the robot of every shipped cell, and of a URDF."""
+"""Robot models: kinematics and limits of the shipped robots, and of a URDF."""
 
 import re
 from itertools import pairwise
@@ -31,14 +31,14 @@ def robot(name: str) -> RobotModel:
     return load_robot(load_cell(resource_path(f"models/cells/{name}_epick_tray.yaml")).robot)
 
 
-def drawn(arm: RobotModel, count: int, seed: int = 0) -> Floats:
-    """Configurations within the limits, and within half a turn."""
+def random_configurations(arm: RobotModel, count: int, seed: int = 0) -> Floats:
+    """Return random configurations within the limits and [-pi, pi]."""
     lower, upper = np.clip(arm.position_limits, -np.pi, np.pi).T
     return rng(seed).uniform(lower, upper, (count, arm.num_joints))
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_drake_agrees_on_poses_and_jacobians(name: str) -> None:
+def test_poses_and_jacobians_agree_with_drake(name: str) -> None:
     arm, plant = robot(name), MultibodyPlant(0.0)
     instance = add_robot(plant, arm, visuals=False)
     plant.Finalize()
@@ -46,7 +46,7 @@ def test_drake_agrees_on_poses_and_jacobians(name: str) -> None:
     flange = plant.GetFrameByName(arm.spec.tool_frame, instance)
     base = plant.GetFrameByName(arm.spec.base_link, instance)
     assert plant.num_actuated_dofs(instance) == arm.num_joints
-    for q in drawn(arm, 100):
+    for q in random_configurations(arm, 100):
         plant.SetPositions(context, q)
         X_BF = plant.CalcRelativeTransform(context, base, flange).GetAsMatrix4()
         np.testing.assert_allclose(arm.forward_kinematics(q), X_BF, atol=1e-9)
@@ -55,14 +55,14 @@ def test_drake_agrees_on_poses_and_jacobians(name: str) -> None:
         J = plant.CalcJacobianSpatialVelocity(*along)
         R_BT = arm.X_TB.rotation().matrix().T
         np.testing.assert_allclose(arm.jacobian(q), np.kron(np.eye(2), R_BT) @ J, atol=1e-9)
-        worth = np.sqrt(max(np.linalg.det(J @ J.T), 0.0))
-        assert arm.manipulability(q) == pytest.approx(worth, abs=1e-9)
+        manipulability = np.sqrt(max(np.linalg.det(J @ J.T), 0.0))
+        assert arm.manipulability(q) == pytest.approx(manipulability, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", URS)
 def test_the_closed_form_finds_every_configuration(name: str) -> None:
     arm = robot(name)
-    q = drawn(arm, 200, seed=1)
+    q = random_configurations(arm, 200, seed=1)
     X_BF = arm.forward_kinematics(q)
     found = arm.ik.solve(X_BF)
     assert found.shape == (200, arm.ik.num_solutions, 6)
@@ -77,7 +77,7 @@ def test_the_closed_form_finds_every_configuration(name: str) -> None:
 def test_the_numerical_solver_reaches_nearly_all_poses(name: str) -> None:
     arm = robot(name)
     ik = NumericalInverseKinematics(arm.chain, arm.joint_range, arm.home)
-    X_BF = arm.forward_kinematics(drawn(arm, 200, seed=2))
+    X_BF = arm.forward_kinematics(random_configurations(arm, 200, seed=2))
     found = ik.solve(X_BF)
     np.testing.assert_array_equal(found, ik.solve(X_BF))
     reached = np.isfinite(found[..., 0])
@@ -93,11 +93,11 @@ def test_the_numerical_solver_reaches_nearly_all_poses(name: str) -> None:
     assert ik.follow(far, arm.home) is None
 
 
-def test_the_ur10_is_what_it_was_to_the_bit() -> None:
+def test_the_ur10_equals_its_closed_form_exactly() -> None:
     arm, parameters = robot("ur10"), kinematics.UR10_PARAMETERS
     assert arm.ur_fit is not None
     assert (arm.ur_fit.parameters, arm.ur_fit.X_B0, arm.ur_fit.X_6F) == (parameters, None, None)
-    q = drawn(arm, 500, seed=3)
+    q = random_configurations(arm, 500, seed=3)
     X_BF = kinematics.forward_kinematics(q)
     np.testing.assert_array_equal(arm.forward_kinematics(q), X_BF)
     np.testing.assert_array_equal(arm.ik.solve(X_BF), kinematics.ik_branches(X_BF))
@@ -110,8 +110,8 @@ def test_the_ur10_is_what_it_was_to_the_bit() -> None:
     assert arm.torque_limits.tolist() == [330, 330, 150, 56, 56, 56]
 
 
-def column(arm: RobotModel, q: Floats, heights: Floats) -> Floats:
-    """Poses of the flange over that of q, (m, 4, 4)."""
+def poses_above(arm: RobotModel, q: Floats, heights: Floats) -> Floats:
+    """Return flange poses vertically above that of q. Shape (m, 4, 4)."""
     X_BF = np.broadcast_to(arm.forward_kinematics(q), (len(heights), 4, 4)).copy()
     X_BF[:, 2, 3] += heights
     return X_BF
@@ -121,7 +121,7 @@ def column(arm: RobotModel, q: Floats, heights: Floats) -> Floats:
 def test_a_path_is_tracked_on_its_branch(name: str) -> None:
     arm = robot(name)
     start = arm.home + 0.1
-    X_BF = column(arm, start, np.linspace(0.0, 0.1, 6))
+    X_BF = poses_above(arm, start, np.linspace(0.0, 0.1, 6))
     path = arm.ik.track(X_BF, start)
     assert path is not None
     np.testing.assert_array_equal(path[0], start)
@@ -131,14 +131,14 @@ def test_a_path_is_tracked_on_its_branch(name: str) -> None:
     assert end is not None
     if arm.ur_fit is not None:
         np.testing.assert_array_equal(end, path[-1])
-    assert arm.ik.track(column(arm, start, np.linspace(0.0, 3.0, 100)), start) is None
+    assert arm.ik.track(poses_above(arm, start, np.linspace(0.0, 3.0, 100)), start) is None
 
 
-def test_the_branch_is_tracked_as_by_its_number() -> None:
-    """The path is the same, to the bit, as that which follows a branch of all solutions."""
+def test_a_tracked_path_equals_one_branch_of_all_solutions() -> None:
+    """The path equals one branch of all solutions exactly."""
     arm = robot("ur10")
-    for q in drawn(arm, 50, seed=5):
-        X_BF = column(arm, q, np.linspace(0.0, 0.06, 4))
+    for q in random_configurations(arm, 50, seed=5):
+        X_BF = poses_above(arm, q, np.linspace(0.0, 0.06, 4))
         solutions = arm.ik.solve(X_BF)
         apart = np.abs((solutions[0] - q + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
         expected = solutions[:, np.nanargmin(apart)].copy()
@@ -155,7 +155,7 @@ def test_the_branch_is_tracked_as_by_its_number() -> None:
 def test_solutions_of_two_poses_are_matched() -> None:
     for name in ("ur5e", "iiwa14"):
         arm = robot(name)
-        X_BF = column(arm, arm.home, np.array([0.0, 0.02]))
+        X_BF = poses_above(arm, arm.home, np.array([0.0, 0.02]))
         q_from, q_to = arm.ik.solve(X_BF)
         matched = arm.ik.match(q_from, q_to)
         near = arm.unwrap(matched, q_from)
@@ -166,7 +166,7 @@ def test_solutions_of_two_poses_are_matched() -> None:
 
 def test_unwrapping_keeps_to_the_limits_and_to_joints_that_can_turn() -> None:
     arm = robot("iiwa14")
-    q, reference = drawn(arm, 20), drawn(arm, 20, seed=6)
+    q, reference = random_configurations(arm, 20), random_configurations(arm, 20, seed=6)
     np.testing.assert_array_equal(arm.unwrap(q, reference), q)
     limits = ((-4.0, 4.0), *((-2.0 * np.pi, 2.0 * np.pi),) * 5)
     spec = robot("ur5e").spec
@@ -209,13 +209,13 @@ def test_the_tool_stays_vertical_along_the_rows() -> None:
     assert robot("iiwa14").vertical_tool_rows is None
 
 
-def test_links_know_which_joints_move_them() -> None:
+def test_link_depths_count_the_joints_from_the_base() -> None:
     expected = ["base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"]
     assert dict(robot("ur10").link_depths) == {name: k for k, name in enumerate(expected)}
     assert list(robot("iiwa14").link_depths.values()) == list(range(8))
 
 
-def test_links_of_the_ur10_that_are_not_checked() -> None:
+def test_allowed_collision_pairs_of_the_ur10() -> None:
     pairs = set(allowed_collision_pairs(robot("ur10")))
     links = list(robot("ur10").link_depths)
     assert pairs - set(pairwise(links)) == {("base", "upper_arm"), ("wrist_1", "wrist_3")}
@@ -234,14 +234,14 @@ def bullet_iiwa() -> RobotSpec:
     )
 
 
-def test_a_urdf_is_a_robot() -> None:
-    """The iiwa that comes with pybullet: its limits, and the same kinematics as our own model."""
+def test_a_robot_is_loaded_from_a_urdf() -> None:
+    """The iiwa of pybullet has its own limits, and the kinematics of the shipped model."""
     arm, own = load_robot(bullet_iiwa()), robot("iiwa14")
     assert arm.torque_limits.tolist() == [300.0] * 7
     assert arm.velocity_limits.tolist() == [10.0] * 7
     assert np.degrees(arm.position_limits[:, 1]) == pytest.approx([170, 120] * 3 + [175])
     assert np.isinf(arm.jerk_limits).all()
-    q = drawn(arm, 20)
+    q = random_configurations(arm, 20)
     X_LF = RigidTransform([0.0, 0.0, 0.045]).GetAsMatrix4()
     theirs = arm.forward_kinematics(q) @ X_LF
     np.testing.assert_allclose(theirs, own.forward_kinematics(q), atol=1e-9)
@@ -252,7 +252,7 @@ def test_a_urdf_is_a_robot() -> None:
 
 
 def ros_urdf(offset: float = 0.0) -> str:
-    """A UR5e as ROS describes it: base_link is turned, and the tool's frame has another x."""
+    """Return a UR5e as in ROS: base_link is rotated, and the tool frame has another x axis."""
     pi = "3.141592653589793"
     joints = [
         ("shoulder_pan_joint", "0 0 0.1625", f"0 0 {pi}"),
@@ -291,14 +291,14 @@ def ros_spec(folder: Path, text: str) -> RobotSpec:
     )
 
 
-def test_the_closed_form_serves_a_ur_with_other_base_and_tool_frames(tmp_path: Path) -> None:
+def test_the_closed_form_adapts_to_other_base_and_tool_frames(tmp_path: Path) -> None:
     arm = load_robot(ros_spec(tmp_path, ros_urdf()))
     assert arm.ur_fit is not None
     own = robot("ur5e").ur_fit
     assert own is not None
     assert arm.ur_fit.parameters.a == pytest.approx(own.parameters.a)
     assert arm.ur_fit.parameters.d == pytest.approx(own.parameters.d)
-    q = drawn(arm, 100)
+    q = random_configurations(arm, 100)
     X_BF = arm.forward_kinematics(q)
     np.testing.assert_allclose(X_BF, arm.chain.forward_kinematics(q), atol=1e-9)
     found = arm.ik.solve(X_BF)
@@ -306,7 +306,7 @@ def test_the_closed_form_serves_a_ur_with_other_base_and_tool_frames(tmp_path: P
     assert (np.nanmin(apart, axis=1) < 1e-6).all()
 
 
-def test_motors_are_in_the_order_of_the_joints_whatever_the_file_s(tmp_path: Path) -> None:
+def test_actuators_are_in_the_order_of_the_joints(tmp_path: Path) -> None:
     own = robot("iiwa14").spec
     text = resource_path("models/robots/iiwa14.sdf").read_text()
     joints = re.findall(r"    <joint .*?</joint>\n", text, re.DOTALL)

@@ -1,4 +1,4 @@
-"""A shelf as a cell: a rectangular support with three walls above the table, and a board over it."""
+"""Shelf as a work cell: a rectangular support with three walls, and a board above it."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def inside(scene: Scene, config: ClutterConfig) -> bool:
     return bool((np.abs(corners[:, :2]) <= config.cell.support.half_size).all())
 
 
-def test_the_cell(shelf: ClutterConfig) -> None:
+def test_the_geometry_of_the_shelf(shelf: ClutterConfig) -> None:
     cell = shelf.cell
     assert cell.table_height == pytest.approx(-0.41)
     assert cell.robot.model == DEFAULT_CELL.robot.model
@@ -73,8 +73,8 @@ def test_both_judges_agree_on_generated_scenes(shelf: ClutterConfig) -> None:
     assert False in stable
 
 
-def test_what_slides_out_of_the_open_side_has_left(shelf: ClutterConfig) -> None:
-    """An object over the edge of the open side falls; against a wall it stands."""
+def test_an_object_beyond_the_open_side_is_unstable(shelf: ClutterConfig) -> None:
+    """An object at the edge of the open side falls; one at a wall is stable."""
     x, y = shelf.cell.support.half_size
     judge = DrakeJudge(shelf)
     for xy, stable in (((-x, 0.0), False), ((x - 0.06, 0.0), True), ((0.0, y - 0.12), True)):
@@ -82,7 +82,7 @@ def test_what_slides_out_of_the_open_side_has_left(shelf: ClutterConfig) -> None
         assert judge.judge(scene, rng()).stable is stable
 
 
-def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
+def test_free_placements_are_inside_the_walls(shelf: ClutterConfig) -> None:
     scene = Scene(
         (resting("pudding_box"), resting("sugar_box", xy=(0.0, 0.25))), shelf.cell.support
     )
@@ -98,10 +98,10 @@ def test_places_are_inside_the_rectangle(shelf: ClutterConfig) -> None:
 @pytest.mark.parametrize(
     ("board", "result"), [(0.80, MoveResult.PLACED), (0.45, MoveResult.NOT_PLANNED)]
 )
-def test_the_arm_reaches_in_or_says_why_not(
+def test_the_arm_reaches_in_or_gives_a_reason(
     shelf: ClutterConfig, board: float, result: MoveResult
 ) -> None:
-    """Under the high board a box is moved; a low one leaves the arm no room."""
+    """A box is moved under a high board; under a low one, the arm would collide."""
     world = load_config_as(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
     picked = resting("pudding_box", xy=(-0.05, 0.1))
     scene = Scene((picked, resting("cracker_box", xy=(0.1, -0.2))), world.cell.support)

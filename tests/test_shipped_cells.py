@@ -1,4 +1,4 @@
-"""Shipped cells: at home the arm is clear and out of the view; the cup gets to the tray."""
+"""Shipped cells: the home configuration is free and outside of the view; the tray is reachable."""
 
 from collections.abc import Callable
 from itertools import product
@@ -21,7 +21,7 @@ from drake_clutter.robots.robot_plant import add_robot, filter_collisions
 Floats = NDArray[np.float64]
 
 OBJECTS = 0.30
-"""Height up to which objects are to be seen [m]."""
+"""Height up to which the view of objects must be free [m]."""
 
 
 def cell_of(name: str) -> WorkCell:
@@ -29,14 +29,14 @@ def cell_of(name: str) -> WorkCell:
 
 
 def view(cell: WorkCell) -> Convex:
-    """All that is between the camera and the space over the tray."""
+    """Return the convex hull of the camera and the space above the tray."""
     x, y = cell.support.half_size
     corners = [[i * x, j * y, z] for i in (1, -1) for j in (1, -1) for z in (0.0, OBJECTS)]
     return Convex(np.array([*corners, cell.camera.X_TC.translation()]).T, "view")
 
 
 def clearance(cell: WorkCell, robot: RobotModel, with_view: bool) -> Callable[[Floats], float]:
-    """Return the distance [m] of arm and gripper to all, and to themselves, as a function of q."""
+    """Return a function from q to the smallest distance of arm and gripper [m]."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     instance = add_robot(plant, robot, visuals=False)
@@ -69,7 +69,7 @@ def clearance(cell: WorkCell, robot: RobotModel, with_view: bool) -> Callable[[F
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_home_is_clear_and_out_of_the_view(name: str) -> None:
+def test_home_is_free_of_collisions_and_outside_of_the_view(name: str) -> None:
     cell = cell_of(name)
     robot = load_robot(cell.robot)
     assert not cell.pedestal_overlaps_support
@@ -90,8 +90,8 @@ def test_home_is_clear_and_out_of_the_view(name: str) -> None:
         ("iiwa14", 0.85),
     ],
 )
-def test_the_cup_gets_to_the_tray(name: str, share: float) -> None:
-    """Straight down, at 25 places that are 5 cm from the walls or more, at three heights."""
+def test_the_gripper_reaches_the_tray(name: str, share: float) -> None:
+    """Downward poses at 25 positions, at least 5 cm from the walls, and three heights."""
     cell = cell_of(name)
     robot = load_robot(cell.robot)
     distance = clearance(cell, robot, with_view=False)

@@ -1,4 +1,4 @@
-"""The simulated station: reset, stepped, recorded, and drawn where it was."""
+"""Station simulation: reset, steps, recordings and fixtures."""
 
 from functools import partial
 from pathlib import Path
@@ -35,7 +35,7 @@ CELL = cell_with(
     "gripper.extension=0.12",
     "cameras.overhead.pose.z=1.8",
 )
-"""Base, tool and camera are elsewhere than in the default cell."""
+"""Cell whose base, tool and camera have other poses than in the default cell."""
 
 
 def planned(cell: WorkCell = CELL) -> PickPlacePlan:
@@ -48,7 +48,7 @@ def planned(cell: WorkCell = CELL) -> PickPlacePlan:
 
 
 def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
-    """X_TL of the arm's links by name; the cup gives way on its bellows, and is left out."""
+    """Return X_TL of the arm's links by name, without the cup, which moves on its bellows."""
     plant, context = simulation.station.plant, simulation.plant_context
     return {
         f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_from_transform(
@@ -63,7 +63,7 @@ def is_past(simulation: StationSimulation, time: float) -> bool:
     return bool(simulation.root.get_time() > time)
 
 
-def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
+def test_recordings_show_the_arm_at_its_simulated_poses(tmp_path: Path) -> None:
     simulation, motion, simulated = StationSimulation(CELL, SCENE), list[MotionSample](), []
     context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
     simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, planned()))
@@ -87,7 +87,7 @@ def test_the_arm_is_drawn_where_the_simulation_had_it(tmp_path: Path) -> None:
     assert np.linalg.norm(ends[1] - ends[0]) > 0.1, "it moved meanwhile"
 
 
-def test_it_begins_anew_and_does_the_same() -> None:
+def test_a_reset_simulation_repeats_itself() -> None:
     plan, simulation = planned(), StationSimulation(CELL, SCENE)
     first = simulation.execute(plan, record=True)
     simulation.reset(SCENE)
@@ -98,7 +98,7 @@ def test_it_begins_anew_and_does_the_same() -> None:
     assert again.motion == first.motion
 
 
-def test_one_plan_after_the_other() -> None:
+def test_plans_are_executed_one_after_the_other() -> None:
     simulation = StationSimulation(CELL, SCENE)
     first = simulation.execute(planned())
     assert (simulation.finished_plan, simulation.is_executing, first.lost_object) == (
@@ -119,7 +119,7 @@ def test_one_plan_after_the_other() -> None:
     )
 
 
-def test_an_arm_of_seven_joints(tmp_path: Path) -> None:
+def test_an_arm_with_seven_joints_executes_a_plan(tmp_path: Path) -> None:
     cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
     result = StationSimulation(cell, SCENE).execute(planned(cell), record=True)
     assert result.poses["pudding_box"].p[:2] == pytest.approx([0.0, -0.2], abs=0.005)
@@ -150,7 +150,7 @@ def with_board(path: Path, z: float) -> WorkCell:
 
 
 def test_a_fixture_with_a_model_is_an_obstacle(tmp_path: Path) -> None:
-    """For the simulation and for plans, by its name."""
+    """The fixture is an obstacle in simulation and in planning, and named in failures."""
     path, top = tmp_path / "board.urdf", 0.12
     path.write_text(BOARD.format(FLAP.format("fixed")))
     cell = with_board(path, top - 0.01)
@@ -170,7 +170,7 @@ STATIC = """<sdf version="1.9"><model name="post"><static>true</static><link nam
 
 
 def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
-    """Furniture is often static in its file; its pose is that of the cell."""
+    """Models of furniture are often static; the fixture's pose is used all the same."""
     path = tmp_path / "post.sdf"
     path.write_text(STATIC)
     names = ("post", "other", "ur10", "epick")
@@ -182,13 +182,14 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
     near = around.distances_below(np.array(CELL.robot.home), 3.0)
     assert all(any(name in clearance.pair for clearance in near) for name in names)
     assert around.fixture_tops == pytest.approx([0.5] * 4)
-    nailed = tmp_path / "nailed.urdf"
-    joint = '<link name="world"/><joint name="nail" type="fixed"><parent link="world"/><child link="top"/></joint>'
-    nailed.write_text(BOARD.format(joint))
+    welded = tmp_path / "welded.urdf"
+    parent = '<parent link="world"/><child link="top"/>'
+    joint = f'<link name="world"/><joint name="weld" type="fixed">{parent}</joint>'
+    welded.write_text(BOARD.format(joint))
     with pytest.raises(
         InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"
     ):
-        CollisionModel(with_board(nailed, 0.3), [])
+        CollisionModel(with_board(welded, 0.3), [])
 
 
 def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a cup can hold: seals, loads and the limits of the pull, against numbers worked out by hand."""
+"""Suction gripper: seals, load ratios and accelerations, against analytical values."""
 
 import math
 
@@ -23,10 +23,10 @@ SAMPLING = GraspSampling(spacing=0.012, max_grasps=9, min_payload_acceleration=0
 
 
 def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
-    """X_OG of a cup that points down at a height, m, beside the axis by x, m, tilted about y, rad."""
+    """Return X_OG of a cup that points down, at height and x [m], tilted about y [rad]."""
     c, s = math.cos(tilt), math.sin(tilt)
-    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ np.diag([1.0, -1.0, -1.0])
-    return RigidTransform(RotationMatrix(turn), [x, 0.0, height])
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ np.diag([1.0, -1.0, -1.0])
+    return RigidTransform(RotationMatrix(R), [x, 0.0, height])
 
 
 def test_a_flat_face_seals() -> None:
@@ -39,8 +39,8 @@ def test_a_flat_face_seals() -> None:
     ) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_an_edge_does_not() -> None:
-    """The rim of a can, and a face narrower than the cup."""
+def test_an_edge_does_not_seal() -> None:
+    """The rim of a can, and a face that is narrower than the cup, do not seal."""
     assert (
         lip_flatness_deviation(
             CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter
@@ -52,8 +52,8 @@ def test_an_edge_does_not() -> None:
     assert lip_flatness_deviation(CLASSES["gelatin_box"], narrow, 0.030) == math.inf
 
 
-def test_tilt_and_curvature_show_in_millimetres() -> None:
-    """A plane tilted by a across a ring of diameter d: d * tan(a). A cylinder of radius r: r - sqrt(r^2 - (d / 2)^2)."""
+def test_tilt_and_curvature_increase_the_flatness_deviation() -> None:
+    """It is d tan(a) for a tilt a, and r - sqrt(r^2 - d^2 / 4) for a cylinder of radius r."""
     found = lip_flatness_deviation(
         CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.cup_diameter
     )
@@ -65,8 +65,8 @@ def test_tilt_and_curvature_show_in_millimetres() -> None:
     )  # of a prism of 32 sides
 
 
-def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
-    """On all faces of the boxes, and the tops of the cans, of all fourteen classes."""
+def test_the_default_cup_is_the_widest_that_seals_on_all_objects() -> None:
+    """Faces of all boxes and tops of all cans of the fourteen classes."""
 
     def seals(diameter: float) -> bool:
         for o in load_catalog().object_set("pantry14"):
@@ -92,17 +92,17 @@ def test_the_cup_is_the_widest_that_seals_wherever_one_can() -> None:
     ]
 
 
-def test_a_marker_cannot_be_held() -> None:
+def test_a_marker_cannot_be_grasped() -> None:
     side = RigidTransform(ALONG_MINUS_X, [0.009, 0.0, 0.0])
     for diameter in (0.010, 0.015, 0.025, 0.040):
         assert lip_flatness_deviation(CLASSES["large_marker"], side, diameter) > CUP.unevenness
 
 
-def test_the_pull() -> None:
+def test_the_holding_force_is_pressure_times_area() -> None:
     assert CUP.holding_force == pytest.approx(0.8 * 101_325 * math.pi * 0.0125**2)
 
 
-def test_shares_of_a_load_by_hand() -> None:
+def test_load_ratios_of_simple_loads() -> None:
     zero = np.zeros(3)
     assert CUP.load_ratio(np.array([0.0, 0.0, CUP.holding_force]), zero) == pytest.approx(1.0)
     assert CUP.load_ratio(
@@ -111,31 +111,31 @@ def test_shares_of_a_load_by_hand() -> None:
     assert CUP.load_ratio(
         np.array([CUP.friction * CUP.holding_force, 0.0, 0.0]), zero
     ) == pytest.approx(1.0)
-    assert CUP.load_ratio(np.array([0.0, 0.0, -5.0]), zero) == 0.0, "pressed on"
+    assert CUP.load_ratio(np.array([0.0, 0.0, -5.0]), zero) == 0.0, "a pressing force"
     assert CUP.load_ratio(np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))) == pytest.approx(
         np.array([10, 20]) / CUP.holding_force
     )
 
 
-def test_what_hangs_still_pulls_with_its_weight() -> None:
+def test_the_wrench_of_a_load_at_rest_is_its_weight() -> None:
     force, moment = payload_wrench(0.5, np.array([0.02, 0.0, 0.1]), np.zeros(3))
     assert force == pytest.approx([0.0, 0.0, 0.5 * GRAVITY])
     assert moment == pytest.approx([0.0, -0.02 * 0.5 * GRAVITY, 0.0])
 
 
-def test_accelerations_that_a_grasp_bears() -> None:
-    """The higher the load's centre is from the cup, the sooner it tears off; too much is not held at all."""
+def test_the_largest_acceleration_decreases_with_the_lever() -> None:
+    """The lever is the distance of the center of mass; a load that is too heavy gives -1."""
     low = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.0]))
     high = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.15]))
     assert 0 < high < low
-    share = CUP.load_ratio(
+    ratio = CUP.load_ratio(
         *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
     )
-    assert 0.8 / CUP.safety < share <= 1.001 / CUP.safety
+    assert 0.8 / CUP.safety < ratio <= 1.001 / CUP.safety
     assert CUP.max_acceleration(CUP.holding_force / GRAVITY, np.zeros(3)) == -1.0
 
 
-def test_grasps_begin_in_the_middle_of_the_top() -> None:
+def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
     gripper: Gripper = DEFAULT_CELL.gripper
     box = resting("cracker_box", xy=(0.1, -0.2))
     found = gripper.sample_grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
@@ -148,7 +148,7 @@ def test_grasps_begin_in_the_middle_of_the_top() -> None:
     assert found[0].payload.max_acceleration >= found[-1].payload.max_acceleration >= 0.3
 
 
-def test_why_there_is_no_grasp() -> None:
+def test_reasons_why_there_is_no_grasp() -> None:
     can = resting("tomato_soup_can")
     rim = CUP.model_copy(update={"cup_diameter": 0.08})
     found = rim.sample_grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
@@ -158,7 +158,7 @@ def test_why_there_is_no_grasp() -> None:
     assert found == GraspFailure(GraspFailureReason.TOO_HEAVY, can.object_class.mass)
 
 
-def test_it_seals_where_the_lip_is_even() -> None:
+def test_a_cup_attaches_where_the_surface_is_flat() -> None:
     can = CLASSES["tomato_soup_can"]
     assert CUP.can_attach(can, on_top(0.0505))
     assert not CUP.can_attach(can, on_top(0.0505, x=0.025))

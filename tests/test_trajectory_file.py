@@ -1,4 +1,4 @@
-"""Recorded motions: written, read back the same, refused when they are something else, replayed from the command line."""
+"""Trajectory files: round trip, refusal of other files, and replay from the command line."""
 
 import json
 from pathlib import Path
@@ -41,7 +41,9 @@ def file(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Outcome]]) -> None:
+def test_written_trajectories_are_read_back(
+    file: Path, outcomes: list[tuple[Move, Outcome]]
+) -> None:
     scene, cell, moves = read_trajectories(file, load_catalog())
     assert cell == DEFAULT_CELL
     assert scene.poses == SCENE.poses
@@ -56,7 +58,7 @@ def test_what_is_written_is_read_back(file: Path, outcomes: list[tuple[Move, Out
             assert frame.poses[name].quaternion == pytest.approx(other.poses[name].quaternion)
 
 
-def test_the_cell_has_the_support_that_the_objects_stand_on(
+def test_the_cell_of_a_file_has_the_support_of_the_scene(
     outcomes: list[tuple[Move, Outcome]], tmp_path: Path
 ) -> None:
     path, other = tmp_path / "trajectory.h5", DEFAULT_CELL.with_support(tray(0.9))
@@ -66,7 +68,7 @@ def test_the_cell_has_the_support_that_the_objects_stand_on(
     assert cell == DEFAULT_CELL
 
 
-def test_the_arrays_belong_together(file: Path) -> None:
+def test_datasets_are_consistent(file: Path) -> None:
     with h5py.File(file) as stored:
         move = stored["move_0001"]
         time, q, v, torque, suction = (
@@ -74,8 +76,8 @@ def test_the_arrays_belong_together(file: Path) -> None:
         )
         assert move.attrs["result"] == MoveResult.PLACED.value
         assert move["X_TO"].shape == (len(time), 3, 7)
-    middle = (q[2:] - q[:-2]) / (time[2:] - time[:-2])[:, None]
-    assert np.abs(middle - v[1:-1]).max() < 0.15
+    mean_velocity = (q[2:] - q[:-2]) / (time[2:] - time[:-2])[:, None]
+    assert np.abs(mean_velocity - v[1:-1]).max() < 0.15
     assert np.abs(torque).max() > 10
     assert (np.abs(torque) <= [1.01 * link.max_torque for link in LINKS]).all()
     assert (np.abs(v) <= [1.01 * link.max_speed for link in LINKS]).all()
@@ -83,7 +85,7 @@ def test_the_arrays_belong_together(file: Path) -> None:
     assert len(switches) == 2, "on once, off once"
 
 
-def test_what_is_no_such_file_is_refused(file: Path, tmp_path: Path) -> None:
+def test_other_files_are_refused(file: Path, tmp_path: Path) -> None:
     catalog = load_catalog()
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(InputError, match="cannot be read as HDF5"):
@@ -101,11 +103,11 @@ def test_what_is_no_such_file_is_refused(file: Path, tmp_path: Path) -> None:
         read_trajectories(file, catalog)
 
 
-def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> None:
+def test_replay_and_plan_only_from_the_command_line(file: Path, tmp_path: Path) -> None:
     runner = CliRunner()
-    told = runner.invoke(app, ["replay", str(file), "--html", str(tmp_path / "replay.html")])
-    assert told.exit_code == 0, told.output
-    assert "gelatin_box -> tray" in told.output
+    result = runner.invoke(app, ["replay", str(file), "--html", str(tmp_path / "replay.html")])
+    assert result.exit_code == 0, result.output
+    assert "gelatin_box -> tray" in result.output
     assert (tmp_path / "replay.html").stat().st_size > 100_000
     save_scene(tmp_path / "scene.yaml", SCENE, DEFAULT_CELL)
     moves = tmp_path / "moves.yaml"
@@ -119,16 +121,16 @@ def test_replay_and_plans_from_the_command_line(file: Path, tmp_path: Path) -> N
         "arm",
         "--plan-only",
     ]
-    told = runner.invoke(app, [*arguments, "--out", str(tmp_path / "plans")])
-    assert told.exit_code == 0, told.output
-    planned, refused = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
+    result = runner.invoke(app, [*arguments, "--out", str(tmp_path / "plans")])
+    assert result.exit_code == 0, result.output
+    planned, failed = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
     assert planned["planned"]
     assert [segment["name"] for segment in planned["segments"]] == ["approach", "carry", "retreat"]
     assert planned["segments"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
     assert len(planned["segments"][1]["q"]) == len(planned["segments"][1]["time"])
-    assert (refused["planned"], refused["reason"], refused["detail"]) == (
+    assert (failed["planned"], failed["reason"], failed["detail"]) == (
         False,
         "no seal",
         "large_marker",
     )
-    assert refused["value"] is None, "its lip would be partly in the air"
+    assert failed["value"] is None, "its lip would be partly in the air"

@@ -1,4 +1,4 @@
-"""The UR10's model: as the closed form says, with the published limits, and covered by its capsules."""
+"""UR10 model: agreement with the closed form, published limits, and cover by capsules."""
 
 from pathlib import Path
 
@@ -21,32 +21,33 @@ from drake_clutter.robots.ur_kinematics import (
 from ur10 import BASE_COLLISION_GEOMETRY, LINKS, ur10_sdf
 
 OUTLINES = Path(__file__).parent / "data" / "ur10_outline.npz"
-"""Corners (V, 3), in 10 um, and triangles of each link in its frame: the meshes of ROS-Industrial's ur_description (BSD)."""
+"""Meshes of ROS-Industrial's ur_description (BSD): corners (V, 3) in 10 um and triangles."""
 
 
 @pytest.fixture(scope="module")
 def plant() -> MultibodyPlant:
-    made = MultibodyPlant(0.001)
-    Parser(made).AddModels(str(resource_path("models/robots/ur10.sdf")))
-    made.WeldFrames(made.world_frame(), made.GetFrameByName("base"))
-    made.Finalize()
-    return made
+    ur10_plant = MultibodyPlant(0.001)
+    Parser(ur10_plant).AddModels(str(resource_path("models/robots/ur10.sdf")))
+    ur10_plant.WeldFrames(ur10_plant.world_frame(), ur10_plant.GetFrameByName("base"))
+    ur10_plant.Finalize()
+    return ur10_plant
 
 
-def test_the_file_is_what_is_written() -> None:
+def test_the_shipped_model_is_up_to_date() -> None:
     assert resource_path("models/robots/ur10.sdf").read_text() == ur10_sdf()
 
 
-def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:
-    """Of the flange, its Jacobian, and the joints' order; and the inverse leads back."""
-    context, draw = plant.CreateDefaultContext(), rng(0)
+def test_kinematics_agree_with_drake(plant: MultibodyPlant) -> None:
+    """Flange pose, Jacobian and joint order agree; inverse kinematics returns to the pose."""
+    context = plant.CreateDefaultContext()
+    generator = rng(0)
     assert (
         tuple(plant.get_joint(index).name() for index in plant.GetJointIndices())[:6]
         == UR_JOINT_NAMES
     )
     flange, world = plant.GetFrameByName("flange"), plant.world_frame()
     for _ in range(200):
-        q = draw.uniform(-2 * np.pi, 2 * np.pi, 6)
+        q = generator.uniform(-2 * np.pi, 2 * np.pi, 6)
         plant.SetPositions(context, q)
         X_B6 = flange.CalcPoseInWorld(context).GetAsMatrix4()
         np.testing.assert_allclose(forward_kinematics(q), X_B6, atol=1e-9)
@@ -61,7 +62,7 @@ def test_drake_agrees_on_every_pose(plant: MultibodyPlant) -> None:
             )
 
 
-def test_limits_and_masses_are_the_published_ones(plant: MultibodyPlant) -> None:
+def test_limits_and_masses_equal_the_published_values(plant: MultibodyPlant) -> None:
     assert plant.CalcTotalMass(plant.CreateDefaultContext()) - 4.0 == pytest.approx(
         7.1 + 12.7 + 4.27 + 2 + 2 + 0.365
     )
@@ -79,18 +80,18 @@ def test_every_inertia_is_physical(plant: MultibodyPlant) -> None:
         assert M_LLo_L.IsPhysicallyValid()
 
 
-def within(points: NDArray[np.float64], rod: LinkPrimitive) -> NDArray[np.bool_]:
-    start, axis = np.array(rod.start), np.array(rod.end) - np.array(rod.start)
+def contains(points: NDArray[np.float64], capsule: LinkPrimitive) -> NDArray[np.bool_]:
+    start, axis = np.array(capsule.start), np.array(capsule.end) - np.array(capsule.start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     return np.asarray(
-        np.linalg.norm(points - start - along[..., None] * axis, axis=-1) <= rod.radius
+        np.linalg.norm(points - start - along[..., None] * axis, axis=-1) <= capsule.radius
     )
 
 
-def left_uncovered(triangles: NDArray[np.float64], rods: tuple[LinkPrimitive, ...]) -> int:
-    """Of triangles (F, 3 corners, 3): a capsule that holds all corners of one holds it whole; the others are cut into four."""
+def count_uncovered(triangles: NDArray[np.float64], capsules: tuple[LinkPrimitive, ...]) -> int:
+    """Return the number of triangles, after subdivision, that no single capsule contains."""
     for _ in range(7):
-        covered = np.any([within(triangles, rod).all(axis=1) for rod in rods], axis=0)
+        covered = np.any([contains(triangles, capsule).all(axis=1) for capsule in capsules], axis=0)
         rest = triangles[~covered]
         if not len(rest):
             return 0
@@ -106,14 +107,16 @@ def left_uncovered(triangles: NDArray[np.float64], rods: tuple[LinkPrimitive, ..
 
 
 @pytest.mark.parametrize("name", ["base", *(link.name for link in LINKS)])
-def test_the_capsules_cover_the_real_link(name: str) -> None:
+def test_capsules_cover_the_collision_mesh(name: str) -> None:
     with np.load(OUTLINES) as outlines:
         triangles = outlines[f"{name}.corners"][outlines[f"{name}.triangles"]] * 1e-5
-    rods = (
+    capsules = (
         BASE_COLLISION_GEOMETRY
         if name == "base"
         else next(link.collision_geometry for link in LINKS if link.name == name)
     )
-    assert left_uncovered(triangles, rods) == 0
-    thinner = tuple(LinkPrimitive(rod.start, rod.end, rod.radius - 0.003) for rod in rods)
-    assert left_uncovered(triangles, thinner) > 0, "no capsule is 3 mm thicker than it has to be"
+    assert count_uncovered(triangles, capsules) == 0
+    thinner = tuple(
+        LinkPrimitive(capsule.start, capsule.end, capsule.radius - 0.003) for capsule in capsules
+    )
+    assert count_uncovered(triangles, thinner) > 0, "no capsule is 3 mm thicker than it has to be"

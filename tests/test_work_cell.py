@@ -1,4 +1,4 @@
-"""The work cell's own geometry: poses, pedestal, and what it stands in."""
+"""Geometry of work cells: poses, pedestal, and overlap with the support."""
 
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def test_whether_a_turned_pedestal_stands_in_the_support(
     assert cell_with(base).pedestal_overlaps_support is stands_in
 
 
-def test_which_camera_is_the_first_counts() -> None:
+def test_cells_differ_in_the_order_of_their_cameras() -> None:
     one, two = (
         f"{name}: {{pose: {{translation: [0, 0, {z}], rpy_deg: [180, 0, 0]}}}}"
         for name, z in (("a", 1.6), ("b", 1.8))
@@ -89,8 +89,8 @@ def test_a_camera_must_be_near_enough_to_see_the_support() -> None:
     assert not Camera.overhead(10.1, fov_y_deg=10.0).sees_support(TRAY)
 
 
-def test_depth_beyond_sixteen_bits_is_none(tmp_path: Path) -> None:
-    """Of a box under a camera at 6.6 m the top is within 6.55 m, the tray's floor is not."""
+def test_depth_beyond_the_range_of_16_bits_is_zero(tmp_path: Path) -> None:
+    """Under a camera at 6.6 m, the top of a box is within 6.55 m, and the tray's floor is not."""
     world = world_with("cell.cameras.overhead.pose.z=6.6", "cell.cameras.overhead.fov_y_deg=10.0")
     render_scene(scene_of(resting("cracker_box", Orientation.UPRIGHT_0)), world, tmp_path)
     depth = np.asarray(Image.open(tmp_path / "depth.png"))
@@ -99,7 +99,7 @@ def test_depth_beyond_sixteen_bits_is_none(tmp_path: Path) -> None:
 
 
 def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
-    """As a bin for what has been sorted out: model and link have the support's own names."""
+    """A second tray serves as a bin; its model and link have the names of the support."""
     path = tmp_path / "tray.sdf"
     path.write_text(support_sdf(tray(0.3)))
     cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
@@ -115,7 +115,7 @@ def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
     )
 
 
-def test_a_camera_is_not_called_like_another_part() -> None:
+def test_a_camera_may_not_have_the_name_of_another_part() -> None:
     camera = "{pose: {translation: [0, 0, 1.6], rpy_deg: [180, 0, 0]}}"
     with pytest.raises(
         InputError,

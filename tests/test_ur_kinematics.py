@@ -1,4 +1,4 @@
-"""The UR10's kinematics: published poses, every branch, what is out of reach, and derivatives."""
+"""Closed-form UR10 kinematics: published poses, branches, unreachable poses, derivatives."""
 
 import numpy as np
 import pytest
@@ -14,27 +14,28 @@ from drake_clutter.robots.ur_kinematics import (
 )
 
 
-def apart(q: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Differences of angles, rad, within -pi to pi."""
+def angle_differences(q: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return differences of angles in [-pi, pi] [rad]."""
     return np.asarray((q - other + np.pi) % (2 * np.pi) - np.pi)
 
 
 def test_at_zero_the_arm_lies_along_minus_x() -> None:
-    """Both bars and the wrist in a row: the sums of the published lengths."""
+    """Coordinates are sums of the published lengths."""
     X_B6 = forward_kinematics(np.zeros(6))
     assert X_B6[:3, 3] == pytest.approx([-0.612 - 0.5723, -0.163941 - 0.0922, 0.1273 - 0.1157])
     assert X_B6[:3, 2] == pytest.approx([0.0, -1.0, 0.0])
 
 
-def test_upright_the_wrist_is_as_high_as_it_can_be() -> None:
+def test_the_wrist_of_a_vertical_arm_is_at_its_greatest_height() -> None:
     X = link_poses(np.array([0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
     assert X[2, :3, 3] == pytest.approx([0.0, 0.0, 0.1273 + 0.612 + 0.5723])
 
 
 def test_all_branches_reach_the_pose() -> None:
-    draw, counts = rng(0), []
+    generator = rng(0)
+    counts = []
     for _ in range(300):
-        q = draw.uniform(-np.pi, np.pi, 6)
+        q = generator.uniform(-np.pi, np.pi, 6)
         X_B6 = forward_kinematics(q)
         found = inverse_kinematics(X_B6)
         counts.append(len(found))
@@ -42,7 +43,9 @@ def test_all_branches_reach_the_pose() -> None:
             forward_kinematics(found), np.broadcast_to(X_B6, (len(found), 4, 4)), atol=1e-9
         )
         assert (np.abs(found) <= np.pi).all()
-        assert np.abs(apart(found, q)).max(axis=1).min() < 1e-6, "the branch that it was made from"
+        assert np.abs(angle_differences(found, q)).max(axis=1).min() < 1e-6, (
+            "the initial configuration is among them"
+        )
     assert max(counts) == 8
     assert set(counts) <= {2, 4, 6, 8}
 
@@ -51,18 +54,18 @@ def test_the_branches_differ() -> None:
     found = inverse_kinematics(forward_kinematics(np.array([0.3, -1.2, 1.4, -1.1, -1.4, 0.6])))
     assert len(found) == 8
     for k, q in enumerate(found):
-        assert (np.abs(apart(np.delete(found, k, axis=0), q)).max(axis=1) > 0.1).all()
+        assert (np.abs(angle_differences(np.delete(found, k, axis=0), q)).max(axis=1) > 0.1).all()
 
 
 @pytest.mark.parametrize("p_B6", [[1.5, 0.0, 0.3], [0.0, 0.0, 2.0], [0.05, 0.0, 0.3]])
-def test_out_of_reach(p_B6: list[float]) -> None:
-    """Too far, too high, and too close to the base's axis for a tool that points down."""
+def test_poses_may_be_out_of_reach(p_B6: list[float]) -> None:
+    """Poses of a downward tool that are too far, too high, and too close to the base."""
     X_B6 = np.diag([1.0, -1.0, -1.0, 1.0])
     X_B6[:3, 3] = p_B6
     assert inverse_kinematics(X_B6).shape == (0, 6)
 
 
-def test_where_wrist_2_is_straight_the_last_joint_is_given() -> None:
+def test_the_last_joint_is_given_at_a_wrist_singularity() -> None:
     q = np.array([0.4, -1.0, 1.2, -0.7, 0.0, 0.9])
     found = inverse_kinematics(forward_kinematics(q), singular_wrist_3=0.25)
     straight = found[np.abs(found[:, 4]) < 1e-6]
@@ -72,9 +75,10 @@ def test_where_wrist_2_is_straight_the_last_joint_is_given() -> None:
 
 
 def test_the_jacobian_is_the_derivative() -> None:
-    draw, step = rng(1), 1e-6
+    generator = rng(1)
+    step = 1e-6
     for _ in range(20):
-        q = draw.uniform(-np.pi, np.pi, 6)
+        q = generator.uniform(-np.pi, np.pi, 6)
         found = jacobian(q)
         for joint in range(6):
             ahead, behind = (
@@ -86,8 +90,8 @@ def test_the_jacobian_is_the_derivative() -> None:
             assert found[:, joint] == pytest.approx(np.concatenate([w, v]), abs=1e-8)
 
 
-def test_manipulability_by_hand() -> None:
-    """Of the elbow it is proportional to |sin(q3)|: nothing is left when the arm is stretched."""
+def test_manipulability_is_proportional_to_the_sine_of_the_elbow() -> None:
+    """A stretched arm is singular."""
     bent, half = (
         manipulability(np.array([0.1, -1.0, q3, -0.5, -1.5, 0.0])) for q3 in (np.pi / 2, np.pi / 6)
     )

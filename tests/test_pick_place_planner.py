@@ -1,4 +1,4 @@
-"""Plans of moves: what they promise, checked again with samples of their own; and every reason why there is none."""
+"""Pick-and-place plans are checked at independent samples, and failures have their reasons."""
 
 import json
 import math
@@ -32,8 +32,8 @@ def planner(cell: WorkCell | None = None, config: PlannerConfig | None = None) -
     return PickPlacePlanner(cell or DEFAULT_CELL, config or PlannerConfig())
 
 
-def lifted(o: SceneObject, x: float, y: float) -> Pose:
-    """Where it is let go: a millimetre above the tray."""
+def place_pose(o: SceneObject, x: float, y: float) -> Pose:
+    """Return a place pose 1 mm above the tray."""
     return Pose((x, y, o.X_TO.translation[2] + 0.001), o.X_TO.quaternion)
 
 
@@ -47,12 +47,12 @@ PILE = [
 
 @pytest.fixture(scope="module")
 def plan() -> PickPlacePlan:
-    found = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    found = planner().plan(PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2))
     assert isinstance(found, PickPlacePlan)
     return found
 
 
-def test_the_phases_follow_each_other_from_home_to_home(plan: PickPlacePlan) -> None:
+def test_segments_are_continuous_from_home_to_home(plan: PickPlacePlan) -> None:
     approach, carry, retreat = (phase.trajectory for phase in plan.segments)
     home = np.array(DEFAULT_CELL.robot.home)
     assert approach.value(0.0).ravel() == pytest.approx(home)
@@ -68,7 +68,7 @@ def test_the_phases_follow_each_other_from_home_to_home(plan: PickPlacePlan) -> 
             assert np.abs(trajectory.EvalDerivative(time, 1)).max() < 1e-3
 
 
-def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: PickPlacePlan) -> None:
+def test_gripper_and_object_reach_their_target_poses(plan: PickPlacePlan) -> None:
     carry, tool = plan.segments[1].trajectory, ToolKinematics(DEFAULT_CELL)
     X_TG_pick, X_TG_place = (tool.pose(carry.value(t).ravel()) for t in (0.0, carry.end_time()))
     assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), (
@@ -80,8 +80,8 @@ def test_the_cup_comes_to_the_face_and_the_object_to_its_place(plan: PickPlacePl
         assert pytest.approx(expected, abs=1e-6) == X_TG
 
 
-def hits_nothing(plan: PickPlacePlan, objects: list[SceneObject]) -> None:
-    """At moments of the test's own, three times as dense."""
+def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject]) -> None:
+    """Assert that a plan has no collisions, at samples three times as dense as the planner's."""
     scene = planner().collision_model(objects)
     for phase in plan.segments:
         scene.set_object_poses(objects)
@@ -108,12 +108,12 @@ def hits_nothing(plan: PickPlacePlan, objects: list[SceneObject]) -> None:
         assert least > min(phase.min_distance.distance, 0.03) - 0.001
 
 
-def test_nothing_is_hit_on_the_way(plan: PickPlacePlan) -> None:
-    hits_nothing(plan, PILE)
+def test_a_plan_is_free_of_collisions(plan: PickPlacePlan) -> None:
+    assert_collision_free(plan, PILE)
 
 
-def test_the_same_question_has_the_same_answer(plan: PickPlacePlan) -> None:
-    again = planner().plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+def test_planning_is_deterministic(plan: PickPlacePlan) -> None:
+    again = planner().plan(PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2))
     assert isinstance(again, PickPlacePlan)
     for phase, other in zip(plan.segments, again.segments, strict=True):
         assert phase.duration == other.duration
@@ -136,106 +136,109 @@ def test_a_marker_does_not_seal() -> None:
     assert str(found) == "no seal: marker"
 
 
-def test_what_carries_something_is_not_picked() -> None:
-    found = planner().plan(PILE, "tomato_soup_can", lifted(PILE[1], 0.2, -0.2))
+def test_an_object_with_others_on_top_is_not_picked() -> None:
+    found = planner().plan(PILE, "tomato_soup_can", place_pose(PILE[1], 0.2, -0.2))
     assert reason(found) is PlanningFailureReason.CARRIES_OTHERS
     assert isinstance(found, PlanningFailure)
     assert found.detail == "gelatin_box"
     assert objects_resting_on(PILE[3], PILE) == ()
 
 
-def test_too_heavy() -> None:
-    """A weak vacuum does not hold half a kilogram; and an arm may not be asked for more than its payload."""
+def test_an_object_may_be_too_heavy() -> None:
+    """The vacuum is too weak for 0.5 kg, or the payload of the arm is exceeded."""
     weak = cell_with("gripper.vacuum=0.1")
     assert (
-        reason(planner(weak).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
+        reason(planner(weak).plan(PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2)))
         is PlanningFailureReason.TOO_HEAVY
     )
     frail = cell_with("robot.payload=1")
     assert (
-        reason(planner(frail).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)))
+        reason(planner(frail).plan(PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2)))
         is PlanningFailureReason.TOO_HEAVY
     )
 
 
-def test_out_of_reach() -> None:
+def test_poses_may_be_out_of_reach() -> None:
     far = cell_with("robot.base.x=-2.5")
-    found = planner(far).plan(PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2))
+    found = planner(far).plan(PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2))
     assert (reason(found), str(found)) == (
         PlanningFailureReason.UNREACHABLE,
         "unreachable: the grasp",
     )
     nearer = cell_with("robot.base.x=-1.15")
-    found = planner(nearer).plan(PILE, "cracker_box", lifted(PILE[2], 0.3, -0.3))
+    found = planner(nearer).plan(PILE, "cracker_box", place_pose(PILE[2], 0.3, -0.3))
     assert (reason(found), str(found)) == (
         PlanningFailureReason.UNREACHABLE,
         "unreachable: the place",
     )
 
 
-def test_a_tower_beside_it_is_in_the_way() -> None:
-    """A low box between two high ones: the gripper's body does not fit."""
+def test_neighbors_may_block_every_grasp() -> None:
+    """The body of the gripper does not fit between two high boxes."""
     low = resting("gelatin_box", Orientation.UPRIGHT_0, name="low")
     places = [(x, z) for x in (0.06, -0.06) for z in (0.0, 0.23)]
     walls = [
         resting("cracker_box", Orientation.UPRIGHT_0, (x, 0.0), z, f"wall_{k}")
         for k, (x, z) in enumerate(places)
     ]
-    found = planner().plan([low, *walls], "low", lifted(low, 0.2, -0.2))
+    found = planner().plan([low, *walls], "low", place_pose(low, 0.2, -0.2))
     assert reason(found) is PlanningFailureReason.IN_COLLISION
     assert isinstance(found, PlanningFailure)
     assert "at the grasp" in found.detail
     assert found.value < PlannerConfig().min_distance
-    assert not planner().are_endpoints_reachable([low, *walls], "low", lifted(low, 0.2, -0.2))
+    assert not planner().are_endpoints_reachable([low, *walls], "low", place_pose(low, 0.2, -0.2))
 
 
-def test_time_may_run_out() -> None:
+def test_planning_may_time_out() -> None:
     found = planner(config=PlannerConfig(time_limit=0.0)).plan(
-        PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
+        PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2)
     )
     assert reason(found) is PlanningFailureReason.TIME_OUT
 
 
-def test_what_reaches_both_ends_is_planned() -> None:
-    """Objects of random scenes, put up into the air, where there is room."""
-    tried, draw = 0, rng(0)
+def test_moves_with_reachable_endpoints_are_planned() -> None:
+    """Objects of random scenes are placed in free space above the scene."""
+    num_planned = 0
+    generator = rng(0)
     for seed in range(3):
         scene = random_scene(seed, 12, 12)
         for o in scene.objects:
-            x, y = draw.uniform(-0.2, 0.2, 2)
+            x, y = generator.uniform(-0.2, 0.2, 2)
             place = Pose((x, y, o.X_TO.translation[2] + 0.5), o.X_TO.quaternion)
             if planner().are_endpoints_reachable(scene.objects, o.name, place):
-                tried += 1
+                num_planned += 1
                 assert isinstance(planner().plan(scene.objects, o.name, place), PickPlacePlan), (
                     o.name
                 )
-    assert tried >= 5
+    assert num_planned >= 5
 
 
-def test_turned_by_a_quarter() -> None:
+def test_a_place_pose_may_be_rotated_by_90_degrees() -> None:
     quarter = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
-    place = replace(lifted(PILE[0], 0.2, -0.2), quaternion=quarter)
+    place = replace(place_pose(PILE[0], 0.2, -0.2), quaternion=quarter)
     assert isinstance(planner().plan(PILE, "sugar_box", place), PickPlacePlan)
 
 
-def test_how_distances_change_is_how_they_differ(plan: PickPlacePlan) -> None:
-    """Beside the way, where faces are not parallel: between those that are, the nearest points are not unique."""
-    scene, step, draw = planner().collision_model(PILE), 1e-4, rng(0)
-    scene.attach_object(plan.pick, plan.X_OG)
+def test_distance_gradients_equal_finite_differences(plan: PickPlacePlan) -> None:
+    """Configurations are perturbed: closest points between parallel faces are not unique."""
+    model = planner().collision_model(PILE)
+    step = 1e-4
+    generator = rng(0)
+    model.attach_object(plan.pick, plan.X_OG)
     errors: dict[bool, list[float]] = {True: [], False: []}  # of pairs with a cylinder, and without
     for time in np.linspace(0.0, plan.segments[1].duration, 15):
-        q = plan.segments[1].trajectory.value(time).ravel() + draw.normal(0, 0.1, 6)
-        gradients = scene.distances_and_gradients(q, 0.2)
-        assert [clearance for clearance, _ in gradients] == scene.distances_below(q, 0.2)
+        q = plan.segments[1].trajectory.value(time).ravel() + generator.normal(0, 0.1, 6)
+        gradients = model.distances_and_gradients(q, 0.2)
+        assert [clearance for clearance, _ in gradients] == model.distances_below(q, 0.2)
         pairs = [clearance.pair for clearance, _ in gradients]
         once = {pair for pair in pairs if pairs.count(pair) == 1}  # some parts have several shapes
         found = {c.pair: (c.distance, gradient) for c, gradient in gradients if c.pair in once}
         for joint in range(6):
             ahead = {
-                c.pair: c.distance for c in scene.distances_below(q + step * np.eye(6)[joint], 0.21)
+                c.pair: c.distance for c in model.distances_below(q + step * np.eye(6)[joint], 0.21)
             }
             behind = {
-                c.pair: c.distance for c in scene.distances_below(q - step * np.eye(6)[joint], 0.21)
+                c.pair: c.distance for c in model.distances_below(q - step * np.eye(6)[joint], 0.21)
             }
             for pair, (_, gradient) in found.items():
                 sides = (
@@ -252,29 +255,29 @@ def test_how_distances_change_is_how_they_differ(plan: PickPlacePlan) -> None:
     assert max(errors[True]) < 1e-2, "Drake finds the nearest points of curved faces by iteration"
 
 
-def test_optimised_ways_are_quicker(plan: PickPlacePlan) -> None:
-    sure = planner(config=PlannerConfig(optimize=False)).plan(
-        PILE, "sugar_box", lifted(PILE[0], 0.2, -0.2)
+def test_optimized_trajectories_are_faster(plan: PickPlacePlan) -> None:
+    unoptimized = planner(config=PlannerConfig(optimize=False)).plan(
+        PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2)
     )
-    assert isinstance(sure, PickPlacePlan)
-    assert sure.duration == sure.unoptimized_duration == plan.unoptimized_duration
+    assert isinstance(unoptimized, PickPlacePlan)
+    assert unoptimized.duration == unoptimized.unoptimized_duration == plan.unoptimized_duration
     assert plan.duration < 0.9 * plan.unoptimized_duration
     assert all(phase.duration <= phase.unoptimized_duration for phase in plan.segments)
 
 
-def test_from_a_height_the_arm_goes_back_before_it_goes_home() -> None:
-    """Straight home would take the gripper through the box that it has just put there."""
+def test_the_arm_retracts_from_a_high_place_pose_before_moving_home() -> None:
+    """A straight joint-space path home would pass through the placed box."""
     box = resting("pudding_box", Orientation.FLAT_0)
     for height in (0.2, 0.35, 0.5):
         high = Pose((0.1, 0.0, height), box.X_TO.quaternion)
-        for optimise in (False, True):
-            found = planner(config=PlannerConfig(optimize=optimise)).plan([box], box.name, high)
+        for optimize in (False, True):
+            found = planner(config=PlannerConfig(optimize=optimize)).plan([box], box.name, high)
             assert isinstance(found, PickPlacePlan)
-            hits_nothing(found, [box])
+            assert_collision_free(found, [box])
 
 
 def test_results_files_with_earlier_names_load() -> None:
-    """The planner's config in a results file of version 0.1, and what is written today."""
+    """A results file of version 0.1 has earlier names of the planner's parameters."""
     path = Path(__file__).parents[1] / "benchmarks" / "results" / "arm_moves.json"
     earlier = json.loads(path.read_text())["planner"]
     assert "optimise" in earlier

@@ -1,4 +1,4 @@
-"""Ways of the arm: whole turns, smooth corners, and trajectories within the limits, densely sampled."""
+"""Time parameterization: unwrapping, blended corners, and limits at dense samples."""
 
 import math
 
@@ -32,14 +32,16 @@ def unwrapped(q: float, reference: float) -> float:
     return float(found[0])
 
 
-def test_whole_turns() -> None:
+def test_positions_are_unwrapped_to_the_nearest_equivalent() -> None:
     assert unwrapped(3.0, -3.0) == pytest.approx(3.0 - 2 * math.pi)
     assert unwrapped(3.0, 6.2) == pytest.approx(3.0)
     assert unwrapped(-3.0, 6.2) == pytest.approx(2 * math.pi - 3.0)
-    assert unwrapped(1.0, 6.2) == pytest.approx(1.0), "a turn more is out of the joint's range"
+    assert unwrapped(1.0, 6.2) == pytest.approx(1.0), (
+        "an equivalent outside of the joint's range is not taken"
+    )
 
 
-def test_a_smooth_way_keeps_its_ends_and_cuts_corners() -> None:
+def test_a_bspline_path_keeps_its_ends_and_blends_corners() -> None:
     corner = HOME + np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     end = corner + np.array([0.0, 0.4, 0.0, 0.0, 0.0, 0.0])
     points = sample_path(
@@ -53,8 +55,8 @@ def test_a_smooth_way_keeps_its_ends_and_cuts_corners() -> None:
     assert 0.005 < aside.min() < 0.08
 
 
-def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, float]:
-    """How much of each limit a motion uses, at most, at 1,500 times."""
+def limit_ratios(trajectory: Trajectory, payload: Payload) -> dict[str, float]:
+    """Return the largest ratio to each limit at 1,500 samples of a trajectory."""
     times = np.linspace(0.0, trajectory.end_time(), 1500)
     q = np.array([trajectory.value(t).ravel() for t in times])
     v, a = (
@@ -77,32 +79,32 @@ def shares_of_limits(trajectory: Trajectory, payload: Payload) -> dict[str, floa
 
 
 @pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
-def test_trajectories_keep_the_limits(payload: Payload) -> None:
-    draw = rng(0)
+def test_trajectories_satisfy_the_limits(payload: Payload) -> None:
+    generator = rng(0)
     for _ in range(3):
-        middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
+        via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
         trajectory = parameterize_time_optimal(
             bspline_path(
-                np.vstack([linear_joint_path(HOME, middle), linear_joint_path(middle, end)[1:]])
+                np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]])
             ),
             ARM,
             payload,
         )
         assert trajectory is not None
-        shares = shares_of_limits(trajectory, payload)
-        assert max(shares.values()) < 1.01, shares
+        ratios = limit_ratios(trajectory, payload)
+        assert max(ratios.values()) < 1.01, ratios
         assert np.abs(trajectory.EvalDerivative(0.0, 1)).max() < 1e-3
 
 
 @pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
-def test_a_motion_that_is_too_fast_is_slowed_until_one_limit_is_met(payload: Payload) -> None:
-    way = bspline_path(linear_joint_path(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
+def test_a_trajectory_is_scaled_until_one_limit_is_active(payload: Payload) -> None:
+    path = bspline_path(linear_joint_path(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
     too_fast = PathParameterizedTrajectory(
-        way, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]])
+        path, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]])
     )
     found = scale_to_limits(too_fast, ARM, payload)
     assert found is not None
-    assert 0.95 < max(shares_of_limits(found, payload).values()) < 1.01
+    assert 0.95 < max(limit_ratios(found, payload).values()) < 1.01
     assert found.value(found.end_time()) == pytest.approx(too_fast.value(0.3))
     again = scale_to_limits(found, ARM, payload)
     assert again is not None
@@ -111,12 +113,12 @@ def test_a_motion_that_is_too_fast_is_slowed_until_one_limit_is_met(payload: Pay
     )
 
 
-def test_as_quick_as_drakes_toppra() -> None:
-    draw = rng(1)
+def test_durations_equal_those_of_drakes_toppra() -> None:
+    generator = rng(1)
     for _ in range(3):
-        middle, end = (HOME + draw.uniform(-0.8, 0.8, 6) for _ in range(2))
+        via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
         path = bspline_path(
-            np.vstack([linear_joint_path(HOME, middle), linear_joint_path(middle, end)[1:]])
+            np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]])
         )
         toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
         toppra.AddJointVelocityLimit(
@@ -132,10 +134,10 @@ def test_as_quick_as_drakes_toppra() -> None:
         )
 
 
-def test_the_faster_joint_decides() -> None:
-    """Over a long way the shoulder runs at its 120 deg/s: the way over the speed, and a little to start and stop."""
-    way = linear_joint_path(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    trajectory = parameterize_time_optimal(bspline_path(way), ARM, Payload())
+def test_the_duration_of_a_long_path_follows_from_the_velocity_limit() -> None:
+    """On a long path the shoulder moves at its velocity limit, 120 deg/s, most of the time."""
+    waypoints = linear_joint_path(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    trajectory = parameterize_time_optimal(bspline_path(waypoints), ARM, Payload())
     assert trajectory is not None
     cruise = 2.5 / (0.97 * ROBOT.velocity_limits[0])
     starts = ROBOT.velocity_limits[0] / ROBOT.acceleration_limits[0]
