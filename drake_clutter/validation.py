@@ -72,26 +72,33 @@ class InRange:
             number: CoreSchema = core_schema.int_schema(strict=True, ge=least, le=greatest)
         else:
             number = core_schema.float_schema(strict=True, ge=low, le=high, allow_inf_nan=False)
-        what = "a whole number" if source is int else "a finite number"
+        description = "a whole number" if source is int else "a finite number"
         if low is not None or high is not None:
-            what += f" from {self.low:g} to {self.high:g}"
+            description += f" from {self.low:g} to {self.high:g}"
         return core_schema.custom_error_schema(
-            number, "allowed", custom_error_message="{what}", custom_error_context={"what": what}
+            number,
+            "allowed",
+            custom_error_message="{what}",
+            custom_error_context={"what": description},
         )
 
 
-def allowed_error(what: str) -> PydanticCustomError:
-    """Return the error of a validator, whose message is what is allowed."""
-    return PydanticCustomError("allowed", "{what}", {"what": what})
-
-
-def rejected_error(what: str) -> PydanticCustomError:
-    """Return the error of a validator, whose message names a part of the field.
+def allowed_error(allowed: str) -> PydanticCustomError:
+    """Return the error of a validator for a value that is not allowed.
 
     Args:
-        what: Name of the part, what is wrong with it, and what is allowed.
+        allowed: What is allowed instead, such as "a number above zero".
     """
-    return PydanticCustomError("refused", "{what}", {"what": what})
+    return PydanticCustomError("allowed", "{what}", {"what": allowed})
+
+
+def rejected_error(message: str) -> PydanticCustomError:
+    """Return the error of a validator for a part of a field.
+
+    Args:
+        message: Name of the part, what is wrong with it, and what is allowed.
+    """
+    return PydanticCustomError("refused", "{what}", {"what": message})
 
 
 Finite = Annotated[float, InRange(-math.inf, math.inf)]
@@ -116,20 +123,20 @@ _RENAMED: dict[type, Mapping[str, str]] = {}
 """Current names of fields by earlier ones, of each class that has renamed fields."""
 
 
-def renamed_fields(**current: str) -> Callable[[type[Schema]], type[Schema]]:
+def renamed_fields(**current_names: str) -> Callable[[type[Schema]], type[Schema]]:
     """Return a class decorator that accepts earlier names of fields in files.
 
     It stands below `config_class`.
 
     Args:
-        current: Current name of a field by its earlier name.
+        current_names: Current name of a field by its earlier name.
     """
 
     def decorate(cls: type[Schema]) -> type[Schema]:
         def take_earlier_names(cls: type, given: Any) -> Any:
             return with_current_names(cls, given)
 
-        _RENAMED[cls] = current
+        _RENAMED[cls] = current_names
         validator: Any = model_validator(mode="before")(cast(Any, classmethod(take_earlier_names)))
         setattr(cls, take_earlier_names.__name__, validator)
         return cls
@@ -137,25 +144,27 @@ def renamed_fields(**current: str) -> Callable[[type[Schema]], type[Schema]]:
     return decorate
 
 
-def with_current_names(schema: type, given: Any) -> Any:
+def with_current_names(schema: type, document: Any) -> Any:
     """Return a document with the fields of a schema under their current names.
 
     If a field is given under both names, the earlier one is kept, too, and then refused as unknown.
 
     Args:
         schema: Class of the document; classes of its fields are not considered.
-        given: The document.
+        document: The document.
     """
-    current = {
+    current_names = {
         earlier: name
         for base in reversed(schema.__mro__)
         for earlier, name in _RENAMED.get(base, {}).items()
     }
-    if not current or not isinstance(given, dict):
-        return given
+    if not current_names or not isinstance(document, dict):
+        return document
     return {
-        current[key] if key in current and current[key] not in given else key: value
-        for key, value in given.items()
+        current_names[key]
+        if key in current_names and current_names[key] not in document
+        else key: value
+        for key, value in document.items()
     }
 
 
@@ -183,80 +192,93 @@ def _json_schema(schema: Any) -> dict[str, Any]:
     return _adapter(schema).json_schema()
 
 
-def validate(schema: type[Schema], given: Any, source: str) -> Schema:
-    """Return `given` as an instance of a schema.
+def validate(schema: type[Schema], document: Any, source: str) -> Schema:
+    """Return a document as an instance of a schema.
 
     Args:
-        schema: A pydantic model or dataclass, or a container of them.
-        given: What was read.
-        source: The file or option that it was read from, for the message.
+        schema: Pydantic model or dataclass, or a container of them.
+        document: The document.
+        source: File or option of the document, for the message.
 
     Raises:
-        InputError: The first field that cannot be used, in one line.
+        InputError: A field is unknown or has a value that is not allowed.
     """
     try:
-        validated: Schema = _adapter(cast(Hashable, schema)).validate_python(given)
+        validated: Schema = _adapter(cast(Hashable, schema)).validate_python(document)
     except ValidationError as error:
-        raise input_error(source, _message(schema, error.errors(include_url=False)[0])) from None
+        raise input_error(
+            source, _error_message(schema, error.errors(include_url=False)[0])
+        ) from None
     return validated
 
 
-def _message(schema: Any, error: ErrorDetails) -> str:
-    kind = error["type"]
-    loc = error["loc"]
-    if kind in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
-        owner, node = _locate(schema, loc[:-1])
+def _error_message(schema: Any, error: ErrorDetails) -> str:
+    """Return field, value and what is allowed, from a pydantic error."""
+    error_type = error["type"]
+    location = error["loc"]
+    if error_type in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
+        owner, node = _locate(schema, location[:-1])
         names = ", ".join(node.get("properties", {}))
-        return f"{_field_path(owner, loc[-1])}: is unknown; allowed are {names}"
-    if kind in ("missing", "missing_argument"):
-        owner, node = _locate(schema, loc[:-1])
+        return f"{_field_path(owner, location[-1])}: is unknown; allowed are {names}"
+    if error_type in ("missing", "missing_argument"):
+        owner, node = _locate(schema, location[:-1])
         if "prefixItems" in node:
             return _value_message(owner, error["input"], _describe_list(node))
         needed = ", ".join(node.get("required", {}))
-        return f"{_field_path(owner, loc[-1])}: is missing; needed are {needed}"
-    field, node = _locate(schema, loc)
-    if kind == "refused":
+        return f"{_field_path(owner, location[-1])}: is missing; needed are {needed}"
+    field, node = _locate(schema, location)
+    if error_type == "refused":
         return f"{field}.{error['msg']}"
-    if kind in ("union_tag_not_found", "union_tag_invalid"):
+    if error_type in ("union_tag_not_found", "union_tag_invalid"):
         tag = error["input"].get(node["discriminator"]["propertyName"])
         field = _field_path(field, node["discriminator"]["propertyName"])
         return _value_message(field, tag, f"one of {', '.join(node['discriminator']['mapping'])}")
     return _value_message(field, error["input"], _describe_allowed(error, node))
 
 
-def _value_message(field: str, value: Any, what: str) -> str:
-    return f"{field}{': ' if field else ''}{format_value(value)}; allowed is {what}"
+def _value_message(field: str, value: Any, allowed: str) -> str:
+    """Return the message about a value that is not allowed."""
+    return f"{field}{': ' if field else ''}{format_value(value)}; allowed is {allowed}"
 
 
 def _describe_allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
-    kind = error["type"]
-    if kind in ("literal_error", "enum"):
+    """Return what is allowed, as words.
+
+    Args:
+        error: The pydantic error.
+        node: Part of the JSON schema about the field.
+    """
+    error_type = error["type"]
+    if error_type in ("literal_error", "enum"):
         values = [str(value) for value in node.get("enum", [node.get("const")])]
         return values[0] if len(values) == 1 else f"one of {', '.join(values)}"
-    if kind in ("dict_type", "model_type", "dataclass_type", "model_attributes_type"):
+    if error_type in ("dict_type", "model_type", "dataclass_type", "model_attributes_type"):
         names = ", ".join(node.get("required") or node.get("properties", ()))
         return f"a mapping with {names}" if names else "a mapping"
-    if kind == "too_short" and node.get("type") == "object":
+    if error_type == "too_short" and node.get("type") == "object":
         return "a mapping of at least one entry"
-    if kind in ("list_type", "tuple_type", "too_long", "too_short"):
+    if error_type in ("list_type", "tuple_type", "too_long", "too_short"):
         return _describe_list(node)
-    return _TYPE_DESCRIPTIONS.get(kind.split("_")[0], error["msg"])
+    return _TYPE_DESCRIPTIONS.get(error_type.split("_")[0], error["msg"])
 
 
 def _describe_list(node: Mapping[str, Any]) -> str:
+    """Return what is allowed for a list, from its part of the JSON schema."""
     if "prefixItems" not in node:
         return "a list of at least one entry" if node.get("minItems") else "a list"
     items = node["prefixItems"]
-    what = "numbers" if all(item.get("type") == "number" for item in items) else "values"
-    return f"a list of {len(items)} {what}"
+    item_description = (
+        "numbers" if all(item.get("type") == "number" for item in items) else "values"
+    )
+    return f"a list of {len(items)} {item_description}"
 
 
-def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
+def _locate(schema: Any, location: Sequence[int | str]) -> tuple[str, Mapping[str, Any]]:
     """Return the path of a field as text, and its part of the schema's JSON schema."""
     document = _json_schema(schema)
     field = ""
     node = _resolve_reference(document, document)
-    for part in loc:
+    for part in location:
         if part == "[key]":  # of a mapping with a key that is not allowed
             break
         if "discriminator" in node:  # the part is a member of the union, which no file names
@@ -273,6 +295,7 @@ def _locate(schema: Any, loc: Sequence[int | str]) -> tuple[str, Mapping[str, An
 
 
 def _field_path(field: str, part: int | str) -> str:
+    """Return the path of a field or list element, such as `cameras.overhead` or `steps[1]`."""
     if isinstance(part, int):
         return f"{field}[{part}]"
     name = str(part) if str(part).isprintable() and len(str(part)) <= 40 else format_value(part)
@@ -280,6 +303,7 @@ def _field_path(field: str, part: int | str) -> str:
 
 
 def _resolve_reference(document: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
+    """Return a part of a JSON schema after its references are followed."""
     while isinstance(node, dict) and ("$ref" in node or "anyOf" in node):
         reference = node.get("$ref", "").rsplit("/", 1)[-1]
         node = document["$defs"][reference] if reference else node["anyOf"][0]
@@ -317,11 +341,11 @@ def load_config_as(
     """
     config = defaults
     if path is not None:
-        given = read_yaml(path, "a mapping of config fields")
-        config = override_config(config, upgrade({} if given is None else given), str(path))
+        document = read_yaml(path, "a mapping of config fields")
+        config = override_config(config, upgrade({} if document is None else document), str(path))
     for setting in settings:
-        given = _parse_setting(setting, config)
-        config = override_config(config, upgrade(given), f"--set {setting}")
+        document = _parse_setting(setting, config)
+        config = override_config(config, upgrade(document), f"--set {setting}")
     return config
 
 
@@ -348,10 +372,12 @@ def _parse_setting(setting: str, config: Any) -> Any:
 
 
 def _with_item(values: tuple[Any, ...], index: int, value: Any) -> list[Any]:
+    """Return values as a list with one item replaced."""
     return [value if k == index else old for k, old in enumerate(values)]
 
 
 def _get_nested(config: Any, parts: Sequence[str]) -> Any:
+    """Return the value at a path of names and indices; None if there is none."""
     for part in parts:
         if isinstance(config, tuple):
             config = dict(enumerate(config)).get(int(part) if part.isdecimal() else -1)
@@ -369,7 +395,7 @@ def _field_values(config: Any) -> dict[str, Any]:
     return {}
 
 
-def override_config(defaults: Schema, given: Any, source: str) -> Schema:
+def override_config(defaults: Schema, document: Any, source: str) -> Schema:
     """Return a config with the fields of a document replaced.
 
     Lists are replaced as a whole. So is a part with another `kind`, and one with another `model`
@@ -378,24 +404,25 @@ def override_config(defaults: Schema, given: Any, source: str) -> Schema:
 
     Args:
         defaults: The config.
-        given: The document.
+        document: The document.
         source: File or option of the document, for the message.
 
     Raises:
         InputError: A field is unknown or has a value that is not allowed.
     """
-    return validate(type(defaults), _merge(defaults, given), source)
+    return validate(type(defaults), _merge(defaults, document), source)
 
 
-def _merge(config: Any, given: Any) -> Any:
-    if not isinstance(given, dict):
-        return given
+def _merge(config: Any, document: Any) -> Any:
+    """Return a document completed by the fields of a config; see `override_config`."""
+    if not isinstance(document, dict):
+        return document
     if isinstance(config, dict):
-        return {key: _merge(config.get(key), value) for key, value in given.items()}
+        return {key: _merge(config.get(key), value) for key, value in document.items()}
     fields = _field_values(config)
-    given = with_current_names(type(config), given)
-    if given.get("kind", fields.get("kind")) != fields.get("kind"):
-        return given
-    if len(given) > 1 and given.get("model", fields.get("model")) != fields.get("model"):
-        return given
-    return {**fields, **{key: _merge(fields.get(key), value) for key, value in given.items()}}
+    document = with_current_names(type(config), document)
+    if document.get("kind", fields.get("kind")) != fields.get("kind"):
+        return document
+    if len(document) > 1 and document.get("model", fields.get("model")) != fields.get("model"):
+        return document
+    return {**fields, **{key: _merge(fields.get(key), value) for key, value in document.items()}}

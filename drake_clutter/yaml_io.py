@@ -73,11 +73,11 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        what = f"cannot be read ({error.strerror}); allowed is {allowed_content}"
-        raise input_error(str(path), what) from error
+        problem = f"cannot be read ({error.strerror}); allowed is {allowed_content}"
+        raise input_error(str(path), problem) from error
     except UnicodeDecodeError as error:
-        what = f"is not YAML ({error.reason}); allowed is {allowed_content}"
-        raise input_error(str(path), what) from error
+        problem = f"is not YAML ({error.reason}); allowed is {allowed_content}"
+        raise input_error(str(path), problem) from error
     return parse_yaml(text, str(path), allowed_content)
 
 
@@ -96,7 +96,9 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        why = f"{line}{error.problem}"
-        raise input_error(source, f"is not YAML ({why}); allowed is {allowed_content}") from error
+        reason = f"{line}{error.problem}"
+        raise input_error(
+            source, f"is not YAML ({reason}); allowed is {allowed_content}"
+        ) from error
     except Exception as error:  # many types, for a bad date, number or nesting
         raise input_error(source, f"is not YAML ({error}); allowed is {allowed_content}") from error
