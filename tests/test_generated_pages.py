@@ -1,9 +1,12 @@
 """Generated pages of the documentation: numbers of results files, and references to the code."""
 
+import importlib
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
 
 import cli_page
 import configuration_page
@@ -35,7 +38,7 @@ RESULTS = {
     )
 }
 FILE = re.compile(r"`((?:training|benchmarks)/[\w./-]+)`")
-COMMAND = re.compile(r"- Command: `python ((?:training|benchmarks)/\w+\.py)")
+COMMAND = re.compile(r"- Command: `python ((training|benchmarks)/(\w+)\.py)( [^`]*)`")
 
 
 def rows_of(text: str, *cells: str) -> list[list[str]]:
@@ -51,11 +54,25 @@ def rows_of(text: str, *cells: str) -> list[list[str]]:
 @pytest.mark.parametrize("name", RESULTS)
 def test_pages_of_results_name_files_that_exist(name: str) -> None:
     text = RESULTS[name]()
-    named = FILE.findall(text) + COMMAND.findall(text)
+    named = FILE.findall(text) + [match[1] for match in COMMAND.finditer(text)]
     assert named
     assert [path for path in named if not (ROOT / path).exists()] == []
     images = re.findall(r"\]\(\.\./images/([\w.]+)\)", text)
     assert [image for image in images if not (ROOT / "docs/images" / image).exists()] == []
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_pages_of_results_name_commands_that_parse(name: str) -> None:
+    for match in COMMAND.finditer(RESULTS[name]()):
+        module = importlib.import_module(f"{match[2]}.{match[3]}")
+        words = match[4].split()
+        function = module.main if hasattr(module, "main") else None
+        if function is None:  # The first word names a command of several.
+            function = getattr(module, words.pop(0).replace("-", "_"))
+        app = typer.Typer()
+        app.command()(function)
+        command: Any = typer.main.get_command(app)
+        command.make_context(match[3], words)
 
 
 def test_generation_page_has_the_rows_of_table_one() -> None:

@@ -93,7 +93,7 @@ def _parts() -> str:
     text = section(
         "Times of the parts",
         "One process, no other work; measured with the SNOPT optimizer and 5 ms steps.",
-        command="python benchmarks/pick_place.py parts --count 20 --seed 3 --out FILE",
+        command="python benchmarks/pick_place.py timing --count 20 --seed 3 --out FILE",
         seed=3,
         results=["benchmarks/results/arm_parts.json"],
     )
@@ -111,7 +111,7 @@ def _grasps() -> str:
     text = section(
         "Grasp constraints",
         "Optimized moves with the two constraints between cup and object; medians.",
-        command="python benchmarks/pick_place.py holds --count 20 --seed 0 --out FILE",
+        command="python benchmarks/pick_place.py grasp-constraints --count 20 --seed 0 --out FILE",
         seed=0,
         results=["benchmarks/results/arm_holds.json"],
     )

@@ -79,7 +79,7 @@ def _settings() -> str:
         "Settings of the settling",
         f"Verdicts on {results['count']} RG stacks of at least two objects, compared with the "
         "default settings.",
-        command="python benchmarks/settle_sensitivity.py --out FILE",
+        command="python benchmarks/settle_sensitivity.py --count 100 --out FILE",
         seed=results["seed"],
         results=["benchmarks/results/settle_settings.json"],
     )

@@ -261,7 +261,7 @@ def _disassembly() -> str:
         "Disassembly and solvability",
         "Stable scenes (Drake), split by whether every stack can be taken away from the top, "
         "object by object, while the rest stays stable; *solvable* by the oracle search.",
-        command="python benchmarks/disassembly_vs_solvability.py runs/table1 --out FILE",
+        command="python benchmarks/disassembly_vs_solvability.py runs/table1/* --out FILE",
         seed=rows[0]["seed"],
         results=["benchmarks/results/come_apart.json"],
     )
