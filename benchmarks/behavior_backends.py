@@ -1,6 +1,8 @@
-"""What the package does with a case, as lines of text: one function for each backend.
+"""Traces of episodes and generated scenes: one function for each backend.
 
-All that `behavior_hashes.py` asks of the package is here; when interfaces change, this follows.
+A trace is a list of lines of text that describe an episode move by move, or a scene part by part.
+`behavior_hashes.py` compares traces with recorded ones. This module is its only interface to the
+package. The texts are those of the records, also where the package has changed its wording.
 """
 
 import hashlib
@@ -30,25 +32,31 @@ from drake_clutter.systems.scenario import Scenario, make_perception, make_polic
 from drake_clutter.tasks.episode import BackendFactory, run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
 
-WORLD, MAX_MOVES, OBJECTS = ClutterConfig(), 10, "ycb7"
+WORLD = ClutterConfig()
+"""Configuration of all scenes and episodes."""
+MAX_MOVES = 10
+"""Number of moves after which an episode ends."""
+OBJECTS = "ycb7"
+"""Object set of generated scenes and of detectors."""
 NODES = 25
-"""Of generated scenes."""
-DRAKE_EVERY = 10
-"""Of a generator's scenes, one in so many is judged by Drake, too."""
+"""Number of nodes of generated scene graphs."""
+DRAKE_INTERVAL = 10
+"""Every tenth generated scene is also judged in Drake."""
 DECIMALS = 9
-"""To which numbers are compared."""
+"""Decimals to which numbers are compared: poses to a nanometer."""
 
 Part = str | Sequence[float]
+"""What a line states by its hash: a text, or numbers."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is played or made.
+    """One episode or generated scene.
 
     Attributes:
-        scenes: name of a frozen set; of a generated scene, of its generator.
-        number: of the scene in the set or batch; the seed of every random choice.
-        agent: the explorer, or "".
+        scenes: Name of the scene set; of a generated scene, name of its generator.
+        number: Number of the scene, and seed of every random choice.
+        agent: Name of the explorer; "" for a generated scene.
     """
 
     scenes: str
@@ -56,28 +64,30 @@ class Case:
     agent: str = ""
 
     def __str__(self) -> str:
+        """Return the case for messages."""
         return f"{self.scenes} {self.number} {self.agent}".strip()
 
 
 @dataclass(frozen=True)
 class Line:
-    """One move, or another fact of an episode or scene.
+    """One line of a trace.
 
     Attributes:
-        words: readable.
-        parts: what is too long for that, by name: texts, or numbers to be compared to `DECIMALS`.
+        words: Readable text.
+        parts: What is too long for a text, by name; it is hashed.
     """
 
     words: str
     parts: Mapping[str, Part] = field(default_factory=dict)
 
     def __str__(self) -> str:
+        """Return the text of the line."""
         hashes = (f"{name} {hash_of(part)[:12]}" for name, part in self.parts.items())
         return " | ".join([self.words, *hashes])
 
 
 def hash_of(part: Part) -> str:
-    """Of a text, or of rounded numbers."""
+    """Return the SHA-256 of a text, or of numbers that are rounded to `DECIMALS`."""
     if isinstance(part, str):
         return hashlib.sha256(part.encode()).hexdigest()
     rounded = np.round(np.asarray(part, np.float64), DECIMALS) + 0.0  # -0.0 + 0.0 is 0.0
@@ -85,45 +95,45 @@ def hash_of(part: Part) -> str:
 
 
 @cache
-def _scene_set(name: str) -> SceneDataset:
+def _load_scenes(name: str) -> SceneDataset:
     return load_scene_dataset(resource_path(f"training/scenes/{name}.json"), load_catalog())
 
 
 def _scene(case: Case) -> Scene:
-    """The scene of a case, at rest."""
-    held = _scene_set(case.scenes)
-    return held.settled_scene(case.number, held.grammar, WORLD)
+    """Return the scene of a case at rest."""
+    scenes = _load_scenes(case.scenes)
+    return scenes.settled_scene(case.number, scenes.grammar, WORLD)
 
 
 @cache
-def _explorers(agent: str) -> PolicyFactory:
+def _policy_factory(agent: str) -> PolicyFactory:
     return make_policy_factory(agent, WORLD)
 
 
 @cache
-def _backends(fidelity: str) -> BackendFactory:
+def _backend_factory(fidelity: str) -> BackendFactory:
     return make_backend_factory(fidelity, WORLD, follow_falls=True)
 
 
-def _at_fidelity(case: Case, fidelity: str) -> list[Line]:
-    backend = _backends(fidelity)(_scene(case), item_rng(case.number))
-    policy = _explorers(case.agent)(backend)
-    return _episode(run_episode(backend, policy, max_moves=MAX_MOVES))
+def _run_at_fidelity(case: Case, fidelity: str) -> list[Line]:
+    backend = _backend_factory(fidelity)(_scene(case), item_rng(case.number))
+    policy = _policy_factory(case.agent)(backend)
+    return _trace(run_episode(backend, policy, max_moves=MAX_MOVES))
 
 
 def static(case: Case) -> list[Line]:
-    """Moves by teleport, judged by the static judge alone."""
-    return _at_fidelity(case, "static")
+    """Run an episode with teleported moves and the static stability model."""
+    return _run_at_fidelity(case, "static")
 
 
 def settle(case: Case) -> list[Line]:
-    """Moves by teleport, settled in Drake."""
-    return _at_fidelity(case, "settle")
+    """Run an episode with teleported moves that settle in Drake."""
+    return _run_at_fidelity(case, "settle")
 
 
 def arm(case: Case) -> list[Line]:
-    """Moves by the arm, with perfect detections."""
-    return _at_fidelity(case, "arm")
+    """Run an episode with moves of the arm and perfect detections."""
+    return _run_at_fidelity(case, "arm")
 
 
 def _scenario(case: Case, perception: str) -> Scenario:
@@ -137,8 +147,9 @@ def _scenario(case: Case, perception: str) -> Scenario:
     )
 
 
-def _closed_loop(case: Case, perception: str) -> list[Line]:
-    scenario, scene = _scenario(case, perception), _scene(case)
+def _run_closed_loop(case: Case, perception: str) -> list[Line]:
+    scenario = _scenario(case, perception)
+    scene = _scene(case)
     loop = ClosedLoop(
         scene,
         perceive=make_perception(scenario, scene.support),
@@ -148,101 +159,108 @@ def _closed_loop(case: Case, perception: str) -> list[Line]:
     )
     policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(loop, policy, max_moves=scenario.max_moves)
-    return _episode(task, loop.belief.objects, "nothing feasible")
+    return _trace(task, loop.belief.objects, "nothing feasible")
 
 
 def closed_loop_labels(case: Case) -> list[Line]:
-    """The closed loop with the perfect detector."""
-    return _closed_loop(case, "labels")
+    """Run a closed-loop episode with perfect detections."""
+    return _run_closed_loop(case, "labels")
 
 
 def closed_loop_depth(case: Case) -> list[Line]:
-    """The closed loop that sees depth images."""
-    return _closed_loop(case, "depth")
+    """Run a closed-loop episode with detections in depth images."""
+    return _run_closed_loop(case, "depth")
 
 
 def images(case: Case) -> list[Line]:
-    """The loop without an arm, which sees depth images."""
-    scenario, scene = _scenario(case, "depth"), _scene(case)
+    """Run an episode with teleported moves and detections in depth images."""
+    scenario = _scenario(case, "depth")
+    scene = _scene(case)
     perceive = make_perception(scenario, scene.support)
     assert perceive is not None
     backend = ImageBackend(scene, perceive, seed=scenario.seed, world=scenario.world)
     policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(backend, policy, max_moves=scenario.max_moves)
-    return _episode(task, backend.belief.objects)
+    return _trace(task, backend.belief.objects)
 
 
 @cache
-def _generator(agent: str) -> tuple[SceneGenerator, StaticStabilityJudge, DrakeJudge]:
+def _generator_and_judges(agent: str) -> tuple[SceneGenerator, StaticStabilityJudge, DrakeJudge]:
     job = GenerationJob(agent, OBJECTS, None, NODES, 0, WORLD)
     return SceneGenerator(job), StaticStabilityJudge(WORLD), DrakeJudge(WORLD)
 
 
 def generation(case: Case) -> list[Line]:
-    """A scene by a generator, with its graph and layout, and judged."""
-    generator, fast, drake = _generator(case.scenes)
+    """Generate, lay out and judge a scene."""
+    generator, static_judge, drake_judge = _generator_and_judges(case.scenes)
     rng = item_rng(0, case.number)
     scene, failures = generator.lay_out(rng)
     assert scene.graph is not None
     graph = scene.graph.nx
     nodes = [f"{node} {kind}" for node, kind in graph.nodes(data="kind")]
-    # An orientation has a name, other kinds of edges are one.
+    # The kind of an edge is an orientation, which has a name, or a text.
     edges = [f"{a} {b} {getattr(kind, 'name', kind)}" for a, b, kind in graph.edges(data="kind")]
     words = f"{len(nodes)} nodes, layout failures before: {failures.total()}"
     parts = {"graph": "\n".join([*nodes, *edges]), "rules": "\n".join(scene.derivation)}
-    names, poses = "\n".join(scene.names), _numbers(scene.poses.values())
+    names = "\n".join(scene.names)
+    poses = _pose_numbers(scene.poses.values())
     laid_out = Line(f"{len(scene.objects)} objects", {"names": names, "poses": poses})
     lines = [Line(words, parts), laid_out]
-    lines.append(_verdict("static", fast.judge(scene, deepcopy(rng))))
-    if case.number % DRAKE_EVERY == 0:
-        lines.append(_verdict("Drake", drake.judge(scene, deepcopy(rng))))
+    lines.append(_verdict_line("static", static_judge.judge(scene, deepcopy(rng))))
+    if case.number % DRAKE_INTERVAL == 0:
+        lines.append(_verdict_line("Drake", drake_judge.judge(scene, deepcopy(rng))))
     return lines
 
 
-def _verdict(judge: str, verdict: Verdict | InconclusiveVerdict) -> Line:
+def _verdict_line(judge: str, verdict: Verdict | InconclusiveVerdict) -> Line:
     if isinstance(verdict, InconclusiveVerdict):
         return Line(f"{judge}: cannot be judged, {verdict}")
-    words = str(verdict.instability or f"stable, hidden {_named(verdict.hidden)}")
-    poses, shares = _numbers(verdict.settled.values()), [*verdict.visible_fractions.values()]
-    return Line(f"{judge}: {words}", {"poses": poses, "shares": shares})
+    words = str(verdict.instability or f"stable, hidden {_name_list(verdict.hidden)}")
+    poses = _pose_numbers(verdict.settled.values())
+    fractions = [*verdict.visible_fractions.values()]
+    return Line(f"{judge}: {words}", {"poses": poses, "shares": fractions})
 
 
-def _episode(
+def _trace(
     task: ExplorationTask,
     known: Sequence[SceneObject] = (),
     end: str = TerminationReason.GAVE_UP.value,
 ) -> list[Line]:
-    """An episode.
+    """Return the trace of an episode.
 
     Args:
-        task: the episode's book.
-        known: K_t at the end, of an agent that keeps it.
-        end: why the agent ended by itself, as it is recorded.
+        task: The episode.
+        known: Objects that the agent knows at the end, of a backend with a belief of its own.
+        end: Recorded reason of the end if the agent ended the episode.
     """
     ended = task.termination.value if task.termination else end
     belief: dict[str, Part] = {}
     if known:
         names = "\n".join(f"{o.name} {o.object_class.name}" for o in known)
-        belief = {"known": names, "at": _numbers(o.X_TO for o in known)}
-    poses = _numbers(task.initial_scene.poses.values())
-    start = Line(f"hidden {_named(task.initially_hidden)}", {"poses": poses})
-    return [start, *(_move(step) for step in task.transitions), Line(ended, belief)]
+        belief = {"known": names, "at": _pose_numbers(o.X_TO for o in known)}
+    poses = _pose_numbers(task.initial_scene.poses.values())
+    start = Line(f"hidden {_name_list(task.initially_hidden)}", {"poses": poses})
+    return [
+        start,
+        *(_move_line(transition) for transition in task.transitions),
+        Line(ended, belief),
+    ]
 
 
-def _move(step: Transition) -> Line:
-    outcome = step.outcome
+def _move_line(transition: Transition) -> Line:
+    outcome = transition.outcome
     texts = [
         outcome.result.value,
         _recorded_detail(outcome.detail),
         outcome.instability,
         outcome.inconclusive,
     ]
-    words = f"{step.move}: {'; '.join(str(text) for text in texts if text)}"
-    words += f"; found {_named(step.newly_found)}"
-    parts = {"poses": _numbers(outcome.scene.poses.values())}
+    words = f"{transition.move}: {'; '.join(str(text) for text in texts if text)}"
+    words += f"; found {_name_list(transition.newly_found)}"
+    parts = {"poses": _pose_numbers(outcome.scene.poses.values())}
     if outcome.X_TO_released is not None:
-        parts["released"] = _numbers([outcome.X_TO_released])
-    arms = [frame.arm for frame in outcome.motion if frame.arm is not None]
+        parts["released"] = _pose_numbers([outcome.X_TO_released])
+    arms = [sample.arm for sample in outcome.motion if sample.arm is not None]
     if arms:
         parts |= {"q_middle": [*arms[len(arms) // 2].q], "q_last": [*arms[-1].q]}
     return Line(words, parts)
@@ -254,10 +272,10 @@ def _recorded_detail(detail: str) -> str:
     return f"{placed[1]} from where it was to be" if placed else detail
 
 
-def _numbers(poses: Iterable[Pose]) -> list[float]:
-    """Translations and rotation matrices: a quaternion's sign says nothing."""
+def _pose_numbers(poses: Iterable[Pose]) -> list[float]:
+    """Return translations and rotation matrices; the sign of a quaternion is arbitrary."""
     return [float(v) for X in poses for v in (*X.translation, *X.rotation.ravel())]
 
 
-def _named(names: Sequence[str]) -> str:
+def _name_list(names: Sequence[str]) -> str:
     return ", ".join(names) or "nothing"

@@ -1,17 +1,19 @@
-"""Hashes of episodes on every backend and of generated scenes: whether all behavior is as it was.
+"""Compare the behavior of all backends and generators with recorded traces.
 
-    python benchmarks/behavior_hashes.py --count 3       # quick: the first three of each backend
+    python benchmarks/behavior_hashes.py --count 3
     python benchmarks/behavior_hashes.py --only arm --only images
-    python benchmarks/behavior_hashes.py --write         # records; where behavior is to change
+    python benchmarks/behavior_hashes.py --write
 
-Without --write it plays again what is recorded, tells of each episode whether it went the same way,
-and if not with which move it first went another; then the exit code is 1. Of a move count its
-result and texts, what it found, all poses afterwards to a nanometer, and the arm's joint angles.
+Episodes and generated scenes are repeated, and their traces compared with the records. A trace
+holds of every move its result and texts, the objects found, the poses of all objects afterwards to
+a nanometer, and the arm's joint angles. For each case that differs, the first differing line is
+printed; the exit code is then 1. `--write` records the traces, where a change of behavior is
+intended.
 """
 
 import os
 
-# Before numpy is imported: how a sum is rounded depends on the number of threads.
+# Before numpy is imported: the rounding of sums depends on the number of threads.
 os.environ.update(
     {
         "OMP_NUM_THREADS": "1",
@@ -21,13 +23,11 @@ os.environ.update(
     }
 )
 
-import json
-import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,166 +35,198 @@ import typer
 
 from benchmarks import behavior_backends as backends
 from benchmarks.behavior_backends import Case, Line, hash_of
-from drake_clutter.files import InputError, cli_error_handler, write_json
-from drake_clutter.resources import git_commit
+from benchmarks.measurement import describe_machine
+from drake_clutter.files import InputError
+from drake_clutter.records import read_jsonl, write_jsonl
 from drake_clutter.workers.parallel_map import map_ordered
+from training.results_file import provenance
+from training.script import ROOT, WorkersOption, run_script
 
-RECORD = Path(__file__).parent / "results" / "behavior_hashes.json"
-EXPLORERS, GENERATORS = ("student", "largest-clear"), ("random", "sg-star")
-LARGE, MIXED = ("sg_star_25", "rg_25"), ("sg_star_15", "sg_star_25")
-EPISODES = 10
-"""Of a process, where Diagrams hold systems written in Python: hundreds of MB each stay."""
+RECORDS = ROOT / "benchmarks/results/behavior_hashes"
+"""Folder of the records, one file for each backend."""
+EXPLORERS = ("student", "largest-clear")
+"""Explorers of the episodes, which take turns."""
+LARGE_SETS = ("sg_star_25", "rg_25")
+"""Scene sets of the cheap backends, which take turns."""
+MIXED_SETS = ("sg_star_15", "sg_star_25")
+"""Scene sets of the costly backends, which take turns."""
+GENERATORS = ("random", "sg-star")
+"""Scene generators, which take turns."""
+EPISODES_PER_PROCESS = 10
+"""Episodes after which a process is replaced: Diagrams with systems in Python are never freed."""
+
+Entry = dict[str, Any]
+"""Record of a case: the fields of `Case`, the `hash` of its trace, and the lines as `moves`."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """One way to play or make something.
+    """One way to run episodes or to generate scenes.
 
     Attributes:
-        play: does it, and tells of it line by line.
-        scenes: as of `Case`, by turns.
-        count: of cases.
-        agents: likewise by turns.
-        max_items_per_process: cases, after which a process is replaced; None: never.
+        run: Runs a case and returns its trace.
+        scenes: Values of `Case.scenes`, which take turns.
+        count: Number of cases.
+        agents: Values of `Case.agent`, which take turns.
+        max_items_per_process: See `map_ordered`.
     """
 
-    play: Callable[[Case], list[Line]]
+    run: Callable[[Case], list[Line]]
     scenes: tuple[str, ...]
     count: int
     agents: tuple[str, ...] = EXPLORERS
     max_items_per_process: int | None = None
 
     def cases(self) -> list[Case]:
-        """All of it, in order."""
-        made = list[Case]()
+        """Return all cases in order."""
+        cases = list[Case]()
         for k in range(self.count):
-            number, turn = divmod(k, len(self.scenes))
-            made.append(Case(self.scenes[turn], number, self.agents[number % len(self.agents)]))
-        return made
+            number, position = divmod(k, len(self.scenes))
+            agent = self.agents[number % len(self.agents)]
+            cases.append(Case(self.scenes[position], number, agent))
+        return cases
 
 
 BACKENDS = {
-    "static": Backend(backends.static, LARGE, 30),
+    "static": Backend(backends.static, LARGE_SETS, 30),
     "generation": Backend(backends.generation, GENERATORS, 200, agents=("",)),
-    "settle": Backend(backends.settle, LARGE, 30),
-    "images": Backend(backends.images, MIXED, 30),
-    "arm": Backend(backends.arm, MIXED, 30, max_items_per_process=EPISODES),
+    "settle": Backend(backends.settle, LARGE_SETS, 30),
+    "images": Backend(backends.images, MIXED_SETS, 30),
+    "arm": Backend(backends.arm, MIXED_SETS, 30, max_items_per_process=EPISODES_PER_PROCESS),
     "closed-loop-labels": Backend(
-        backends.closed_loop_labels, MIXED, 15, max_items_per_process=EPISODES
+        backends.closed_loop_labels, MIXED_SETS, 15, max_items_per_process=EPISODES_PER_PROCESS
     ),
     "closed-loop-depth": Backend(
-        backends.closed_loop_depth, MIXED, 15, max_items_per_process=EPISODES
+        backends.closed_loop_depth, MIXED_SETS, 15, max_items_per_process=EPISODES_PER_PROCESS
     ),
 }
-"""By name, the quickest first."""
+"""Backends by name, the quickest first."""
 
 
 @dataclass(frozen=True)
-class Played:
-    """How a case went: its lines, and s that it took."""
+class Trace:
+    """Trace of a case.
+
+    Attributes:
+        lines: The lines.
+        seconds: Time that the case took [s].
+    """
 
     lines: tuple[str, ...]
     seconds: float
 
     @property
     def hash(self) -> str:
-        """Of all lines."""
+        """Hash of all lines."""
         return hash_of("\n".join(self.lines))
 
 
-class Player:
-    """Plays cases of a backend; a worker for the runner."""
+class CaseRunner:
+    """Runs cases of a backend; a worker for `map_ordered`."""
 
     def __init__(self, name: str) -> None:
-        self._play = BACKENDS[name].play
+        """Look up the backend.
 
-    def __call__(self, case: Case) -> Played:
-        """Plays one."""
+        Args:
+            name: Key of `BACKENDS`.
+        """
+        self._run = BACKENDS[name].run
+
+    def __call__(self, case: Case) -> Trace:
+        """Run a case and return its trace."""
         start = time.perf_counter()
-        lines = tuple(str(line) for line in self._play(case))
-        return Played(lines, time.perf_counter() - start)
+        lines = tuple(str(line) for line in self._run(case))
+        return Trace(lines, time.perf_counter() - start)
 
 
-Entry = dict[str, Any]
-"""A case in the record."""
+def describe_difference(case: Case, trace: Trace, records: Sequence[Entry]) -> str:
+    """Return how a trace differs from the recorded one; "" if they are equal.
 
-
-def named(case: Case) -> Entry:
-    """What an entry is known by."""
-    return {"scenes": case.scenes, "number": case.number, "agent": case.agent}
-
-
-def difference(case: Case, played: Played, recorded: Sequence[Entry]) -> str:
-    """Where a case went another way than is recorded; "" if it went the same."""
-    found = next((entry for entry in recorded if named(case).items() <= entry.items()), None)
-    if found is None:
+    Args:
+        case: The case.
+        trace: Its trace.
+        records: The recorded cases of the backend.
+    """
+    entry = next((entry for entry in records if asdict(case).items() <= entry.items()), None)
+    if entry is None:
         return "not recorded"
-    if found["hash"] == played.hash:
+    if entry["hash"] == trace.hash:
         return ""
-    old, new = [*found["moves"], "nothing"], [*played.lines, "nothing"]
-    k = next((k for k, line in enumerate(old) if k >= len(new) or line != new[k]), None)
-    if k is None:
-        return "the hash differs, but no line: the record was changed"
-    return f"differs from line {k} of {len(old) - 2} on\n  recorded {old[k]}\n  now      {new[k]}"
+    lines = zip_longest(entry["moves"], trace.lines, fillvalue="nothing")
+    for k, (recorded, current) in enumerate(lines):
+        if recorded != current:
+            return (
+                f"differs from line {k} of {len(entry['moves']) - 1} on\n"
+                f"  recorded {recorded}\n  now      {current}"
+            )
+    return "the hash differs, but no line: the record was edited"
 
 
-def about() -> dict[str, str]:
-    """What a backend was recorded with."""
-    packages = {name: version(name) for name in ("drake", "numpy", "scipy", "torch", "numba")}
-    system = {"python": platform.python_version(), "system": platform.platform()}
-    return {"commit": git_commit(), **system, **packages}
+def records_path(name: str) -> Path:
+    """Return the record file of a backend."""
+    return RECORDS / f"{name}.jsonl.gz"
 
 
-def read_record() -> dict[str, Any]:
-    """The record, empty if there is none."""
-    if not RECORD.exists():
-        return {"about": {}, "backends": {}}
-    try:
-        document: dict[str, Any] = json.loads(RECORD.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{RECORD}: no JSON ({error}); allowed is what --write wrote") from error
-    return document
+def compare_backend(name: str, count: int | None, workers: int, write: bool) -> list[str]:
+    """Run the cases of a backend and return those that differ from the records.
+
+    Args:
+        name: Key of `BACKENDS`.
+        count: Number of cases; None for all.
+        workers: Number of processes.
+        write: Whether the traces are recorded instead of compared.
+    """
+    backend = BACKENDS[name]
+    cases = backend.cases()[:count]
+    records = read_jsonl(records_path(name))[1:]
+    traces = map_ordered(
+        partial(CaseRunner, name),
+        cases,
+        workers=workers,
+        max_items_per_process=backend.max_items_per_process,
+    )
+    start = time.perf_counter()
+    entries = list[Entry]()
+    differences = list[str]()
+    for case, trace in zip(cases, traces, strict=True):
+        entries.append({**asdict(case), "hash": trace.hash, "moves": [*trace.lines]})
+        difference = "" if write else describe_difference(case, trace, records)
+        if difference:
+            differences.append(f"{name}: {case}: {difference}")
+        result = difference or ("recorded" if write else "equal")
+        position = f"{name} {len(entries)}/{len(cases)}"
+        print(f"{position}: {case}, {trace.seconds:.1f} s: {result}", flush=True)
+    print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    if write:
+        header = describe_machine("drake", "numpy", "scipy", "torch", "numba") | provenance()
+        write_jsonl(records_path(name), header, entries + records[len(entries) :])
+        print(f"{name}: written to {records_path(name)}", flush=True)
+    return differences
 
 
 def main(
-    only: Annotated[list[str] | None, typer.Option(help="A backend; may be repeated.")] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="The first of each backend.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    write: Annotated[bool, typer.Option("--write", help="Record, do not compare.")] = False,
+    only: Annotated[list[str] | None, typer.Option(help="A backend. May be repeated.")] = None,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Only the first N cases of each backend.")
+    ] = None,
+    workers: WorkersOption = 1,
+    write: Annotated[
+        bool, typer.Option("--write", help="Record the traces, do not compare them.")
+    ] = False,
 ) -> None:
-    """Plays, and compares with what is recorded."""
+    """Run the cases and compare their traces with the records."""
     if unknown := [name for name in only or [] if name not in BACKENDS]:
         raise InputError(f"--only {unknown[0]}; allowed are {', '.join(BACKENDS)}")
-    record, different = read_record(), list[str]()
-    for name, backend in BACKENDS.items():
-        if only and name not in only:
-            continue
-        recorded, entries = record["backends"].get(name, []), list[Entry]()
-        cases, start = backend.cases()[:count], time.perf_counter()
-        fresh = backend.max_items_per_process
-        made = map_ordered(
-            partial(Player, name), cases, workers=workers, max_items_per_process=fresh
-        )
-        for case, played in zip(cases, made, strict=True):
-            entries.append({**named(case), "hash": played.hash, "moves": [*played.lines]})
-            found = "" if write else difference(case, played, recorded)
-            if found:
-                different.append(f"{name}: {case}: {found}")
-            head = f"{name} {len(entries)}/{len(cases)}: {case}, {played.seconds:.1f} s"
-            print(f"{head}: {found or ('played' if write else 'equal')}", flush=True)
-        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
-        if write:
-            record["backends"][name] = entries + recorded[len(entries) :]
-            record["about"][name] = about()
-            write_json(RECORD, record)
-            print(f"{name}: written to {RECORD}", flush=True)
-    if different:
-        print("\n".join([f"{len(different)} differ:", *different]))
+    differences = list[str]()
+    for name in BACKENDS:
+        if not only or name in only:
+            differences += compare_backend(name, count, workers, write)
+    if differences:
+        print("\n".join([f"{len(differences)} differ:", *differences]))
         raise typer.Exit(1)
     if not write:
         print("all equal")
 
 
 if __name__ == "__main__":
-    with cli_error_handler():
-        typer.run(main)
+    run_script(main)

@@ -31,6 +31,18 @@ def read_jsonl(path: Path) -> list[Any]:
     return [json.loads(line) for line in max(lines, _compressed_lines(path), key=len)]
 
 
+def write_jsonl(path: Path, header: Any, records: Iterable[Any]) -> None:
+    """Write a compressed record file in one step, in place of an earlier one.
+
+    Args:
+        path: The file; its folder is created if it does not exist.
+        header: The header.
+        records: The records.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_compressed(path, [f"{json.dumps(line)}\n" for line in (header, *records)])
+
+
 def resume_jsonl(
     path: Path,
     header: Mapping[str, Any],
@@ -97,6 +109,12 @@ def _compressed_lines(path: Path) -> list[str]:
     return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
 
 
+def _write_compressed(path: Path, lines: Iterable[str]) -> None:
+    """Write a compressed file; equal lines give equal bytes."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+
+
 @contextmanager
 def _open_journal(path: Path) -> Iterator[TextIO]:
     """Open and lock the journal of a record file; at the end, compress and remove it."""
@@ -109,8 +127,7 @@ def _open_journal(path: Path) -> Iterator[TextIO]:
                 journal.seek(0)
                 lines = _complete_lines(journal.read())
                 if len(lines) > len(_compressed_lines(path)):
-                    with atomic_write(path) as temporary:
-                        temporary.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+                    _write_compressed(path, lines)
                 journal_path.unlink()
 
 

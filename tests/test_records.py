@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from drake_clutter.files import InputError
-from drake_clutter.records import read_jsonl, resume_jsonl
+from drake_clutter.records import read_jsonl, resume_jsonl, write_jsonl
 
 NAMES = pytest.mark.parametrize("name", ["records.jsonl", "records.jsonl.gz"])
 
@@ -82,3 +82,12 @@ def test_records_survive_an_error(tmp_path: Path) -> None:
 
 def test_no_file_holds_no_records(tmp_path: Path) -> None:
     assert read_jsonl(tmp_path / "records.jsonl.gz") == []
+
+
+def test_written_records_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "records.jsonl.gz"
+    write_jsonl(path, {"seed": 1}, [0, 1])
+    content = path.read_bytes()
+    assert read_jsonl(path) == [{"seed": 1}, 0, 1]
+    write_jsonl(path, {"seed": 1}, [0, 1])
+    assert path.read_bytes() == content

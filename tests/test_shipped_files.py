@@ -26,7 +26,6 @@ RESULTS = sorted(
     path
     for folder in ("training/results", "benchmarks/results")
     for path in (ROOT / folder).rglob("*.json*")
-    if path.name != "behavior_hashes.json"  # its cells are no work cells
 )
 
 
