@@ -1,6 +1,7 @@
 """Compare installations of Drake: verdicts on the same scenes, and times.
 
-Each installation writes its own results file, with the interpreter of its environment:
+Each installation writes its own results file, and beside it a record file of the verdicts, with the
+interpreter of its environment:
 
     python benchmarks/drake_versions.py measure --out drake_1.51.json
     python benchmarks/drake_versions.py compare drake_1.51.json drake_1.58.json
@@ -24,6 +25,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.explore_scene import explore_scene
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
+from drake_clutter.records import read_jsonl, write_jsonl
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
@@ -96,32 +98,36 @@ def measure(
         seconds = time.perf_counter() - start
         episodes.append({"scene": number, "moves": len(task.transitions), "seconds": seconds})
     settle_seconds = stopwatch.seconds["settle"]
-    write_json(
-        out,
-        {
-            **describe_machine("drake", "numpy"),
-            **provenance(),
-            "seed": SEED,
-            "nodes": NODES,
-            "count": count,
-            "settle_seconds": {
-                "median": float(np.median(settle_seconds)),
-                "mean": float(np.mean(settle_seconds)),
-            },
-            "step_ms": measure_steps(config),
-            "episodes": episodes,
-            "episode_seconds_per_move": sum(e["seconds"] for e in episodes)
-            / sum(e["moves"] for e in episodes),
-            "verdicts": verdicts,
+    results = {
+        **describe_machine("drake", "numpy"),
+        **provenance(),
+        "seed": SEED,
+        "nodes": NODES,
+        "count": count,
+        "settle_seconds": {
+            "median": float(np.median(settle_seconds)),
+            "mean": float(np.mean(settle_seconds)),
         },
-    )
+        "step_ms": measure_steps(config),
+        "episodes": episodes,
+        "episode_seconds_per_move": sum(e["seconds"] for e in episodes)
+        / sum(e["moves"] for e in episodes),
+    }
+    write_json(out, results)
+    header = {key: results[key] for key in ("drake", "python", "seed", "nodes", "count")}
+    write_jsonl(verdicts_path(out), header, verdicts)
+
+
+def verdicts_path(results: Path) -> Path:
+    """Return the record file of the verdicts that belong to a results file."""
+    return results.with_suffix(".jsonl.gz")
 
 
 def table_row(results: Row, reference: Row) -> dict[str, str]:
     """Return the results of an installation as cells of the printed table.
 
     Args:
-        results: The results.
+        results: The results, with the `verdicts`.
         reference: Results of the installation that it is compared with.
     """
     pairs = list(zip(reference["verdicts"], results["verdicts"], strict=True))
@@ -148,7 +154,11 @@ def compare(
     ],
 ) -> None:
     """Print how far verdicts agree with those of the first file, and the times."""
-    results = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+    results = [
+        json.loads(path.read_text(encoding="utf-8"))
+        | {"verdicts": read_jsonl(verdicts_path(path))[1:]}
+        for path in files
+    ]
     print_table([table_row(one, results[0]) for one in results])
 
 

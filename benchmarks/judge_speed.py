@@ -84,15 +84,15 @@ NOTES = {
     f" judge the first {SLOW_SCENES}. 30 objects may be one more or less, 60 two.",
     STATIC_COLD: "Stability and visibility. The cache of stacks is cleared before every scene.",
     STATIC_WARM: "Second verdict on the same scenes.",
-    DRAKE: "Default settings with early stop. One judge for all scenes, which caches objects that"
-    f" stand alone; untimed verdicts on the first {SLOW_SCENES} scenes come first. Its engine is"
-    " rebuilt when a scene has more objects of a class than any before.",
+    DRAKE: "Default settings with early stop. One judge for all scenes, which caches objects"
+    f" that stand alone; untimed verdicts on the first {SLOW_SCENES} scenes come first. Its engine"
+    " is rebuilt when a scene has more objects of a class than any before.",
     DRAKE_ACCURATE: "Without the early stop: stable scenes are simulated for 2 s.",
     BULLET: f"{PYBULLET_STEPS} steps of 1/240 s in a new world for every scene, friction 0.5,"
     " Drake's limits at the end, stability only. Loading is given as load_mean_ms; the export is"
     " not included. Lying markers roll away.",
-    "agreement": "With the accurate settings. agrees: stability; agrees_on_hidden: hidden objects of"
-    " scenes that both call stable; unchanged: both.",
+    "agreement": "With the accurate settings. agrees: stability; agrees_on_hidden: hidden objects"
+    " of scenes that both call stable; unchanged: both.",
     "eyes": "640 x 480; shares: the visible fractions of all objects. Every scene was rendered once"
     " before, untimed; PyBullet without shadows.",
     "repeats": f"Static judge and ray caster: median of {REPEATS} rounds; all others: one call.",

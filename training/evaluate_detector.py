@@ -2,6 +2,8 @@ r"""Evaluate a trained detector on shipped scene sets and on rendered images.
 
     python training/evaluate_detector.py --scenes training/scenes/sg_star_25.json \
         --detector training/checkpoints/detector_depth.safetensors --out detector.json
+
+The noise of a stereo camera is added to the depth images.
 """
 
 import time

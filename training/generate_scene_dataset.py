@@ -1,7 +1,7 @@
-"""Generate a dataset of stable scenes for explorers: one small scene-set file.
+r"""Generate a dataset of stable scenes for explorers: one small scene-set file.
 
     python training/generate_scene_dataset.py --seed 100 --work runs/train --out train.json
-    python training/generate_scene_dataset.py --with-poses --count 300 --seed 9000 \\
+    python training/generate_scene_dataset.py --with-poses --count 300 --seed 9000 \
         --work runs/test --out test.json
 
 Every scene is stable and hides at least one object, by Drake's verdict. No scene graph is repeated,

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from markdown_text import estimate, figure, number, section, significant, table
-from results_files import read_benchmark_results
+from results_files import BENCHMARKS, read_benchmark_results, read_episodes
 
 JUDGES = {
     "FastJudge, cold": "static judge, empty cache",
@@ -263,7 +263,11 @@ def _oracle() -> str:
 
 def _drake_versions() -> str:
     names = ("1.51.1", "1.58.0")
-    runs = [read_benchmark_results(f"drake_versions/drake_{name}.json") for name in names]
+    runs = [
+        read_benchmark_results(f"drake_versions/drake_{name}.json")
+        | {"verdicts": read_episodes(BENCHMARKS / f"drake_versions/drake_{name}.jsonl.gz")}
+        for name in names
+    ]
     text = section(
         "Drake versions",
         "Verdicts and times of the oldest and the newest supported Drake on the same RG scenes.",
