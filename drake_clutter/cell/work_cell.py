@@ -165,19 +165,19 @@ def load_cell(path: Path, settings: Sequence[str] = ()) -> WorkCell:
     Raises:
         InputError: The file is invalid; names the field and what is allowed.
     """
-    given = read_yaml(path, "a mapping with robot, gripper, support and cameras")
-    cell = validate(WorkCell, _with_absolute_paths(given, path.parent), str(path))
+    document = read_yaml(path, "a mapping with robot, gripper, support and cameras")
+    cell = validate(WorkCell, _with_absolute_paths(document, path.parent), str(path))
     return load_config_as(cell, settings=settings)
 
 
-def _with_absolute_paths(given: Any, folder: Path) -> Any:
+def _with_absolute_paths(document: Any, folder: Path) -> Any:
     """Return a cell document with model paths relative to `folder` made absolute."""
-    if not isinstance(given, dict):
-        return given
-    absolute = dict(given)
-    if isinstance(robot := given.get("robot"), dict):
+    if not isinstance(document, dict):
+        return document
+    absolute = dict(document)
+    if isinstance(robot := document.get("robot"), dict):
         absolute["robot"] = _with_absolute_path(robot, folder)
-    if isinstance(fixtures := given.get("fixtures"), list):
+    if isinstance(fixtures := document.get("fixtures"), list):
         absolute["fixtures"] = [
             _with_absolute_path(f, folder) if isinstance(f, dict) else f for f in fixtures
         ]

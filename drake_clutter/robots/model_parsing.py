@@ -31,8 +31,8 @@ def resolve_model_path(model: str, field: str = "robot.model") -> Path:
         InputError: The file does not exist, or is neither SDF nor URDF.
     """
     prefix = f"package://{PACKAGE}/"
-    shipped, inside = model.startswith(prefix), model.removeprefix(prefix)
-    path = resource_path("models") / inside if shipped else Path(model)
+    is_shipped = model.startswith(prefix)
+    path = resource_path("models") / model.removeprefix(prefix) if is_shipped else Path(model)
     if not path.is_file() or path.suffix not in (".sdf", ".urdf"):
         raise InputError(f"{field}: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
     return path
@@ -61,8 +61,8 @@ def find_packages(path: Path) -> PackageMap:
 def read_model_text(path: Path, *, visuals: bool) -> str:
     """Return the text of a model for Drake's parser.
 
-    Mesh paths become absolute, and `static` elements are removed. Parsing the text takes a few
-    milliseconds; parsing the file takes 60 ms, because Drake resolves each path anew.
+    Mesh paths become absolute, and `static` elements are removed. Drake parses the text in a few
+    milliseconds, and the file in 60 ms.
 
     Args:
         path: SDF or URDF file.
@@ -88,6 +88,7 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
 
 
 def _read_xml(path: Path) -> ElementTree.Element:
+    """Return the root element of a model file, or raise an `InputError`."""
     # Without registration, ElementTree would rename the prefix, which Drake would not recognize.
     ElementTree.register_namespace("drake", _DRAKE)
     try:
@@ -101,6 +102,7 @@ def _read_xml(path: Path) -> ElementTree.Element:
 
 
 def _resolve_mesh(path: Path, uri: str, packages: PackageMap) -> Path:
+    """Return the file of a mesh URI in a model file; STL meshes are converted to OBJ."""
     scheme, _, rest = uri.partition("://")
     package, _, inside = rest.partition("/")
     if scheme in ("package", "model") and packages.Contains(package):

@@ -39,7 +39,9 @@ _NULL_SPACE_ITERATIONS = 20
 _NULL_SPACE_GAIN = 0.5
 """Fraction of the distance to home that is desired in one iteration."""
 _ABANDON_ITERATION = 12
-"""Iteration at which a start is abandoned unless its squared error is small."""
+"""Iteration at which a start is abandoned if its squared error is large."""
+_ABANDON_SQUARED_ERROR = 0.05
+"""Squared error above which a start is abandoned [rad^2 and m^2]."""
 _ERROR_TOLERANCE = 1e-10
 """Largest error of a solution, rotation [rad] and position [m] combined."""
 
@@ -186,7 +188,8 @@ def _solve_cholesky(A, b):  # type: ignore[no-untyped-def]
 def _damped_step(J, e, damping, dq_null, dq):  # type: ignore[no-untyped-def]
     """Write J^T (J J^T + damping I)^-1 (e - J dq_null) + dq_null into dq (n,)."""
     n = J.shape[1]
-    A, b = np.empty((6, 6)), np.empty(6)
+    A = np.empty((6, 6))
+    b = np.empty(6)
     for i in range(6):
         b[i] = e[i]
         for k in range(n):
@@ -210,21 +213,24 @@ def _iterate(fixed, revolute, limits, home, X, q, null_space_iterations):  # typ
     The first iterations have a null-space motion towards home.
     """
     n = len(q)
-    frames, J, e = np.empty((n + 1, 4, 4)), np.empty((6, n)), np.empty(6)
-    pull, dq = np.zeros(n), np.empty(n)
+    frames = np.empty((n + 1, 4, 4))
+    J = np.empty((6, n))
+    e = np.empty(6)
+    dq_null = np.zeros(n)
+    dq = np.empty(n)
     for iteration in range(_MAX_ITERATIONS):
         chain_frames(fixed, revolute, q, frames)
-        square = _pose_error(X, frames[n], e)
-        if iteration >= null_space_iterations and square < _ERROR_TOLERANCE**2:
+        squared_error = _pose_error(X, frames[n], e)
+        if iteration >= null_space_iterations and squared_error < _ERROR_TOLERANCE**2:
             return True
-        if iteration == _ABANDON_ITERATION and square > 0.05:
+        if iteration == _ABANDON_ITERATION and squared_error > _ABANDON_SQUARED_ERROR:
             return False
         chain_jacobian(frames, revolute, J)
         for k in range(n):
-            pull[k] = (
+            dq_null[k] = (
                 _NULL_SPACE_GAIN * (home[k] - q[k]) if iteration < null_space_iterations else 0.0
             )
-        _damped_step(J, e, square + 1e-12, pull, dq)
+        _damped_step(J, e, squared_error + 1e-12, dq_null, dq)
         for k in range(n):
             q[k] = min(max(q[k] + dq[k], limits[k, 0]), limits[k, 1])
     return False

@@ -180,18 +180,18 @@ def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
 
 def _joint_limits(
     kind: str,
-    given: tuple[float, ...] | None,
+    cell_limits: tuple[float, ...] | None,
     arm: ParsedArm,
-    of_model: list[float],
+    model_limits: list[float],
 ) -> Floats:
     """Return the limits of the cell, or else those of the model. Shape (n,)."""
-    if given is not None:
-        _check_length(f"limits.{kind}", len(given), arm)
-        return np.array(given)
-    for joint, limit in zip(arm.joints, of_model, strict=True):
+    if cell_limits is not None:
+        _check_length(f"limits.{kind}", len(cell_limits), arm)
+        return np.array(cell_limits)
+    for joint, limit in zip(arm.joints, model_limits, strict=True):
         if not 0 < limit < np.inf:
             raise _missing_limit(kind, joint.name())
-    return np.array(of_model)
+    return np.array(model_limits)
 
 
 def _check_length(field: str, length: int, arm: ParsedArm) -> None:

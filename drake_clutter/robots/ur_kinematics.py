@@ -107,7 +107,8 @@ def jacobian(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floa
         parameters: Denavit-Hartenberg parameters.
     """
     X = np.concatenate([np.eye(4)[None], link_poses(q, parameters)])
-    axes, p_B6 = X[:-1, :3, 2], X[-1, :3, 3]
+    axes = X[:-1, :3, 2]
+    p_B6 = X[-1, :3, 3]
     return np.vstack([axes.T, np.cross(axes, p_B6 - X[:-1, :3, 3]).T])
 
 
