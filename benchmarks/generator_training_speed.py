@@ -14,7 +14,8 @@ import typer
 
 from benchmarks.measurement import Stopwatch, describe_machine
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
-from drake_clutter.agents.soft_q import NUM_GRADIENT_SHARDS, ReplayBuffer, SoftQConfig, SoftQLearner
+from drake_clutter.agents.replay_buffer import ReplayBuffer
+from drake_clutter.agents.soft_q import NUM_GRADIENT_SHARDS, SoftQConfig, SoftQLearner
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
@@ -28,7 +29,7 @@ PARTS: dict[str, tuple[Any, Callable[..., Any]]] = {
     "remembering": (ReplayBuffer, ReplayBuffer.add),
     "updates": (SoftQLearner, SoftQLearner._update),
     "of updates: drawing from memory": (ReplayBuffer, ReplayBuffer.sample_sequences),
-    "of updates: losses and gradients": (SoftQLearner, SoftQLearner._loss),
+    "of updates: losses and gradients": (SoftQLearner, SoftQLearner._shard_loss),
 }
 """Measured methods by name, each with its class.
 

@@ -157,7 +157,7 @@ def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneDataset) ->
             (0, 0) if number < 3 else random_move(observation, np.random.default_rng(1))
         )
         assert (over, out_of_moves) == (False, number == 3)
-    assert info["end"] is TerminationReason.OUT_OF_MOVES
+    assert info["termination"] is TerminationReason.OUT_OF_MOVES
     assert len(environment.task.transitions) == 1
 
 
@@ -172,7 +172,7 @@ def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
         np.flatnonzero(before["action_mask"][:, 0]).tolist(), key=lambda node: float(height[node])
     )
     after, *_, info = environment.step((highest, 0))
-    assert info["step"].outcome.result is MoveResult.PLACED
+    assert info["transition"].outcome.result is MoveResult.PLACED
     assert after["node_features"][highest, NODE_FEATURES.index("z")] < height[highest] - 0.05
     assert after["global_features"].tolist() == [pytest.approx(1 / 20)]
 

@@ -16,7 +16,7 @@ from drake_clutter.agents.explorer_training import ExplorerTrainingConfig
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, load_explorer
 from drake_clutter.agents.learned_generator import load_rule_network
 from drake_clutter.agents.ppo import PPOConfig
-from drake_clutter.agents.soft_q import RENAMED_ARRAYS as RENAMED_REPLAY_ARRAYS
+from drake_clutter.agents.replay_buffer import RENAMED_ARRAYS as RENAMED_REPLAY_ARRAYS
 from drake_clutter.agents.soft_q import RENAMED_STATE, SoftQConfig, SoftQLearner
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, load_tensors, save_tensors

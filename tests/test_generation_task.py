@@ -203,7 +203,7 @@ def test_a_tower_that_falls_ends_the_episode() -> None:
     total, over, info = derived(environment, rules)
     assert over
     assert total == -1.0
-    assert info["fault"] is StackFailure.UNSTABLE
+    assert info["failure"] is StackFailure.UNSTABLE
 
 
 def test_a_tower_that_is_too_high_ends_the_episode() -> None:
@@ -218,7 +218,7 @@ def test_a_tower_that_is_too_high_ends_the_episode() -> None:
         *["orient_upright_0"] * 3,
     ]
     total, over, info = derived(environment, rules)
-    assert (total, over, info["fault"]) == (-1.0, True, StackFailure.TOO_HIGH)
+    assert (total, over, info["failure"]) == (-1.0, True, StackFailure.TOO_HIGH)
 
 
 def test_a_hidden_object_pays_at_once() -> None:

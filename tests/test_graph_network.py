@@ -15,7 +15,7 @@ from drake_clutter.agents.message_passing import (
     message_passing,
     message_passing_reference,
 )
-from drake_clutter.agents.soft_q import collate
+from drake_clutter.agents.replay_buffer import collate
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationObservation
 
 ENVIRONMENT = ClutterGeneration()

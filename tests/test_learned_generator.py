@@ -15,7 +15,8 @@ from drake_clutter.agents.learned_generator import (
     load_rule_network,
     rule_network_metadata,
 )
-from drake_clutter.agents.soft_q import SoftQConfig, collate
+from drake_clutter.agents.replay_buffer import collate
+from drake_clutter.agents.soft_q import SoftQConfig
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, canonical_form

@@ -13,8 +13,8 @@ import torch
 from conftest import rng, training_script
 
 from drake_clutter.agents.generators import make_generation_agent
+from drake_clutter.agents.replay_buffer import ReplayBuffer
 from drake_clutter.agents.soft_q import (
-    ReplayBuffer,
     SoftQConfig,
     SoftQLearner,
     action_probabilities,
@@ -97,7 +97,7 @@ def test_chances_are_those_of_the_choice() -> None:
 
 def test_what_is_drawn_was_added_and_follows_each_other() -> None:
     example, _ = small_environment().reset(seed=0)
-    replay = ReplayBuffer(capacity=60, environments=4, observation=example, actions=5)
+    replay = ReplayBuffer(capacity=60, num_envs=4, observation=example, num_actions=5)
     draw, seen = rng(0), set[int]()
     assert replay.sample_sequences(3, 4, draw) is None
     for moment in range(40):  # the ring of 15 is filled more than twice

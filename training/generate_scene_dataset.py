@@ -202,7 +202,7 @@ def main(
         judge = partial(GraphJudge, job)
         records = resume_jsonl(
             work / VERDICTS_FILE,
-            job.to_dict,
+            job.to_dict(),
             lambda done: map_ordered(judge, range(done, max_generated), workers=workers),
         )
         with closing(records):

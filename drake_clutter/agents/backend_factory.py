@@ -1,4 +1,4 @@
-"""Backends by the name of their fidelity, the arm among them."""
+"""Backends of exploration episodes by the name of their fidelity, including the arm."""
 
 from functools import partial
 
@@ -13,18 +13,22 @@ from drake_clutter.tasks.episode import (
 )
 
 FIDELITIES = (*TELEPORT_FIDELITIES, "arm")
-"""How moves are carried out: by teleport, or planned and simulated with the arm."""
+"""Models of the outcome of a move: three in which objects are teleported, and the simulated arm."""
 
 
 def make_backend_factory(
     fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
 ) -> BackendFactory:
-    """Return what starts episodes.
+    """Return a factory of the backends of episodes.
 
     Args:
         fidelity: One of `FIDELITIES`.
-        config: The world.
-        follow_falls: See `teleport_backends`; the arm's simulation always follows falls.
+        config: The simulated world.
+        follow_falls: See `make_teleport_backend_factory`; the arm's simulation always follows a
+            collapse to its end.
+
+    Raises:
+        InputError: The fidelity is unknown.
     """
     if fidelity == "arm":
         detector = LabelDetector(config.cell.camera)

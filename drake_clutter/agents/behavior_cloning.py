@@ -1,8 +1,9 @@
-"""Behaviour cloning of the teacher by a student that sees K_t alone (SPEC section 4), plain or by DAgger (Ross et al. 2011).
+"""Behavior cloning of a privileged teacher by a student that observes K_t (Kumar et al. 2022).
 
-Every round plays episodes, notes what the teacher would do in each state, and takes some updates on all states so far. Plain
-cloning lets the teacher play; with DAgger the student plays from the second round on, so that it also learns what to do where
-only its own mistakes lead.
+K_t is the set of the objects that have been in view. Every iteration collects episodes, labels each
+state with the teacher's action, and updates the student on all states so far. In plain behavior
+cloning, the teacher acts. In DAgger (Ross et al. 2011), the student acts from the second iteration
+on, so that it is also trained in states that only its own mistakes lead to.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.agents.explorer_network import (
     ExplorerNetwork,
+    PolicyOutput,
     action_log_probs,
     collate_graphs,
     sample_actions,
@@ -42,14 +44,16 @@ from drake_clutter.validation import Flag, InRange, NonNegative, config_class, r
     batch="batch_size",
 )
 class BehaviorCloningConfig:
-    """How a student learns.
+    """Hyperparameters of behavior cloning.
 
     Attributes:
-        iterations: in all; episodes_per_iteration: per round.
-        dagger: whether the student plays from the second round on.
-        updates_per_iteration: per round; batch_size: states per update.
-        learning_rate: at the beginning; it falls to 0 in a straight line.
-        width: of the network.
+        iterations: Total number of iterations.
+        episodes_per_iteration: Number of episodes per iteration.
+        dagger: Whether the student acts from the second iteration on.
+        updates_per_iteration: Number of updates per iteration.
+        batch_size: Number of states per update.
+        learning_rate: Initial learning rate of Adam; annealed linearly to 0.
+        width: Width of the network's embeddings.
     """
 
     iterations: Annotated[int, InRange(1)] = 40
@@ -62,12 +66,13 @@ class BehaviorCloningConfig:
 
 
 class BehaviorCloningLearner:
-    """One training, round by round.
+    """A behavior-cloning run.
 
     Attributes:
-        step: rounds so far.
-        network: the student.
-        losses: of the latest round.
+        config: Hyperparameters.
+        step: Number of iterations so far.
+        network: The student.
+        losses: Mean loss of the latest iteration by name.
     """
 
     def __init__(
@@ -78,97 +83,117 @@ class BehaviorCloningLearner:
         seed: int,
         device: torch.device,
     ) -> None:
-        """Begins a training; the environment shows K_t."""
-        self.config, self._environment, self._teacher, self._seed = (
-            config,
-            environment,
-            teacher,
-            seed,
-        )
+        """Start a run.
+
+        Args:
+            environment: Where the student is trained; its observations show K_t.
+            teacher: The teacher, which acts on privileged observations.
+            config: Hyperparameters.
+            seed: Seed of the run.
+            device: Device of the networks.
+        """
+        self.config = config
+        self._environment = environment
+        self._teacher = teacher
+        self._seed = seed
         torch.manual_seed(seed)
         self.network = ExplorerNetwork(len(environment.node_kind_ids), config.width).to(device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.step = 0
         self.losses: dict[str, float] = {}
-        self._states: ExplorationObservation = {}
-        self._moves = np.zeros((0, 2), np.int64)
+        self._observations: ExplorationObservation = {}
+        self._expert_actions = np.zeros((0, 2), np.int64)
 
     def train_iteration(self) -> list[Rollout]:
-        """One round; returns its episodes."""
+        """Collect episodes, update the student, and return the episodes."""
         rng = item_rng(self._seed, 1, self.step)
-        student_plays = self.config.dagger and self.step > 0
+        student_acts = self.config.dagger and self.step > 0
 
-        def act(
+        def policy_fn(
             environments: Sequence[ClutterExploration],
             observations: Sequence[ExplorationObservation],
         ) -> tuple[NDArray[np.int64], list[Any]]:
-            wanted = self.expert_actions(environments)
-            played = (
-                sample_actions(self.network, collate_graphs(observations), rng)[0]
-                if student_plays
-                else wanted
-            )
-            return played, list(wanted)
+            """Return the actions to take, and the teacher's as the extras."""
+            expert_actions = self.expert_actions(environments)
+            actions = expert_actions
+            if student_acts:
+                actions = sample_actions(self.network, collate_graphs(observations), rng).actions
+            return actions, list(expert_actions)
 
-        played = collect_rollouts(
-            self._environment, self.config.episodes_per_iteration, (self._seed, 2, self.step), act
+        rollouts = collect_rollouts(
+            self._environment,
+            self.config.episodes_per_iteration,
+            (self._seed, 2, self.step),
+            policy_fn,
         )
-        states = collate_graphs(
-            [observation for episode in played for observation in episode.observations]
+        new_observations = collate_graphs(
+            [observation for rollout in rollouts for observation in rollout.observations]
         )
-        moves = np.array([move for episode in played for move in episode.policy_extras])
-        self._states = {
-            name: np.concatenate([self._states[name], new]) if self._states else new
-            for name, new in states.items()
+        new_actions = np.array([action for rollout in rollouts for action in rollout.policy_extras])
+        self._observations = {
+            name: np.concatenate([self._observations[name], array]) if self._observations else array
+            for name, array in new_observations.items()
         }
-        self._moves = np.concatenate([self._moves, moves])
-        self._learn(rng)
+        self._expert_actions = np.concatenate([self._expert_actions, new_actions])
+        self._update(rng)
         self.step += 1
-        return played
+        return rollouts
 
     def expert_actions(self, environments: Sequence[ClutterExploration]) -> NDArray[np.int64]:
-        """(B, 2) what the teacher would do, as nodes of the student's graphs."""
-        moves = sample_actions(
-            self._teacher, collate_graphs([e.observe(privileged=True) for e in environments]), None
-        )[0]
-        found = np.zeros_like(moves)
-        for row, environment in enumerate(environments):
-            known = environment.objects
-            names = environment.task.scene.names
-            found[row] = [
-                known.index(names[node - 1]) + 1 if node else 0 for node in moves[row].tolist()
-            ]
-        return found
+        """Return the teacher's most probable actions, as nodes of the student's graphs.
 
-    def _learn(self, rng: np.random.Generator) -> None:
-        device, total = self.network.pick_marker.device, 0.0
+        Args:
+            environments: B environments.
+
+        Returns:
+            Picked node and place of each move. Shape (B, 2).
+        """
+        observations = [environment.observe(privileged=True) for environment in environments]
+        teacher_actions = sample_actions(self._teacher, collate_graphs(observations), None).actions
+        actions = np.zeros_like(teacher_actions)
+        for row, environment in enumerate(environments):
+            student_objects = environment.objects
+            # Node 0 is the tray in both graphs; the teacher's node k is the scene's k-th object.
+            names = environment.task.scene.names
+            actions[row] = [
+                student_objects.index(names[node - 1]) + 1 if node else 0
+                for node in teacher_actions[row].tolist()
+            ]
+        return actions
+
+    def _update(self, rng: np.random.Generator) -> None:
+        """Update the student on random states, and record the mean loss."""
+        config = self.config
+        device = self.network.pick_marker.device
         for group in self._optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * (1 - self.step / self.config.iterations)
-        for _ in range(self.config.updates_per_iteration):
-            part = rng.integers(len(self._moves), size=self.config.batch_size)
-            found = self.network({name: array[part] for name, array in self._states.items()})
-            moves = torch.from_numpy(self._moves[part]).to(device)
-            loss = -action_log_probs(
-                found, self.network.place_log_probs(found, moves[:, 0]), moves
-            ).mean()
+            group["lr"] = config.learning_rate * (1 - self.step / config.iterations)
+        loss_sum = 0.0
+        for _ in range(config.updates_per_iteration):
+            batch = rng.integers(len(self._expert_actions), size=config.batch_size)
+            output: PolicyOutput = self.network(
+                {name: array[batch] for name, array in self._observations.items()}
+            )
+            actions = torch.from_numpy(self._expert_actions[batch]).to(device)
+            place_log_probs = self.network.place_log_probs(output, actions[:, 0])
+            loss = -action_log_probs(output, place_log_probs, actions).mean()
             self._optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimizer.step()
-            total += loss.item()
-        self.losses = {"cloning": total / self.config.updates_per_iteration}
+            loss_sum += loss.item()
+        self.losses = {"cloning": loss_sum / config.updates_per_iteration}
 
     def save(self, path: Path) -> None:
-        """Writes all that the training needs to go on as if it had never been interrupted."""
+        """Write the complete state of the run; see `Learner`."""
         tensors = learner_tensors(self.network, self._optimizer)
-        arrays = {**self._states, "moves": self._moves}
+        arrays = {**self._observations, "moves": self._expert_actions}
         tensors |= {f"states.{name}": torch.from_numpy(array) for name, array in arrays.items()}
         save_tensors(path, tensors, {"step": self.step})
 
     def load(self, path: Path) -> None:
-        """Goes on where `save` was called, in a training of the same config, seed and teacher."""
+        """Restore the state of a run of the same config, seed and teacher; see `Learner`."""
         tensors, state = load_tensors(path)
         restore_learner(self.network, self._optimizer, tensors)
-        states = with_current_keys(tensors_with_prefix(tensors, "states"), RENAMED_ARRAYS)
-        self._states = {name: value.numpy() for name, value in states.items()}
-        self._moves = self._states.pop("moves")
+        arrays = with_current_keys(tensors_with_prefix(tensors, "states"), RENAMED_ARRAYS)
+        self._observations = {name: value.numpy() for name, value in arrays.items()}
+        self._expert_actions = self._observations.pop("moves")
         self.step = state["step"]

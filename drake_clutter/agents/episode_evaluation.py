@@ -1,4 +1,4 @@
-"""Playing explorers on many scenes, in parallel, the same for any number of workers."""
+"""Evaluation of exploration policies on many scenes, reproducible with any number of workers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,39 +23,41 @@ from drake_clutter.tasks.exploration_task import TerminationReason
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """What is to be played: an agent on a scene at rest. `index` seeds its chances.
+    """An episode to be run.
 
     Attributes:
-        file: a scene file that a judge has called stable, or a frozen set.
-        number: of the scene in the set; None for a scene file.
-        agent: see `make_explorers`.
-        index: of the episode.
+        file: A file of a stable scene, or a scene dataset.
+        scene_index: Index of the scene in the dataset; None for a scene file.
+        agent: See `make_policy_factory`.
+        index: Index of the episode, from which its random generator is seeded.
     """
 
     file: Path
-    number: int | None
+    scene_index: int | None
     agent: str
     index: int
 
     @property
     def scene(self) -> str:
-        """What the scene is called."""
-        return self.file.name if self.number is None else f"{self.file.name} {self.number}"
+        """Name of the scene."""
+        return (
+            self.file.name if self.scene_index is None else f"{self.file.name} {self.scene_index}"
+        )
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """How an episode went.
+    """Result of an episode.
 
     Attributes:
-        scene: what the scene is called.
-        agent: the agent's name.
-        ended: why it ended.
-        hidden: objects hidden at the start.
-        found: those of them that were found.
-        moves: moves made.
-        found_after: (moves,) how many were found after each move.
-        not_carried_out: moves that could not be.
+        scene: Name of the scene.
+        agent: Name of the agent.
+        ended: Value of the `TerminationReason`.
+        hidden: Number of objects that were hidden at the start.
+        found: Number of those objects that were detected.
+        moves: Number of moves, including those that could not be carried out.
+        found_after: Number of objects found after each move. Shape (moves,).
+        not_carried_out: Number of moves that could not be carried out.
     """
 
     scene: str
@@ -69,7 +71,7 @@ class EpisodeResult:
 
 
 class EpisodeRunner:
-    """Plays episodes at a fidelity; a worker for the runner."""
+    """Runs episodes at a fidelity; a worker for `map_ordered`."""
 
     def __init__(
         self,
@@ -79,70 +81,92 @@ class EpisodeRunner:
         seed: int,
         fidelity: str,
     ) -> None:
-        self._config, self._max_moves, self._seed = config, max_moves, seed
-        # In this process: an object class is known by its identity.
-        self._catalog = load_catalog(catalog_folder)
-        self._set = cache(partial(load_scene_dataset, catalog=self._catalog))
-        self._start_backend = make_backend_factory(fidelity, config)
-        self._explorers: dict[str, PolicyFactory] = {}
+        """Create a runner.
 
-    def _scene(self, episode: EpisodeSpec) -> Scene:
-        if episode.number is None:
+        Args:
+            config: The simulated world.
+            catalog_folder: Folder with additional object classes, or None.
+            max_moves: Maximum number of moves of an episode.
+            seed: Seed of the evaluation.
+            fidelity: See `make_backend_factory`.
+        """
+        self._config = config
+        self._max_moves = max_moves
+        self._seed = seed
+        # Loaded by each worker: object classes are compared by identity.
+        self._catalog = load_catalog(catalog_folder)
+        self._load_dataset = cache(partial(load_scene_dataset, catalog=self._catalog))
+        self._make_backend = make_backend_factory(fidelity, config)
+        self._policy_factories: dict[str, PolicyFactory] = {}
+
+    def _load_scene(self, episode: EpisodeSpec) -> Scene:
+        if episode.scene_index is None:
             return load_scene(episode.file, self._catalog).settled_scene
-        held = self._set(episode.file)
-        return held.settled_scene(episode.number, held.grammar, self._config)
+        dataset = self._load_dataset(episode.file)
+        return dataset.settled_scene(episode.scene_index, dataset.grammar, self._config)
 
     def __call__(self, episode: EpisodeSpec) -> EpisodeResult:
-        """Plays one episode; the result depends on nothing but the episode and what the player was made with."""
-        if episode.agent not in self._explorers:
-            self._explorers[episode.agent] = make_policy_factory(episode.agent, self._config)
-        backend = self._start_backend(self._scene(episode), item_rng(self._seed, episode.index))
-        policy = self._explorers[episode.agent](backend)
+        """Run an episode; the result depends only on it and the arguments of the constructor."""
+        if episode.agent not in self._policy_factories:
+            factory = make_policy_factory(episode.agent, self._config)
+            self._policy_factories[episode.agent] = factory
+        rng = item_rng(self._seed, episode.index)
+        backend = self._make_backend(self._load_scene(episode), rng)
+        policy = self._policy_factories[episode.agent](backend)
         task = run_episode(backend, policy, max_moves=self._max_moves)
-        found_after = np.cumsum([len(step.newly_found) for step in task.transitions], dtype=int)
+        transitions = task.transitions
+        found_after = np.cumsum([len(t.newly_found) for t in transitions], dtype=int)
         return EpisodeResult(
             scene=episode.scene,
             agent=episode.agent,
             ended=(task.termination or TerminationReason.GAVE_UP).value,
             hidden=len(task.initially_hidden),
             found=len(task.found),
-            moves=len(task.transitions),
+            moves=len(transitions),
             found_after=tuple(int(n) for n in found_after),
-            not_carried_out=sum(not step.outcome.result.was_executed for step in task.transitions),
+            not_carried_out=sum(not t.outcome.result.was_executed for t in transitions),
         )
 
 
-def summarize_episodes(results: Sequence[EpisodeResult], limits: Sequence[int]) -> dict[str, Any]:
-    """An agent's row: what it had found within so many moves, whether all, and collapses, with 95 % intervals.
+def summarize_episodes(
+    results: Sequence[EpisodeResult], move_limits: Sequence[int]
+) -> dict[str, Any]:
+    """Return the statistics of an agent's episodes.
+
+    For each limit, `within_LIMIT` holds the success rate, the number and the fraction of hidden
+    objects found, and the collapse rate, as if the episodes had ended after that number of moves.
+    Keys that end in `ci95` hold 95 % confidence intervals.
 
     Args:
-        results: of one agent, on scenes that hide something.
-        limits: of moves, at most those that were allowed.
+        results: Results of one agent on scenes with hidden objects.
+        move_limits: Numbers of moves, none above the episodes' maximum.
     """
+    num_hidden = [r.hidden for r in results]
     row: dict[str, Any] = {
         "episodes": len(results),
-        "hidden": float(np.mean([r.hidden for r in results])),
+        "hidden": float(np.mean(num_hidden)),
     }
-    for limit in limits:
-        won = [r.ended == TerminationReason.ALL_FOUND.value and r.moves <= limit for r in results]
-        found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
-        fallen = [
+    for limit in move_limits:
+        num_successes = sum(
+            r.ended == TerminationReason.ALL_FOUND.value and r.moves <= limit for r in results
+        )
+        num_found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
+        num_collapsed = sum(
             r.ended == TerminationReason.COLLAPSED.value and r.moves <= limit for r in results
-        ]
+        )
         row[f"within_{limit}"] = {
-            "success": sum(won) / len(won),
-            "success_ci95": wilson_interval(sum(won), len(won)),
-            "found": float(np.mean(found)),
-            "found_ci95": mean_interval(found),
-            "found_of_hidden": sum(found) / sum(r.hidden for r in results),
-            "found_of_hidden_ci95": bootstrap_ratio_interval(found, [r.hidden for r in results]),
-            "collapsed": sum(fallen) / len(results),
-            "collapsed_ci95": wilson_interval(sum(fallen), len(results)),
+            "success": num_successes / len(results),
+            "success_ci95": wilson_interval(num_successes, len(results)),
+            "found": float(np.mean(num_found)),
+            "found_ci95": mean_interval(num_found),
+            "found_of_hidden": sum(num_found) / sum(num_hidden),
+            "found_of_hidden_ci95": bootstrap_ratio_interval(num_found, num_hidden),
+            "collapsed": num_collapsed / len(results),
+            "collapsed_ci95": wilson_interval(num_collapsed, len(results)),
         }
-    won_moves = [r.moves for r in results if r.ended == TerminationReason.ALL_FOUND.value]
-    row["moves_of_successes"] = float(np.mean(won_moves)) if won_moves else None
-    row["moves_of_successes_ci95"] = mean_interval(won_moves)
-    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(
-        1, sum(r.moves for r in results)
-    )
+    success_moves = [r.moves for r in results if r.ended == TerminationReason.ALL_FOUND.value]
+    num_moves = sum(r.moves for r in results)
+    row["moves_of_successes"] = float(np.mean(success_moves)) if success_moves else None
+    row["moves_of_successes_ci95"] = mean_interval(success_moves)
+    row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, num_moves)
     return row

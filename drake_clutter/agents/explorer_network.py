@@ -1,7 +1,10 @@
-"""The explorers' network (SPEC section 4): message passing over the graph of what is known, and a move chosen in two steps.
+"""Actor-critic network of the exploration agents, and the sampling of moves from it.
 
-First the object to pick; it is marked, two more layers of message passing follow, then the place is chosen: the autoregressive
-head of Janisch et al.
+A move is chosen in two steps, with the autoregressive head of Janisch et al. 2020: the object to
+pick is sampled, its node is marked, two more message-passing layers follow, then the node on which
+the object is placed is sampled.
+
+Symbols in shapes: B graphs with up to N nodes each and M nodes in all; H the width of an embedding.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +28,14 @@ from drake_clutter.tasks.exploration_graph import (
 
 
 def collate_graphs(observations: Sequence[ExplorationObservation]) -> ExplorationObservation:
-    """A batch: the arrays of `exploration_graph` with a first axis of graphs, padded to the largest."""
+    """Return a batch of observations, padded to the largest graph.
+
+    Args:
+        observations: B observations of `build_exploration_graph`.
+
+    Returns:
+        The same arrays with a first axis of length B.
+    """
     nodes = max(len(observation["node_kind"]) for observation in observations)
     edges = nodes * (nodes - 1) // 2
     shapes = {
@@ -47,22 +57,40 @@ def collate_graphs(observations: Sequence[ExplorationObservation]) -> Exploratio
     return batch
 
 
-class PolicyOutput(NamedTuple):
-    """What the network says of a batch of B graphs with up to N nodes.
+class GraphEncoding(NamedTuple):
+    """Encoded graphs, from which the place is chosen.
 
     Attributes:
-        pick_log_probs: (B, N) log-probability of each node as what is picked; -inf where it cannot be.
-        value: (B,) expected sum of rewards.
-        encoding: what the choice of the place goes on from.
+        nodes: Embeddings of the nodes. Shape (M, H).
+        globals: Embeddings of the graphs. Shape (B, H).
+        batch: The input of the encoder.
+        node_index: Index of each node within its graph. Shape (M,).
+        action_mask: Whether a move is allowed, by picked node and place. Shape (B, N, N).
+    """
+
+    nodes: Tensor
+    globals: Tensor
+    batch: GraphBatch
+    node_index: Tensor
+    action_mask: Tensor
+
+
+class PolicyOutput(NamedTuple):
+    """Output of the network for a batch of graphs.
+
+    Attributes:
+        pick_log_probs: Log-probability of picking each node; -inf if not allowed. Shape (B, N).
+        value: Expected return. Shape (B,).
+        encoding: Input of `ExplorerNetwork.place_log_probs`.
     """
 
     pick_log_probs: Tensor
     value: Tensor
-    encoding: tuple[Tensor, Tensor, GraphBatch, Tensor, Tensor]
+    encoding: GraphEncoding
 
 
 class ExplorerNetwork(RenamedParameters):
-    """Policy and value over the arrays of `exploration_graph`."""
+    """Policy and value function over the observations of `build_exploration_graph`."""
 
     renamed: ClassVar[Mapping[str, str]] = {
         "network": "encoder",
@@ -73,16 +101,16 @@ class ExplorerNetwork(RenamedParameters):
         "value": "value_head",
     }
 
-    def __init__(self, node_kinds: int, width: int = 32) -> None:
-        """Makes a network.
+    def __init__(self, num_node_kinds: int, width: int = 32) -> None:
+        """Create a network.
 
         Args:
-            node_kinds: the tray and the classes.
-            width: of the embeddings.
+            num_node_kinds: Number of object classes, plus one for the tray.
+            width: Width H of the embeddings.
         """
         super().__init__()
         self.encoder = GraphNetwork(
-            node_kinds, len(NODE_FEATURES), 2 * len(EDGE_KINDS), len(GLOBAL_FEATURES), width
+            num_node_kinds, len(NODE_FEATURES), 2 * len(EDGE_KINDS), len(GLOBAL_FEATURES), width
         )
         self.pick_head = nn.Linear(width, 1)
         self.pick_marker = nn.Parameter(torch.zeros(width))
@@ -92,100 +120,162 @@ class ExplorerNetwork(RenamedParameters):
         nn.init.normal_(self.pick_marker, std=1.0)
 
     def make_batch(self, observation: Mapping[str, NDArray[Any]]) -> tuple[GraphBatch, Tensor]:
-        """The network's input, and the number of each node in its graph."""
+        """Return the input of the encoder, and each node's index within its graph (M,).
+
+        Args:
+            observation: A batch of `collate_graphs`.
+        """
         weight = self.value_head.weight
-        graph, number, kind, *joined = pack_graphs(
+        graph, index, kind, *edges = pack_graphs(
             observation["node_kind"],
             observation["edge_links"],
             observation["edge_kind"],
             len(EDGE_KINDS),
         )
-        feature = torch.from_numpy(observation["node_features"][graph, number]).to(weight)
-        links = BatchConnectivity(
-            *(torch.from_numpy(array).to(weight.device) for array in (graph, *joined))
+        connectivity = BatchConnectivity(
+            *(torch.from_numpy(array).to(weight.device) for array in (graph, *edges))
         )
-        glob = torch.from_numpy(observation["global_features"]).to(weight)
-        return GraphBatch(
-            torch.from_numpy(kind).to(weight.device), feature, links, glob
-        ), torch.from_numpy(number).to(weight.device)
+        batch = GraphBatch(
+            node_kind=torch.from_numpy(kind).to(weight.device),
+            node_features=torch.from_numpy(observation["node_features"][graph, index]).to(weight),
+            connectivity=connectivity,
+            global_features=torch.from_numpy(observation["global_features"]).to(weight),
+        )
+        return batch, torch.from_numpy(index).to(weight.device)
 
     def forward(self, observation: Mapping[str, NDArray[Any]]) -> PolicyOutput:
-        """What to pick, and what is to be expected."""
-        batch, number = self.make_batch(observation)
-        node, glob = self.encoder(batch)
-        allowed = torch.from_numpy(observation["action_mask"]).to(node.device) > 0
-        pick = _log_softmax(
-            self.pick_head(node).squeeze(1),
-            batch.connectivity.node_graph,
-            number,
-            allowed.any(dim=2),
-        )
-        return PolicyOutput(
-            pick, self.value_head(glob).squeeze(1), (node, glob, batch, number, allowed)
-        )
+        """Return the distribution of the pick, and the value.
 
-    def place_log_probs(self, found: PolicyOutput, picked: Tensor) -> Tensor:
-        """(B, N) log-probability of each node as the place, once (B,) nodes are picked; -inf where it cannot be."""
-        node, glob, batch, number, allowed = found.encoding
-        marked = (number == picked[batch.connectivity.node_graph])[:, None] * self.pick_marker
+        Args:
+            observation: A batch of `collate_graphs`.
+        """
+        batch, node_index = self.make_batch(observation)
+        nodes, globals_ = self.encoder(batch)
+        action_mask = torch.from_numpy(observation["action_mask"]).to(nodes.device) > 0
+        pick_log_probs = _masked_log_softmax(
+            self.pick_head(nodes).squeeze(1),
+            batch.connectivity.node_graph,
+            node_index,
+            action_mask.any(dim=2),
+        )
+        encoding = GraphEncoding(nodes, globals_, batch, node_index, action_mask)
+        return PolicyOutput(pick_log_probs, self.value_head(globals_).squeeze(1), encoding)
+
+    def place_log_probs(self, output: PolicyOutput, picked: Tensor) -> Tensor:
+        """Return the log-probability of each node as the place; -inf if not allowed.
+
+        Args:
+            output: Output of the network.
+            picked: The picked node of each graph. Shape (B,).
+
+        Returns:
+            Log-probabilities. Shape (B, N).
+        """
+        encoding = output.encoding
+        connectivity = encoding.batch.connectivity
+        is_picked = encoding.node_index == picked[connectivity.node_graph]
         edge = leaky_relu(self.encoder.edge_kind_embedding.weight)
-        node, _ = self.post_pick_layers(node + marked, glob, edge, batch.connectivity)
-        rows = torch.arange(len(glob), device=node.device)
-        return _log_softmax(
-            self.place_head(node).squeeze(1),
-            batch.connectivity.node_graph,
-            number,
-            allowed[rows, picked],
+        nodes, _ = self.post_pick_layers(
+            encoding.nodes + is_picked[:, None] * self.pick_marker,
+            encoding.globals,
+            edge,
+            connectivity,
+        )
+        rows = torch.arange(len(encoding.globals), device=nodes.device)
+        return _masked_log_softmax(
+            self.place_head(nodes).squeeze(1),
+            connectivity.node_graph,
+            encoding.node_index,
+            encoding.action_mask[rows, picked],
         )
 
 
-def _log_softmax(score: Tensor, graph: Tensor, number: Tensor, allowed: Tensor) -> Tensor:
-    """(B, N) from (M,) scores of nodes; -inf where it is not allowed."""
-    padded = score.new_full(allowed.shape, -torch.inf).index_put((graph, number), score)
-    return padded.masked_fill(~allowed, -torch.inf).log_softmax(dim=1)
+def _masked_log_softmax(
+    logits: Tensor, node_graph: Tensor, node_index: Tensor, mask: Tensor
+) -> Tensor:
+    """Return log-probabilities over the nodes of each graph; -inf outside the mask.
+
+    Args:
+        logits: Of all nodes. Shape (M,).
+        node_graph: Graph of each node. Shape (M,).
+        node_index: Index of each node within its graph. Shape (M,).
+        mask: Which nodes may be chosen. Shape (B, N).
+
+    Returns:
+        Log-probabilities. Shape (B, N).
+    """
+    padded = logits.new_full(mask.shape, -torch.inf).index_put((node_graph, node_index), logits)
+    return padded.masked_fill(~mask, -torch.inf).log_softmax(dim=1)
 
 
 def sample_categorical(
-    log_probabilities: NDArray[np.float32], rng: np.random.Generator | None
+    log_probs: NDArray[np.float32], rng: np.random.Generator | None
 ) -> NDArray[np.int64]:
-    """(B,) drawn from (B, N) log-probabilities, or without a generator the most likely."""
-    noise = (
-        0.0 if rng is None else rng.gumbel(size=log_probabilities.shape)
-    )  # the largest with Gumbel noise is such a draw
-    return np.asarray((log_probabilities + noise).argmax(axis=1))
+    """Sample an index of each row by the Gumbel-max trick.
+
+    Args:
+        log_probs: Log-probabilities. Shape (B, N).
+        rng: Random generator; None selects the most probable index.
+
+    Returns:
+        Indices. Shape (B,).
+    """
+    noise = 0.0 if rng is None else rng.gumbel(size=log_probs.shape)
+    return np.asarray((log_probs + noise).argmax(axis=1))
+
+
+class SampledActions(NamedTuple):
+    """Moves sampled for a batch of observations.
+
+    Attributes:
+        actions: Picked node and place of each move. Shape (B, 2).
+        log_probs: Log-probability of each move. Shape (B,).
+        values: Expected return of each state. Shape (B,).
+        pick_probs: Probability of picking each node. Shape (B, N).
+    """
+
+    actions: NDArray[np.int64]
+    log_probs: NDArray[np.float32]
+    values: NDArray[np.float32]
+    pick_probs: NDArray[np.float32]
 
 
 def sample_actions(
     network: ExplorerNetwork,
     observation: Mapping[str, NDArray[Any]],
     rng: np.random.Generator | None,
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Moves for a batch, drawn, or without a generator the most likely.
+) -> SampledActions:
+    """Sample a move for each observation of a batch.
 
-    Returns:
-        (B, 2) nodes x and y; (B,) log-probability of the move; (B,) value; (B, N) probability of each pick.
+    Args:
+        network: The policy.
+        observation: A batch of `collate_graphs`.
+        rng: Random generator; None selects the most probable pick, then the most probable place.
     """
     with torch.no_grad():
-        found = network(observation)
-        picks = found.pick_log_probs.cpu().numpy()
-        x = sample_categorical(picks, rng)
-        places = (
-            network.place_log_probs(found, torch.from_numpy(x).to(found.pick_log_probs.device))
-            .cpu()
-            .numpy()
-        )
-    y = sample_categorical(places, rng)
-    rows = np.arange(len(x))
-    return (
-        np.column_stack([x, y]),
-        picks[rows, x] + places[rows, y],
-        found.value.cpu().numpy(),
-        np.exp(picks),
+        output: PolicyOutput = network(observation)
+        pick_log_probs = output.pick_log_probs.cpu().numpy()
+        picks = sample_categorical(pick_log_probs, rng)
+        picked = torch.from_numpy(picks).to(output.pick_log_probs.device)
+        place_log_probs = network.place_log_probs(output, picked).cpu().numpy()
+    places = sample_categorical(place_log_probs, rng)
+    rows = np.arange(len(picks))
+    return SampledActions(
+        actions=np.column_stack([picks, places]),
+        log_probs=pick_log_probs[rows, picks] + place_log_probs[rows, places],
+        values=output.value.cpu().numpy(),
+        pick_probs=np.exp(pick_log_probs),
     )
 
 
-def action_log_probs(found: PolicyOutput, places: Tensor, moves: Tensor) -> Tensor:
-    """(B,) of moves (B, 2), nodes x and y."""
-    return found.pick_log_probs.gather(1, moves[:, :1]).squeeze(1) + places.gather(
-        1, moves[:, 1:]
-    ).squeeze(1)
+def action_log_probs(output: PolicyOutput, place_log_probs: Tensor, actions: Tensor) -> Tensor:
+    """Return the log-probability of each move. Shape (B,).
+
+    Args:
+        output: Output of the network.
+        place_log_probs: Log-probabilities of the places, given the picks. Shape (B, N).
+        actions: Picked node and place of each move. Shape (B, 2).
+    """
+    pick = output.pick_log_probs.gather(1, actions[:, :1]).squeeze(1)
+    place = place_log_probs.gather(1, actions[:, 1:]).squeeze(1)
+    return pick + place

@@ -1,4 +1,4 @@
-"""What all trainings of explorers have in common: the scenes, the world, and how they are watched."""
+"""Configuration shared by all trainings of exploration policies."""
 
 from dataclasses import field
 from pathlib import Path
@@ -17,19 +17,23 @@ from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.validation import InRange, config_class, renamed_fields
 
 CHECKPOINT_FILE = "explorer.safetensors"
+"""Name of the checkpoint that a training writes to its folder."""
 
 
 @config_class
 @renamed_fields(catalogue="catalog", most_objects="max_objects")
 class ExplorerTrainingConfig:
-    """A training.
+    """Configuration shared by all trainings of exploration policies.
 
     Attributes:
-        scenes: file of a set of scenes; catalog: a folder with object classes of one's own, or "".
-        seed: same seed, same weights (on the same kind of machine).
-        fidelity: of the moves; max_moves: of an episode; max_objects: of a scene.
-        evaluation_episodes: that are played with the likeliest moves, to see how it goes.
-        world: see there.
+        scenes: Scene dataset to train on.
+        catalog: Folder with additional object classes; "" for none.
+        seed: Random seed; equal seeds give equal weights on the same kind of machine.
+        fidelity: Model of the outcomes of moves; see `make_backend_factory`.
+        max_moves: Maximum number of moves of an episode.
+        max_objects: Maximum number of objects of a scene.
+        evaluation_episodes: Number of episodes of an evaluation.
+        world: The simulated world.
     """
 
     scenes: str = "training/scenes/train_sg_star.json"
@@ -42,11 +46,14 @@ class ExplorerTrainingConfig:
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
     def make_environment(self, *, privileged: bool = False) -> ClutterExploration:
-        """Where it learns; `privileged`: it sees everything, or K_t."""
+        """Create the environment.
+
+        Args:
+            privileged: Whether observations show all objects as they are, instead of K_t.
+        """
+        catalog = load_catalog(Path(self.catalog) if self.catalog else None)
         return ClutterExploration(
-            load_scene_dataset(
-                Path(self.scenes), load_catalog(Path(self.catalog) if self.catalog else None)
-            ),
+            load_scene_dataset(Path(self.scenes), catalog),
             privileged=privileged,
             fidelity=make_backend_factory(self.fidelity, self.world),
             config=self.world,
@@ -57,9 +64,12 @@ class ExplorerTrainingConfig:
     def evaluate(
         self, environment: ClutterExploration, network: ExplorerNetwork
     ) -> dict[str, float]:
-        """How a network does, on the same episodes every time."""
+        """Return the metrics of a network's most probable moves, always on the same episodes."""
         return episode_metrics(
             collect_rollouts(
-                environment, self.evaluation_episodes, (self.seed, 3), make_policy_fn(network, None)
+                environment,
+                self.evaluation_episodes,
+                (self.seed, 3),
+                make_policy_fn(network, None),
             )
         )

@@ -1,4 +1,7 @@
-"""Explorers without learning (RE, LF, LF-clear, the oracle), and where trained ones are found."""
+"""Exploration policies without learning, and the lookup of policies by name.
+
+The baselines of Kumar et al. 2022 are random exploration (RE) and largest first (LF).
+"""
 
 from collections.abc import Callable, Collection, Sequence
 
@@ -21,15 +24,19 @@ def random_explorer(belief: Belief, observation: Observation, rng: np.random.Gen
     return Decision(moves[rng.integers(len(moves))] if moves else None)
 
 
-def _least_picked_then_largest(
+def _largest_of_least_picked(
     candidates: Sequence[Detection],
     belief: Belief,
     size: Callable[[Detection], float],
 ) -> Decision:
-    """Choose the largest candidate, to the tray.
+    """Move the largest of the least often picked candidates to the tray.
 
-    Those picked least often come first, so that a sweep ends before a repeat begins; among equals,
-    the first by name.
+    Every candidate is thus picked once before any is picked again. Ties are broken by name.
+
+    Args:
+        candidates: Objects that may be picked.
+        belief: Its history counts the picks.
+        size: Size of a candidate.
     """
     picks = [move.pick for move in belief.history]
     order = sorted(candidates, key=lambda d: (picks.count(d.name), -size(d), d.name))
@@ -37,11 +44,11 @@ def _least_picked_then_largest(
 
 
 def largest_first(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
-    """Choose the object in view with the largest volume, whatever may lie on it (LF).
+    """Pick the object in view with the largest volume, whatever lies on it (LF).
 
-    Nearest to the paper's. See `_least_picked_then_largest`.
+    See `_largest_of_least_picked` for the order of repeated picks.
     """
-    return _least_picked_then_largest(
+    return _largest_of_least_picked(
         observation.detections,
         belief,
         lambda d: d.object_class.volume,
@@ -49,12 +56,13 @@ def largest_first(belief: Belief, observation: Observation, rng: np.random.Gener
 
 
 def largest_clear(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
-    """Choose the object in view with the most pixels, among those with a clear top (LF-clear).
+    """Pick the object with the most pixels among those with a clear top (LF-clear).
 
-    If nothing in view has a clear top, all are candidates. See `_least_picked_then_largest`.
+    If no object in view has a clear top, all are candidates. See `_largest_of_least_picked` for the
+    order of repeated picks.
     """
     clear = [d for d in observation.detections if has_clear_top(observation, d)]
-    return _least_picked_then_largest(
+    return _largest_of_least_picked(
         clear or observation.detections,
         belief,
         lambda d: float(d.mask.sum()),
@@ -62,18 +70,24 @@ def largest_clear(belief: Belief, observation: Observation, rng: np.random.Gener
 
 
 class OracleExplorer:
-    """The oracle: follows plans of `FullKnowledgeSearch`, which knows the true scene.
+    """Oracle policy: follows the plans of `OracleSearch`, which knows the true scene.
 
-    It has no move where there is no plan. Objects land where a plan puts them as long as nothing
-    but the moves draws from the episode's generator.
+    It has no move if there is no plan. Objects are placed where the plan puts them as long as only
+    the moves draw from the random generator of the episode.
     """
 
     BUDGET = 2000
-    """Moves that may be tried for a plan."""
+    """Maximum number of moves that are evaluated in the search for a plan."""
 
     def __init__(self, backend: Backend, search: OracleSearch) -> None:
-        """Begin an episode on a backend, whose true scene is looked at."""
-        self._backend, self._search = backend, search
+        """Create the policy of an episode.
+
+        Args:
+            backend: Backend of the episode, whose true scene the search uses.
+            search: Searches for plans.
+        """
+        self._backend = backend
+        self._search = search
         self._plan: list[Move] = []
 
     def __call__(
@@ -82,29 +96,35 @@ class OracleExplorer:
         observation: Observation,
         rng: np.random.Generator,
     ) -> Decision:
-        """Follow the plan; search for another when a move did not go as it was meant."""
-        in_view, failed = {TRAY, *(d.name for d in observation.detections)}, belief.invalid_moves
-        if not self._plan or failed or not {self._plan[0].pick, self._plan[0].place} <= in_view:
-            known = [o.name for o in belief.objects]
-            found = self._search.solve(
+        """Return the next move of the plan; plan again after a move with another outcome."""
+        in_view = {TRAY, *(d.name for d in observation.detections)}
+        invalid_moves = belief.invalid_moves
+        is_plan_valid = (
+            bool(self._plan)
+            and not invalid_moves
+            and {self._plan[0].pick, self._plan[0].place} <= in_view
+        )
+        if not is_plan_valid:
+            result = self._search.solve(
                 self._backend.scene,
                 budget=self.BUDGET,
-                known=known,
+                known=[o.name for o in belief.objects],
                 rng=rng,
-                invalid_moves=failed,
+                invalid_moves=invalid_moves,
             )
-            self._plan = list(found.plan)
+            self._plan = list(result.plan)
         return Decision(self._plan.pop(0) if self._plan else None)
 
 
 PolicyFactory = Callable[[Backend], Policy]
-"""Makes the policy of an episode; a privileged one may look at the backend's true scene."""
+"""Creates the policy of an episode; a privileged one may observe the backend's true scene."""
 
 BASELINE_POLICIES: dict[str, Policy] = {
     "random": random_explorer,
     "largest-first": largest_first,
     "largest-clear": largest_clear,
 }
+"""Policies without learning and without privileged knowledge, by the name of the agent."""
 PRETRAINED_EXPLORERS = {
     "teacher": "training/checkpoints/teacher.safetensors",
     "student": "training/checkpoints/student.safetensors",
@@ -112,24 +132,25 @@ PRETRAINED_EXPLORERS = {
     "student-rg": "training/checkpoints/student_rg.safetensors",
     "student-14": "training/checkpoints/student_14.safetensors",
 }
-"""The shipped checkpoints, by the agent's name."""
-
-
+"""Checkpoints that ship with the package, by the name of the agent."""
 ORACLE = "full-knowledge"
+"""Name of the agent that is an `OracleExplorer`."""
 
 
 def make_policy_factory(
     name: str, config: ClutterConfig, classes: Collection[str] = ()
 ) -> PolicyFactory:
-    """What makes an explorer for each episode.
+    """Return a factory of the policies of an agent.
 
     Args:
-        name: one of `BASELINES`, of `TRAINED`, `FULL_KNOWLEDGE`, or the file of a checkpoint.
-        config: the world.
-        classes: names of the object classes that it will meet, as far as that is known.
+        name: One of `BASELINE_POLICIES`, one of `PRETRAINED_EXPLORERS`, `ORACLE`, or the file of a
+            checkpoint.
+        config: The simulated world.
+        classes: Names of the object classes that will occur, as far as they are known.
 
     Raises:
-        InputError: no such explorer, a file that is no checkpoint of one, or one that has not learned one of the classes.
+        InputError: The agent is unknown, the file is not a checkpoint of an exploration policy, or
+            the policy was not trained with one of the classes.
     """
     if name in BASELINE_POLICIES:
         return lambda _: BASELINE_POLICIES[name]
@@ -140,8 +161,7 @@ def make_policy_factory(
         allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, ORACLE])
         raise InputError(f"--agent {name}; allowed are {allowed}, or a .safetensors file")
     path = checkpoint_path(name, PRETRAINED_EXPLORERS)
-    from drake_clutter.agents.learned_explorer import (
-        LearnedExplorerFactory,
-    )  # takes PyTorch, which the others do without
+    # Imported late: needs PyTorch, which is not required for the other agents.
+    from drake_clutter.agents.learned_explorer import LearnedExplorerFactory
 
     return LearnedExplorerFactory(path, config.exploration, classes)

@@ -1,4 +1,8 @@
-"""Generating scenes: an agent derives graphs, they are laid out and judged."""
+"""Scene generation: agents derive graphs, which are laid out and judged.
+
+The agents are the random generator (RG) and the trained generators (SG) of Kumar et al. 2022, and a
+hill climber (HC).
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -35,18 +39,27 @@ from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.validation import to_plain
 
 SEARCH_BUDGET = 400
-"""Moves that are tried to find out whether a scene is solvable."""
+"""Maximum number of moves that are evaluated to decide whether a scene is solvable."""
 MAX_LAYOUT_ATTEMPTS = 1000
-"""Graphs in a row that may fail to be laid out before the budget is called too large for the tray."""
+"""Maximum number of graphs in a row that cannot be laid out.
+
+More failures mean that graphs of this size do not fit on the support.
+"""
 
 
 class GenerationAgent(Protocol):
-    """Derives terminal graphs."""
+    """An agent that derives terminal graphs."""
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
-        """A terminal graph within the budget."""
+        """Derive a terminal graph.
+
+        Args:
+            grammar: The scene grammar.
+            budget: Size of the graph.
+            rng: Random generator.
+        """
 
 
 PRETRAINED_GENERATORS = {
@@ -54,52 +67,62 @@ PRETRAINED_GENERATORS = {
     "sg-star": "training/checkpoints/sg_star.safetensors",
     "sg-14": "training/checkpoints/sg_14.safetensors",
 }
-"""The shipped checkpoints, by the agent's name."""
+"""Checkpoints that ship with the package, by the name of the agent."""
 
 
 class RandomGenerator:
-    """RG: uniform over the feasible rules, the first match of the rule that is drawn (SPEC section 3)."""
+    """Samples uniformly among the feasible rules (RG; a `GenerationAgent`).
+
+    A rule is applied to its first match.
+    """
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
-        """See `GenerationAgent.derive`."""
+        """Derive a terminal graph; see `GenerationAgent`."""
         return grammar.derive(budget, uniform_choice(rng))
 
 
 class HillClimber:
-    """HC: begins with a random graph, and derives it anew from a random rule on, as long as that makes no worse scene.
+    """Improves a random graph by re-deriving its end (HC; a `GenerationAgent`).
 
-    Scenes are rated as `ClutterGeneration` does, without learning anything from one to the next.
+    Each candidate repeats the best derivation up to a random rule and continues with random rules.
+    It replaces the best one if its reward in `ClutterGeneration` is not lower. Nothing is learned
+    from one scene to the next.
     """
 
     NUM_CANDIDATES = 150
-    """Graphs that are derived for each scene."""
+    """Number of graphs that are derived for each scene."""
 
     def __init__(self, config: ClutterConfig) -> None:
+        """Create an agent.
+
+        Args:
+            config: The simulated world.
+        """
         self._config = config
         self._judge = StaticStabilityJudge(config, margin=GenerationTaskConfig().contact_margin)
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
-        """See `GenerationAgent.derive`."""
+        """Derive a terminal graph; see `GenerationAgent`."""
         task = GenerationTaskConfig(nodes=budget.nodes)
-        best, best_worth = None, -np.inf
+        best: Derivation | None = None
+        best_reward = -np.inf
         for _ in range(self.NUM_CANDIDATES):
             partial = PartialScene(grammar, task, self._config, self._judge)
-            kept: tuple[str, ...] = best.rules[: rng.integers(len(best.rules))] if best else ()
-            for name in kept:
+            kept_rules = best.rules[: rng.integers(len(best.rules))] if best else ()
+            for name in kept_rules:
                 partial.apply(grammar.rule_indices[name])
             while not partial.finished:
                 partial.apply(int(rng.choice(np.flatnonzero(partial.action_mask))))
-            worth = (
-                task.instability_reward
-                if partial.failure
-                else partial.terminal_reward(partial.num_hidden)
-            )
-            if worth >= best_worth:
-                best, best_worth = Derivation(partial.graph, tuple(partial.rules)), worth
+            reward = task.instability_reward
+            if not partial.failure:
+                reward = partial.terminal_reward(partial.num_hidden)
+            if reward >= best_reward:
+                best = Derivation(partial.graph, tuple(partial.rules))
+                best_reward = reward
         assert best is not None
         return best
 
@@ -107,49 +130,52 @@ class HillClimber:
 def make_generation_agent(
     name: str, config: ClutterConfig, temperature: float | None = None
 ) -> GenerationAgent:
-    """A generation agent: `random`, `hill-climbing`, one of `TRAINED`, or the checkpoint in a file.
+    """Return a generation agent.
 
     Args:
-        name: which.
-        config: the world.
-        temperature: of a trained agent's policy; None: the one that its checkpoint names.
+        name: `random`, `hill-climbing`, one of `PRETRAINED_GENERATORS`, or the file of a
+            checkpoint.
+        config: The simulated world.
+        temperature: Temperature of a trained agent's softmax; None selects that of its checkpoint.
 
     Raises:
-        InputError: no such agent, a file that is no checkpoint of one, or a temperature for an agent that has none.
+        InputError: The agent is unknown, the file is not a checkpoint of a scene generator, or a
+            temperature is given for an agent without one.
     """
-    learned = name in PRETRAINED_GENERATORS or name.endswith(".safetensors")
-    if temperature is not None and not (learned and temperature > 0):
+    is_learned = name in PRETRAINED_GENERATORS or name.endswith(".safetensors")
+    if temperature is not None and not (is_learned and temperature > 0):
         raise InputError(
-            f"--temperature {temperature:g} for {name}; allowed is a positive one, for a trained agent"
+            f"--temperature {temperature:g} for {name}; "
+            "allowed is a positive one, for a trained agent"
         )
     if name == "random":
         return RandomGenerator()
     if name == "hill-climbing":
         return HillClimber(config)
-    if not learned:
+    if not is_learned:
         raise InputError(
-            f"--agent {name}; allowed are random, hill-climbing, {', '.join(PRETRAINED_GENERATORS)}, or a .safetensors file"
+            f"--agent {name}; allowed are random, hill-climbing, "
+            f"{', '.join(PRETRAINED_GENERATORS)}, or a .safetensors file"
         )
     path = checkpoint_path(name, PRETRAINED_GENERATORS)
-    from drake_clutter.agents.learned_generator import (
-        LearnedGenerator,
-    )  # takes PyTorch, which the others do without
+    # Imported late: needs PyTorch, which is not required for the other agents.
+    from drake_clutter.agents.learned_generator import LearnedGenerator
 
     return LearnedGenerator(path, config, temperature)
 
 
 @dataclass(frozen=True)
 class GenerationJob:
-    """Everything that decides what a batch of scenes looks like, scene by scene.
+    """Everything that determines the scenes of a batch.
 
     Attributes:
-        agent: see `make_generation_agent`.
-        objects: name of an object set.
-        catalog_folder: a user's asset folder, or None.
-        nodes: exact size of the graphs.
-        seed: of the batch.
-        config: the world.
-        temperature: see `make_generation_agent`.
+        agent: See `make_generation_agent`.
+        objects: Name of the object set.
+        catalog_folder: Folder with additional object classes, or None.
+        nodes: Number of nodes of each graph.
+        seed: Seed of the batch.
+        config: The simulated world.
+        temperature: See `make_generation_agent`.
     """
 
     agent: str
@@ -160,15 +186,11 @@ class GenerationJob:
     config: ClutterConfig
     temperature: float | None = None
 
-    @property
     def to_dict(self) -> dict[str, Any]:
-        """The same for JSON, with the hash of a trained agent's weights: all that decides what the scenes are."""
+        """Return the fields for JSON, with the hash of a trained agent's weights."""
         folder = str(self.catalog_folder.resolve()) if self.catalog_folder else None
-        weights = (
-            {"weights": found}
-            if (found := checkpoint_sha256(self.agent, PRETRAINED_GENERATORS))
-            else {}
-        )
+        weights_hash = checkpoint_sha256(self.agent, PRETRAINED_GENERATORS)
+        weights = {"weights": weights_hash} if weights_hash else {}
         return {**to_plain(self), **weights, "catalog_folder": folder}
 
 
@@ -177,10 +199,12 @@ class GeneratedScene:
     """One scene of a batch.
 
     Attributes:
-        scene: as laid out.
-        verdict: the judge's.
-        layout_failures: graphs that were drawn before it and could not be laid out, by reason.
-        solvable: what the full-knowledge search says of a stable scene, once settled; None for an unstable one.
+        scene: The scene as laid out.
+        verdict: Verdict of the judge.
+        layout_failures: Number of graphs that were derived before and could not be laid out, by
+            reason.
+        solvable: Result of the oracle search for a stable scene, once settled; None for an
+            unstable one.
     """
 
     scene: Scene
@@ -190,9 +214,14 @@ class GeneratedScene:
 
 
 class SceneGenerator:
-    """Makes scene after scene of a job; a worker for the runner."""
+    """Generates the scenes of a job by their index; a worker for `map_ordered`."""
 
     def __init__(self, job: GenerationJob) -> None:
+        """Create a generator.
+
+        Args:
+            job: The batch.
+        """
         self._job = job
         self._grammar = SceneGrammar(load_catalog(job.catalog_folder).object_set(job.objects))
         self._budget = NodeBudget(job.nodes)
@@ -201,19 +230,30 @@ class SceneGenerator:
         self._search = OracleSearch(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:
-        """The scene of an index, judged; it depends on nothing but the job and the index."""
+        """Generate and judge the scene of an index, which depends only on the job and the index."""
         rng = item_rng(self._job.seed, index)
         scene, failures = self.lay_out(rng)
         verdict = self._judge.judge(scene, rng)
         solvable = None
         if verdict.stable:
-            solvable = self._search.solve(
+            result = self._search.solve(
                 scene.with_poses(verdict.settled), self._job.seed, SEARCH_BUDGET, optimal=False
-            ).solvability
+            )
+            solvable = result.solvability
         return GeneratedScene(scene, verdict, failures, solvable)
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
-        """A scene as laid out, and why the graphs drawn before it could not be."""
+        """Derive graphs until one can be laid out.
+
+        Args:
+            rng: Random generator.
+
+        Returns:
+            The scene, and the number of graphs before it that could not be laid out, by reason.
+
+        Raises:
+            RuntimeError: `MAX_LAYOUT_ATTEMPTS` graphs in a row could not be laid out.
+        """
         failures: Counter[str] = Counter()
         for _ in range(MAX_LAYOUT_ATTEMPTS):
             derivation = self._agent.derive(self._grammar, self._budget, rng)
@@ -224,7 +264,8 @@ class SceneGenerator:
                 return scene, failures
             failures[scene.reason.value] += 1
         raise RuntimeError(
-            f"{MAX_LAYOUT_ATTEMPTS} graphs of {self._job.nodes} nodes in a row could not be laid out: {dict(failures)}"
+            f"{MAX_LAYOUT_ATTEMPTS} graphs of {self._job.nodes} nodes in a row could not be laid "
+            f"out: {dict(failures)}"
         )
 
 
@@ -233,47 +274,61 @@ def summarize_scenes(
     scenes: Iterable[tuple[Scene, Verdict]],
     solvable: Sequence[Solvability | None] | None = None,
 ) -> dict[str, Any]:
-    """The figures of a batch: stability over all scenes, hidden and solvable over the stable ones (SPEC section 6).
+    """Return the statistics of a batch, as `summary.json` stores them.
 
-    `largest_stack_share` is of a scene's objects, on average; `balanced_share` is of the scenes in which no stack holds more than
-    60 % of them; `class_entropy` is in bits, over all objects.
+    The numbers of hidden objects and the solvable fraction are taken over the stable scenes, all
+    others over all scenes. `largest_stack_share` is the mean fraction of a scene's objects that are
+    in its largest stack; `balanced_share` is the fraction of scenes in which that is at most
+    `MAX_BALANCED_STACK_FRACTION`; `class_entropy` is the entropy of the classes of all objects
+    [bit]. Keys that end in `ci95` hold 95 % confidence intervals.
+
+    Args:
+        job: The batch.
+        scenes: The scenes and their verdicts.
+        solvable: Results of the oracle search; None if it was not run.
     """
     classes = load_catalog(job.catalog_folder).classes
-    stable, hidden, stacks, forms, objects = 0, [], [], set(), []
+    num_stable = 0
+    num_hidden = list[int]()
+    num_stacks = list[int]()
+    num_objects = list[int]()
+    largest_stack_fractions = list[float]()
+    canonical_forms = set[Any]()
     reasons: Counter[str] = Counter()
-    kinds: Counter[str] = Counter()
-    largest = []
+    class_counts: Counter[str] = Counter()
     for scene, verdict in scenes:
         assert scene.graph is not None
-        stacks.append(len(scene.graph.stack_bases()))
-        objects.append(len(scene.objects))
-        largest.append(scene.graph.largest_stack_fraction())
-        kinds.update(o.object_class.name for o in scene.objects)
-        forms.add(canonical_form(scene.graph, classes))
+        num_stacks.append(len(scene.graph.stack_bases()))
+        num_objects.append(len(scene.objects))
+        largest_stack_fractions.append(scene.graph.largest_stack_fraction())
+        class_counts.update(o.object_class.name for o in scene.objects)
+        canonical_forms.add(canonical_form(scene.graph, classes))
         if verdict.instability is None:
-            stable += 1
-            hidden.append(len(verdict.hidden))
+            num_stable += 1
+            num_hidden.append(len(verdict.hidden))
         else:
             reasons[verdict.instability.reason.value] += 1
-    count = len(stacks)
-    shares = np.array([*kinds.values()]) / kinds.total()
-    solved = sum(answer is Solvability.SOLVABLE for answer in solvable or ())
+    count = len(num_stacks)
+    class_fractions = np.array([*class_counts.values()]) / class_counts.total()
+    num_solvable = sum(result is Solvability.SOLVABLE for result in solvable or ())
+    has_solvable = bool(solvable and num_stable)
+    is_balanced = np.array(largest_stack_fractions) <= MAX_BALANCED_STACK_FRACTION
     return {
         "nodes": job.nodes,
         "count": count,
-        "stability_rate": stable / count,
-        "stability_ci95": wilson_interval(stable, count),
-        "hidden_mean": float(np.mean(hidden)) if hidden else None,
-        "hidden_ci95": mean_interval(hidden),
-        "solvable_share": solved / stable if solvable and stable else None,
-        "solvable_ci95": wilson_interval(solved, stable) if solvable and stable else None,
-        "distinct_share": len(forms) / count,
-        "mean_stacks": float(np.mean(stacks)),
-        "mean_objects": float(np.mean(objects)),
-        "largest_stack_share": float(np.mean(largest)),
-        "balanced_share": float(np.mean(np.array(largest) <= MAX_BALANCED_STACK_FRACTION)),
-        "class_entropy": float(-(shares * np.log2(shares)).sum()),
-        "classes": dict(sorted(kinds.items())),
+        "stability_rate": num_stable / count,
+        "stability_ci95": wilson_interval(num_stable, count),
+        "hidden_mean": float(np.mean(num_hidden)) if num_hidden else None,
+        "hidden_ci95": mean_interval(num_hidden),
+        "solvable_share": num_solvable / num_stable if has_solvable else None,
+        "solvable_ci95": wilson_interval(num_solvable, num_stable) if has_solvable else None,
+        "distinct_share": len(canonical_forms) / count,
+        "mean_stacks": float(np.mean(num_stacks)),
+        "mean_objects": float(np.mean(num_objects)),
+        "largest_stack_share": float(np.mean(largest_stack_fractions)),
+        "balanced_share": float(np.mean(is_balanced)),
+        "class_entropy": float(-(class_fractions * np.log2(class_fractions)).sum()),
+        "classes": dict(sorted(class_counts.items())),
         "instability_reasons": dict(reasons.most_common()),
         "agent": job.agent,
         "temperature": job.temperature,

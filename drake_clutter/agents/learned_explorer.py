@@ -1,7 +1,9 @@
-"""Trained explorers at work: the student, which knows what the camera has shown, and the teacher, which knows everything.
+"""Trained exploration policies: the student, which knows K_t, and the privileged teacher.
 
-Both look before they move: where the camera sees no free place, nothing is put, and what finds one on the tray goes there. On
-another object it might topple, and would hide more; it is put there when the tray is full.
+K_t is the set of the objects that have been in view; the teacher knows the true scene. Both
+filter the network's moves at inference time. A move is discarded if the camera sees no free
+placement for it. If the tray has a free placement, the object is placed there instead of on the
+object that the network chose, where it is less stable and occludes more.
 """
 
 from collections.abc import Collection
@@ -26,11 +28,19 @@ from drake_clutter.tasks.exploration_graph import (
     build_exploration_graph,
 )
 
-TEACHER, STUDENT = "teacher", "student"
+TEACHER = "teacher"
+"""Kind of the checkpoints of privileged policies."""
+STUDENT = "student"
+"""Kind of the checkpoints of policies that observe K_t."""
 
 
 def explorer_metadata(node_kind_ids: dict[str, int], width: int) -> dict[str, Any]:
-    """What the inputs of an `ExplorerNetwork` stand for, for its checkpoint."""
+    """Return the metadata that a checkpoint needs to recreate an `ExplorerNetwork`.
+
+    Args:
+        node_kind_ids: Numbers of the kinds of nodes by name, from 1 on.
+        width: Width of the embeddings.
+    """
     return {
         "node_kinds": list(node_kind_ids),
         "features": list(NODE_FEATURES),
@@ -42,50 +52,62 @@ def explorer_metadata(node_kind_ids: dict[str, int], width: int) -> dict[str, An
 def load_explorer(
     checkpoint: Checkpoint, path: Path, kind: str | None = None
 ) -> tuple[ExplorerNetwork, dict[str, int]]:
-    """The network of a checkpoint, and the numbers of the kinds of nodes.
+    """Return the network of a checkpoint, and the numbers of the kinds of nodes by name.
+
+    Args:
+        checkpoint: The checkpoint.
+        path: Its file, for error messages.
+        kind: `TEACHER` or `STUDENT`; None accepts both.
 
     Raises:
-        InputError: the checkpoint is of something else, or of another version of the observation.
+        InputError: The checkpoint is of another kind or another version of the observation.
     """
-    about = checkpoint.metadata
+    metadata = checkpoint.metadata
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
-    if about.get("kind") not in allowed:
+    if metadata.get("kind") not in allowed:
         raise InputError(
-            f"{path}: is a checkpoint of a {about.get('kind')}; allowed is one of a {' or '.join(allowed)}"
+            f"{path}: is a checkpoint of a {metadata.get('kind')}; "
+            f"allowed is one of a {' or '.join(allowed)}"
         )
-    network = about.get("network", {})
-    if "node_kinds" not in network or "width" not in network:
+    network_metadata = metadata.get("network", {})
+    if "node_kinds" not in network_metadata or "width" not in network_metadata:
         raise InputError(
-            f"{path.with_suffix('.json')}: network: lacks node_kinds or width; allowed is the file as it was written"
+            f"{path.with_suffix('.json')}: network: lacks node_kinds or width; "
+            "allowed is the file as it was written"
         )
-    numbers = {name: number for number, name in enumerate(network["node_kinds"], start=1)}
+    node_kind_ids = {
+        name: number for number, name in enumerate(network_metadata["node_kinds"], start=1)
+    }
     for key in ("features", "edge_kinds"):
-        names = [RENAMED_FEATURES.get(name, name) for name in network.get(key, ())]
-        network = {**network, key: names}
-    if network != explorer_metadata(numbers, network["width"]):
+        names = [RENAMED_FEATURES.get(name, name) for name in network_metadata.get(key, ())]
+        network_metadata = {**network_metadata, key: names}
+    if network_metadata != explorer_metadata(node_kind_ids, network_metadata["width"]):
         raise InputError(
             f"{path}: was trained on other features; allowed is a checkpoint of this version"
         )
-    made = ExplorerNetwork(len(numbers), network["width"])
+    network = ExplorerNetwork(len(node_kind_ids), network_metadata["width"])
     try:
-        made.load_state_dict(checkpoint.weights)
+        network.load_state_dict(checkpoint.weights)
     except RuntimeError as error:
         raise InputError(
-            f"{path}: its weights do not fit {path.with_suffix('.json')}; allowed are the files of one training"
+            f"{path}: its weights do not fit {path.with_suffix('.json')}; "
+            "allowed are the files of one training"
         ) from error
-    return made.eval(), numbers
+    return network.eval(), node_kind_ids
 
 
-def _check_classes(classes: Collection[str], numbers: Collection[str], path: Path) -> None:
-    unknown = sorted(set(classes) - set(numbers))
+def _check_classes(classes: Collection[str], known_classes: Collection[str], path: Path) -> None:
+    """Raise an `InputError` if a policy was not trained with some object classes."""
+    unknown = sorted(set(classes) - set(known_classes))
     if unknown:
         raise InputError(
-            f"--agent {path}: was not trained with {', '.join(unknown)}; train one with your objects"
+            f"--agent {path}: was not trained with {', '.join(unknown)}; "
+            "train one with your objects"
         )
 
 
 class LearnedExplorer:
-    """Takes the likeliest pick and place for which there is room (a `Policy`)."""
+    """Trained policy that takes the most probable move with a free placement (a `Policy`)."""
 
     def __init__(
         self,
@@ -95,15 +117,21 @@ class LearnedExplorer:
         config: ExplorationConfig,
         backend: Backend | None = None,
     ) -> None:
-        """With a network.
+        """Create the policy of an episode.
 
         Args:
-            network, node_kind_ids: see `load_explorer`; path: of the checkpoint, for errors.
-            config: how objects are put down.
-            backend: of the episode whose true scene the agent knows; None: it knows K_t.
+            network: See `load_explorer`.
+            node_kind_ids: See `load_explorer`.
+            path: File of the checkpoint, for error messages.
+            config: Clearances of placements.
+            backend: Backend of the episode, whose true scene a privileged policy observes; None for
+                a policy that observes K_t.
         """
-        self._network, self._numbers, self._path = network, node_kind_ids, path
-        self._config, self._backend = config, backend
+        self._network = network
+        self._node_kind_ids = node_kind_ids
+        self._path = path
+        self._config = config
+        self._backend = backend
 
     def __call__(
         self,
@@ -111,69 +139,77 @@ class LearnedExplorer:
         observation: Observation,
         rng: np.random.Generator,
     ) -> Decision:
-        """Choose the next move.
+        """Choose the next move; see `Policy`.
 
         Raises:
-            InputError: an object of a class that the agent has not learned.
+            InputError: The policy was not trained with the class of an object.
         """
-        shown = belief.objects if self._backend is None else self._backend.scene.objects
-        _check_classes({o.object_class.name for o in shown}, self._numbers, self._path)
+        objects = belief.objects if self._backend is None else self._backend.scene.objects
+        _check_classes({o.object_class.name for o in objects}, self._node_kind_ids, self._path)
         graph = build_exploration_graph(
-            shown,
+            objects,
             observation,
             belief.history,
-            self._numbers,
+            self._node_kind_ids,
             belief.invalid_moves,
         )
-        allowed, names = graph["action_mask"], tuple(o.name for o in shown)
-        chances: dict[str, float] = {}
-        while allowed.any():
-            moves, _, _, picks = sample_actions(self._network, collate_graphs([graph]), None)
-            # As the network had it first: what has no room and is passed over stays among them.
-            chances = chances or {
-                name: float(picks[0, k])
+        action_mask = graph["action_mask"]
+        names = tuple(o.name for o in objects)
+        pick_probabilities: dict[str, float] = {}
+        while action_mask.any():
+            sampled = sample_actions(self._network, collate_graphs([graph]), None)
+            # The reported probabilities are those of the network, before moves are discarded.
+            pick_probabilities = pick_probabilities or {
+                name: float(sampled.pick_probs[0, k])
                 for k, name in enumerate(names, start=1)
-                if allowed[k].any()
+                if action_mask[k].any()
             }
-            x, y = moves[0].tolist()
-            for place in (0, y):
-                move = Move(names[x - 1], names[place - 1] if place else TRAY)
+            pick, chosen_place = sampled.actions[0].tolist()
+            for place in (0, chosen_place):
+                move = Move(names[pick - 1], names[place - 1] if place else TRAY)
                 if (
-                    allowed[x, place]
+                    action_mask[pick, place]
                     and find_free_placements(observation, move, self._config) is not None
                 ):
-                    return Decision(move, chances, names)
-                allowed[x, place] = 0
+                    return Decision(move, pick_probabilities, names)
+                action_mask[pick, place] = 0
         return Decision(None)
 
 
 class LearnedExplorerFactory:
-    """Makes a `LearnedExplorer` for each episode.
+    """Creates a `LearnedExplorer` for each episode (a `PolicyFactory`).
 
     Attributes:
-        privileged: whether it knows everything.
+        privileged: Whether the policy observes the true scene.
     """
 
     def __init__(
         self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()
     ) -> None:
-        """Loads a checkpoint of `training/train_explorer_ppo.py` or `training/train_explorer_dagger.py`.
+        """Load a checkpoint of `train_explorer_ppo.py` or `train_explorer_dagger.py`.
 
         Args:
-            path: of the checkpoint.
-            config: how objects are put down.
-            classes: names of those that it will meet, as far as that is known.
+            path: File of the checkpoint.
+            config: Clearances of placements.
+            classes: Names of the object classes that will occur, as far as they are known.
 
         Raises:
-            InputError: it cannot be read, is none of an explorer, or has not learned one of the classes.
+            InputError: The file cannot be read, is not a checkpoint of an exploration policy, or
+                the policy was not trained with one of the classes.
         """
-        self._path, self._config = path, config
+        self._path = path
+        self._config = config
         checkpoint = load_checkpoint(path)
-        self._network, self._numbers = load_explorer(checkpoint, path)
-        _check_classes(classes, self._numbers, path)
+        self._network, self._node_kind_ids = load_explorer(checkpoint, path)
+        _check_classes(classes, self._node_kind_ids, path)
         self.privileged = checkpoint.metadata["kind"] == TEACHER
 
     def __call__(self, backend: Backend | None = None) -> LearnedExplorer:
-        """Return the policy of an episode; only a privileged one needs its backend."""
-        true = backend if self.privileged else None
-        return LearnedExplorer(self._network, self._numbers, self._path, self._config, true)
+        """Return the policy of an episode; only a privileged policy needs the backend."""
+        return LearnedExplorer(
+            self._network,
+            self._node_kind_ids,
+            self._path,
+            self._config,
+            backend if self.privileged else None,
+        )

@@ -1,4 +1,4 @@
-"""The Scene Generation agent at work: a trained Q over rules, sampled."""
+"""Scene generator that samples grammar rules from a trained Q-network."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from drake_clutter.agents.graph_network import RuleQNetwork
-from drake_clutter.agents.soft_q import collate, sample_softmax_actions
+from drake_clutter.agents.replay_buffer import collate
+from drake_clutter.agents.soft_q import sample_softmax_actions
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
@@ -18,7 +19,12 @@ from drake_clutter.validation import validate
 
 
 def rule_network_metadata(grammar: SceneGrammar, width: int) -> dict[str, Any]:
-    """What the inputs and outputs of a `RuleValues` stand for, for its checkpoint."""
+    """Return the metadata that a checkpoint needs to recreate a `RuleQNetwork`.
+
+    Args:
+        grammar: The grammar, whose kinds and rules the inputs and outputs stand for.
+        width: Width of the embeddings.
+    """
     vocabulary = GraphVocabulary.from_grammar(grammar)
     return {
         "node_kinds": list(vocabulary.node_kinds),
@@ -31,17 +37,24 @@ def rule_network_metadata(grammar: SceneGrammar, width: int) -> dict[str, Any]:
 
 
 def load_rule_network(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleQNetwork:
-    """The network of a checkpoint, for a grammar.
+    """Return the network of a checkpoint, adapted to a grammar.
 
-    What the checkpoint knows by name is taken over: node kinds, edge kinds and rules of another set of objects keep the
-    values of a new network. So a training on one set can begin with what was learned on another.
+    Weights that belong to a node kind, an edge kind or a rule are matched by its name; those of
+    kinds and rules that the checkpoint does not have are initialized as in a new network. Training
+    on one object set can thus start from a network that was trained on another.
+
+    Args:
+        checkpoint: A checkpoint of a scene generator.
+        grammar: The grammar.
     """
     trained_metadata = checkpoint.metadata["network"]
     metadata = rule_network_metadata(grammar, trained_metadata["width"])
-    network, trained = _make_network(metadata), _make_network(trained_metadata)
+    network = _make_network(metadata)
+    trained = _make_network(trained_metadata)
     trained.load_state_dict(checkpoint.weights)
     state = network.state_dict()
-    rows, trained_rows = _named_rows(metadata), _named_rows(trained_metadata)
+    rows = _row_names(metadata)
+    trained_rows = _row_names(trained_metadata)
     for name, weights in trained.state_dict().items():
         if name not in rows:
             state[name] = weights
@@ -55,66 +68,75 @@ def load_rule_network(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleQNet
 
 
 def _make_network(metadata: dict[str, Any]) -> RuleQNetwork:
-    node_kinds, edge_kinds, rules = (
-        len(metadata[name]) for name in ("node_kinds", "edge_kinds", "rules")
+    """Return a new network with the inputs and outputs of `rule_network_metadata`."""
+    return RuleQNetwork(
+        num_node_kinds=len(metadata["node_kinds"]),
+        num_edge_kinds=len(metadata["edge_kinds"]),
+        num_rules=len(metadata["rules"]),
+        width=metadata["width"],
     )
-    return RuleQNetwork(node_kinds, edge_kinds, rules, metadata["width"])
 
 
-def _named_rows(metadata: dict[str, Any]) -> dict[str, list[str]]:
-    """Return what each row stands for, of the parameters whose rows stand for kinds or rules."""
+def _row_names(metadata: dict[str, Any]) -> dict[str, list[str]]:
+    """Return, for each parameter with one row per kind or rule, the names of its rows."""
     edge_kinds = metadata["edge_kinds"]
+    reversed_edge_kinds = [f"{kind} backwards" for kind in edge_kinds]
     return {
         "encoder.node_kind_embedding.weight": metadata["node_kinds"],
-        "encoder.edge_kind_embedding.weight": [
-            *edge_kinds,
-            *(f"{kind} backwards" for kind in edge_kinds),
-        ],
+        "encoder.edge_kind_embedding.weight": [*edge_kinds, *reversed_edge_kinds],
         "q_head.weight": metadata["rules"],
         "q_head.bias": metadata["rules"],
     }
 
 
 class LearnedGenerator:
-    """SG: draws rules from the softmax of Q / temperature over the feasible ones (a `GenerationAgent`)."""
+    """Samples rules from softmax(Q / temperature) (SG of Kumar et al. 2022; a `GenerationAgent`).
+
+    The softmax is taken over the feasible rules.
+    """
 
     def __init__(self, path: Path, config: ClutterConfig, temperature: float | None = None) -> None:
-        """Loads an agent.
+        """Load a checkpoint of `train_generator.py`.
 
         Args:
-            path: a checkpoint of `training/train_generator.py`.
-            config: the world.
-            temperature: None: the one that its checkpoint names.
+            path: File of the checkpoint.
+            config: The simulated world.
+            temperature: Temperature of the softmax; None selects that of the checkpoint.
 
         Raises:
-            InputError: the checkpoint cannot be read, or is none of a generator.
+            InputError: The file cannot be read, or is not a checkpoint of a scene generator.
         """
-        self._path, self._config, self._checkpoint = path, config, load_checkpoint(path)
-        if self._checkpoint.metadata.get("kind") != "generator":
+        self._path = path
+        self._config = config
+        self._checkpoint = load_checkpoint(path)
+        metadata = self._checkpoint.metadata
+        if metadata.get("kind") != "generator":
             raise InputError(
-                f"{path}: is a checkpoint of another kind; allowed is one of training/train_generator.py"
+                f"{path}: is a checkpoint of another kind; "
+                "allowed is one of training/train_generator.py"
             )
-        about = self._checkpoint.metadata
-        self._temperature = about["temperature"] if temperature is None else temperature
-        task = validate(GenerationTaskConfig, about["config"]["task"], str(path))
+        self._temperature = metadata["temperature"] if temperature is None else temperature
+        task = validate(GenerationTaskConfig, metadata["config"]["task"], str(path))
         self._judge = StaticStabilityJudge(config, margin=task.contact_margin)
         self._network: RuleQNetwork | None = None
 
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
-        """See `GenerationAgent.derive`. Stacks that do not stand stay in the graph: nothing is drawn again.
+        """Derive a terminal graph; see `GenerationAgent`.
+
+        Unstable stacks stay in the graph: the derivation is not repeated.
 
         Raises:
-            InputError: the grammar has object classes that the agent has not learned.
+            InputError: The agent was not trained with an object class of the grammar.
         """
         if self._network is None:
-            unknown = sorted(
-                set(grammar.classes) - set(self._checkpoint.metadata["network"]["node_kinds"])
-            )
+            trained_kinds = self._checkpoint.metadata["network"]["node_kinds"]
+            unknown = sorted(set(grammar.classes) - set(trained_kinds))
             if unknown:
                 raise InputError(
-                    f"--agent {self._path}: was not trained with {', '.join(unknown)}; train one with your objects"
+                    f"--agent {self._path}: was not trained with {', '.join(unknown)}; "
+                    "train one with your objects"
                 )
             self._network = load_rule_network(self._checkpoint, grammar).eval()
         task = GenerationTaskConfig(nodes=budget.nodes, require_disassembly=False)
@@ -122,11 +144,8 @@ class LearnedGenerator:
         while not partial.finished:
             with torch.no_grad():
                 values = self._network(collate([partial.observe()])).numpy()
-            partial.apply(
-                int(
-                    sample_softmax_actions(
-                        values, partial.action_mask[None], self._temperature, rng
-                    )[0]
-                )
+            actions = sample_softmax_actions(
+                values, partial.action_mask[None], self._temperature, rng
             )
+            partial.apply(int(actions[0]))
         return Derivation(partial.graph, tuple(partial.rules))

@@ -1,13 +1,17 @@
-"""Layers of message passing, twice: composed of PyTorch's operations, and compiled for the CPU with their gradient.
+"""Message-passing layers of a graph network, as a PyTorch reference and compiled for the CPU.
 
-The networks are so small that on a CPU most of the time of the composed ones goes into calling PyTorch, and they hold the
-interpreter meanwhile. The compiled ones are a single call, and let other threads go on.
+For networks this small, PyTorch spends most of the CPU time on dispatching operations, and holds
+Python's global interpreter lock meanwhile. The compiled layers are a single call that releases the
+lock; their gradient is written out below.
+
+Symbols in shapes: B graphs, M nodes and Z directed edges in a batch; L layers; H the width of a
+node's embedding.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg.cython_blas  # noqa: F401, of which compiled products are made; to be there when its threads are limited
+import scipy.linalg.cython_blas  # noqa: F401, numba's BLAS; loaded before its threads are limited
 import torch
 from numba import njit
 from threadpoolctl import threadpool_limits
@@ -15,23 +19,34 @@ from torch import Tensor
 from torch.nn.functional import leaky_relu
 
 NEGATIVE_SLOPE = 0.01
-"""Of LeakyReLU below 0."""
+"""Slope of LeakyReLU for negative inputs; PyTorch's default."""
 
 
 def limit_operations_to_one_thread() -> None:
-    """For the rest of the process: operations this small lose by being shared out, and more so when threads work side by side."""
+    """Compute every PyTorch and BLAS operation of this process in one thread.
+
+    Operations on networks this small take longer when they are split among threads.
+    """
     torch.set_num_threads(1)
     threadpool_limits(1)
 
 
 class LayerWeights(NamedTuple):
-    """Tensors or arrays of L layers, behind each other: (L, H, H) where nothing else is said.
+    """Weights of L layers as tensors or arrays, stacked along the first axis.
 
     Attributes:
-        sender, sender_bias (L, H), edge (L, H, H_edge): of the messages.
-        node, node_bias (L, H), max_message, global_to_node: of the update of the nodes.
-        attention: (L, 1, H), attention_bias (L, 1).
-        pooled, pooled_bias (L, H), global_self: of the update of the global node, from what is pooled and from itself.
+        sender: Message from the sending node. Shape (L, H, H).
+        sender_bias: Bias of the message. Shape (L, H).
+        edge: Message from the edge's embedding. Shape (L, H, H_edge).
+        node: Node update from the node itself. Shape (L, H, H).
+        node_bias: Bias of the node update. Shape (L, H).
+        max_message: Node update from the maximum of the incoming messages. Shape (L, H, H).
+        global_to_node: Node update from the global node. Shape (L, H, H).
+        attention: Attention logit of a node. Shape (L, 1, H).
+        attention_bias: Bias of the attention logit. Shape (L, 1).
+        pooled: Global update from the attention-pooled nodes. Shape (L, H, H).
+        pooled_bias: Bias of the global update. Shape (L, H).
+        global_self: Global update from the global node itself. Shape (L, H, H).
     """
 
     sender: Any
@@ -48,29 +63,34 @@ class LayerWeights(NamedTuple):
     global_self: Any
 
 
-class _Kept(NamedTuple):
-    """What the gradient needs of each layer, arrays.
+class _Activations(NamedTuple):
+    """Activations of the forward pass that the backward pass needs, as arrays.
 
     Attributes:
-        most, winner: (L, M, H) the maximum of the messages, and the edge that it came by.
-        update, update_glob: (L, M, H) and (L, B, H) what LeakyReLU was applied to.
-        share: (L, M) attention. pooled: (L, B, H).
+        max_message: Maximum of the messages that a node receives. Shape (L, M, H).
+        argmax_edge: Edge that carried the maximum, -1 for a node without edges. Shape (L, M, H).
+        node_preactivation: Node update before LeakyReLU. Shape (L, M, H).
+        attention: Attention weight of a node within its graph. Shape (L, M).
+        pooled: Attention-pooled nodes of each graph. Shape (L, B, H).
+        global_preactivation: Global update before LeakyReLU. Shape (L, B, H).
     """
 
-    most: Any
-    winner: Any
-    update: Any
-    share: Any
+    max_message: Any
+    argmax_edge: Any
+    node_preactivation: Any
+    attention: Any
     pooled: Any
-    update_glob: Any
+    global_preactivation: Any
 
 
 class BatchConnectivity(NamedTuple):
-    """How the nodes of a batch hang together, tensors or arrays.
+    """Edges of a batch of graphs whose nodes are numbered consecutively, as tensors or arrays.
 
     Attributes:
-        node_graph: (M,) the graph that a node belongs to.
-        senders, receivers: (Z,) the nodes that an edge joins. kind: (Z,) number of its kind.
+        node_graph: Index of the graph that a node belongs to. Shape (M,).
+        senders: Node that an edge leaves. Shape (Z,).
+        receivers: Node that an edge enters. Shape (Z,).
+        edge_kind: Kind of an edge, from 0 on. Shape (Z,).
     """
 
     node_graph: Any
@@ -82,51 +102,66 @@ class BatchConnectivity(NamedTuple):
 def message_passing(
     node: Tensor, glob: Tensor, edge: Tensor, connectivity: BatchConnectivity, weights: LayerWeights
 ) -> tuple[Tensor, Tensor]:
-    """Layer after layer: messages FC(sender, edge), their maximum by receiver, 0 where there is none, update FC(node, global,
-    maximum) + skip; then the global node, FC(nodes pooled by attention, global) + skip. FC: a linear layer and LeakyReLU.
+    """Apply message-passing layers with a global attention node (Janisch et al. 2020).
+
+    With FC a linear layer followed by LeakyReLU, each layer computes
+
+        message = FC(sender, edge)
+        node   <- node + FC(node, global, max over incoming messages; 0 without any)
+        global <- global + FC(nodes pooled by attention, global)
+
+    On the CPU the compiled layers are used; among equal messages, the first gets the gradient.
 
     Args:
-        node: (M, H). glob: (B, H). edge: (kinds of edges, H_edge).
+        node: Embeddings of the nodes. Shape (M, H).
+        glob: Embeddings of the global nodes. Shape (B, H).
+        edge: Embeddings of the kinds of edges. Shape (number of kinds, H_edge).
+        connectivity: The edges.
+        weights: The layers' weights.
 
     Returns:
-        (M, H) and (B, H). Of equal messages on the CPU the first gets the gradient.
+        Embeddings of the nodes (M, H) and of the global nodes (B, H) after the last layer.
     """
     if node.device.type == "cpu":
-        found: tuple[Tensor, Tensor] = _MessagePassing.apply(
+        embeddings: tuple[Tensor, Tensor] = _MessagePassing.apply(  # type: ignore[no-untyped-call]
             node, glob, edge, *connectivity, *weights
-        )  # type: ignore[no-untyped-call]
-        return found
+        )
+        return embeddings
     return message_passing_reference(node, glob, edge, connectivity, weights)
 
 
 def message_passing_reference(
     node: Tensor, glob: Tensor, edge: Tensor, connectivity: BatchConnectivity, weights: LayerWeights
 ) -> tuple[Tensor, Tensor]:
-    """See `message_passing`; equal messages share the gradient."""
+    """Apply the layers of `message_passing` with PyTorch operations, on any device.
+
+    Equal messages share the gradient.
+    """
+    node_graph = connectivity.node_graph
     for layer in map(LayerWeights._make, zip(*weights, strict=True)):
-        sent = node @ layer.sender.t() + layer.sender_bias
+        from_sender = node @ layer.sender.t() + layer.sender_bias
+        from_edge = edge @ layer.edge.t()
         message = leaky_relu(
-            sent[connectivity.senders] + (edge @ layer.edge.t())[connectivity.edge_kind],
-            NEGATIVE_SLOPE,
+            from_sender[connectivity.senders] + from_edge[connectivity.edge_kind], NEGATIVE_SLOPE
         )
         receiver = connectivity.receivers[:, None].expand_as(message)
-        most = torch.zeros_like(sent).scatter_reduce(
+        max_message = torch.zeros_like(from_sender).scatter_reduce(
             0, receiver, message, "amax", include_self=False
         )
         update = (
             node @ layer.node.t()
             + layer.node_bias
-            + most @ layer.max_message.t()
-            + (glob @ layer.global_to_node.t())[connectivity.node_graph]
+            + max_message @ layer.max_message.t()
+            + (glob @ layer.global_to_node.t())[node_graph]
         )
         node = leaky_relu(update, NEGATIVE_SLOPE) + node
         logit = (node @ layer.attention.t() + layer.attention_bias).squeeze(1)
-        largest = logit.new_full((len(glob),), -torch.inf).scatter_reduce(
-            0, connectivity.node_graph, logit.detach(), "amax"
+        max_logit = logit.new_full((len(glob),), -torch.inf).scatter_reduce(
+            0, node_graph, logit.detach(), "amax"
         )
-        share = (logit - largest[connectivity.node_graph]).exp()[:, None]
-        total = share.new_zeros(len(glob), 1).index_add(0, connectivity.node_graph, share)
-        pooled = torch.zeros_like(glob).index_add(0, connectivity.node_graph, share * node) / total
+        weight = (logit - max_logit[node_graph]).exp()[:, None]
+        total = weight.new_zeros(len(glob), 1).index_add(0, node_graph, weight)
+        pooled = torch.zeros_like(glob).index_add(0, node_graph, weight * node) / total
         update = pooled @ layer.pooled.t() + layer.pooled_bias + glob @ layer.global_self.t()
         glob = leaky_relu(update, NEGATIVE_SLOPE) + glob
     return node, glob
@@ -134,94 +169,120 @@ def message_passing_reference(
 
 @njit(cache=True, nogil=True)
 def _slope(array):  # type: ignore[no-untyped-def]
-    """NEGATIVE_SLOPE as a number of the array's precision: one of double precision would have loops computed in that."""
+    """Return `NEGATIVE_SLOPE` in an array's precision.
+
+    A factor of double precision would make numba compute the loops in double precision.
+    """
     return np.full(1, NEGATIVE_SLOPE, array.dtype)[0]
 
 
 @njit(cache=True, nogil=True)
-def _maximum(sent, from_edge, sender, receiver, kind, most, winner):  # type: ignore[no-untyped-def]
-    slope = _slope(sent)
-    most[:] = -np.inf
-    winner[:] = -1
-    for z in range(len(sender)):
-        source, edge = sent[sender[z]], from_edge[kind[z]]
-        best, who = most[receiver[z]], winner[receiver[z]]
-        for h in range(sent.shape[1]):
-            value = source[h] + edge[h]
+def _max_messages(from_sender, from_edge, senders, receivers, edge_kind, max_message, argmax_edge):  # type: ignore[no-untyped-def]
+    """Write the maximum of each node's incoming messages, and the edge that carried it."""
+    slope = _slope(from_sender)
+    max_message[:] = -np.inf
+    argmax_edge[:] = -1
+    for z in range(len(senders)):
+        sender_part = from_sender[senders[z]]
+        edge_part = from_edge[edge_kind[z]]
+        best = max_message[receivers[z]]
+        best_edge = argmax_edge[receivers[z]]
+        for h in range(from_sender.shape[1]):
+            value = sender_part[h] + edge_part[h]
             message = max(value, value * slope)
-            better = message > best[h]
-            best[h] = message if better else best[h]
-            who[h] = z if better else who[h]
-    for m in range(len(most)):
-        if winner[m, 0] < 0:
-            most[m] = 0
+            is_better = message > best[h]
+            best[h] = message if is_better else best[h]
+            best_edge[h] = z if is_better else best_edge[h]
+    for m in range(len(max_message)):
+        if argmax_edge[m, 0] < 0:
+            max_message[m] = 0
 
 
 @njit(cache=True, nogil=True)
-def _pooled(node, logit, graph, pooled, weight):  # type: ignore[no-untyped-def]
-    count = len(pooled)
+def _pool_by_attention(node, logit, node_graph, pooled, attention):  # type: ignore[no-untyped-def]
+    """Write each graph's pooled nodes and each node's attention weight, a softmax per graph."""
+    num_graphs = len(pooled)
     pooled[:] = 0
-    most, total = np.full(count, -np.inf, node.dtype), np.zeros(count, node.dtype)
+    max_logit = np.full(num_graphs, -np.inf, node.dtype)
+    total = np.zeros(num_graphs, node.dtype)
     for m in range(len(node)):
-        most[graph[m]] = max(most[graph[m]], logit[m])
+        max_logit[node_graph[m]] = max(max_logit[node_graph[m]], logit[m])
     for m in range(len(node)):
-        weight[m] = np.exp(logit[m] - most[graph[m]])
-        total[graph[m]] += weight[m]
+        attention[m] = np.exp(logit[m] - max_logit[node_graph[m]])
+        total[node_graph[m]] += attention[m]
     for m in range(len(node)):
-        w = weight[m] / total[graph[m]]
-        weight[m] = w
-        a, b = pooled[graph[m]], node[m]
+        weight = attention[m] / total[node_graph[m]]
+        attention[m] = weight
+        graph_pooled = pooled[node_graph[m]]
+        embedding = node[m]
         for h in range(node.shape[1]):
-            a[h] += w * b[h]
+            graph_pooled[h] += weight * embedding[h]
 
 
 @njit(cache=True, nogil=True)
-def _layer(k, node, glob, edge, links, w, kept, out, out_glob):  # type: ignore[no-untyped-def]
-    slope, most, update, update_glob, pooled = (
-        _slope(node),
-        kept.most[k],
-        kept.update[k],
-        kept.update_glob[k],
-        kept.pooled[k],
+def _layer(k, node, glob, edge, connectivity, weights, saved, node_out, glob_out):  # type: ignore[no-untyped-def]
+    """Compute layer k: write its outputs, and save its activations."""
+    slope = _slope(node)
+    max_message = saved.max_message[k]
+    node_preactivation = saved.node_preactivation[k]
+    global_preactivation = saved.global_preactivation[k]
+    pooled = saved.pooled[k]
+    from_sender = np.dot(node, weights.sender[k].T) + weights.sender_bias[k]
+    from_edge = np.dot(edge, weights.edge[k].T)
+    _max_messages(
+        from_sender,
+        from_edge,
+        connectivity.senders,
+        connectivity.receivers,
+        connectivity.edge_kind,
+        max_message,
+        saved.argmax_edge[k],
     )
-    sent, from_edge = np.dot(node, w.sender[k].T) + w.sender_bias[k], np.dot(edge, w.edge[k].T)
-    _maximum(sent, from_edge, links.senders, links.receivers, links.edge_kind, most, kept.winner[k])
-    from_node, from_most, from_glob = (
-        np.dot(node, w.node[k].T),
-        np.dot(most, w.max_message[k].T),
-        np.dot(glob, w.global_to_node[k].T),
-    )
-    bias = w.node_bias[k]
+    from_node = np.dot(node, weights.node[k].T)
+    from_message = np.dot(max_message, weights.max_message[k].T)
+    from_global = np.dot(glob, weights.global_to_node[k].T)
+    bias = weights.node_bias[k]
     for m in range(len(node)):
-        a, b, c, d, e, f = (
-            from_node[m],
-            from_most[m],
-            from_glob[links.node_graph[m]],
-            node[m],
-            update[m],
-            out[m],
-        )
+        node_part = from_node[m]
+        message_part = from_message[m]
+        global_part = from_global[connectivity.node_graph[m]]
+        skip = node[m]
+        preactivation = node_preactivation[m]
+        out = node_out[m]
         for h in range(node.shape[1]):
-            value = a[h] + bias[h] + b[h] + c[h]
-            e[h] = value
-            f[h] = max(value, value * slope) + d[h]
-    logit = np.dot(out, w.attention[k].T)[:, 0] + w.attention_bias[k, 0]
-    _pooled(out, logit, links.node_graph, pooled, kept.share[k])
-    update_glob[:] = (
-        np.dot(pooled, w.pooled[k].T) + w.pooled_bias[k] + np.dot(glob, w.global_self[k].T)
+            value = node_part[h] + bias[h] + message_part[h] + global_part[h]
+            preactivation[h] = value
+            out[h] = max(value, value * slope) + skip[h]
+    logit = np.dot(node_out, weights.attention[k].T)[:, 0] + weights.attention_bias[k, 0]
+    _pool_by_attention(node_out, logit, connectivity.node_graph, pooled, saved.attention[k])
+    global_preactivation[:] = (
+        np.dot(pooled, weights.pooled[k].T)
+        + weights.pooled_bias[k]
+        + np.dot(glob, weights.global_self[k].T)
     )
-    out_glob[:] = np.maximum(update_glob, update_glob * slope) + glob
+    glob_out[:] = np.maximum(global_preactivation, global_preactivation * slope) + glob
 
 
 @njit(cache=True, nogil=True)
-def _forward(nodes, globs, edge, links, weights, kept):  # type: ignore[no-untyped-def]
-    """All layers; `nodes` (L + 1, M, H) and `globs` (L + 1, B, H) hold what goes into each, and what comes out of the last."""
+def _forward(nodes, globs, edge, connectivity, weights, saved):  # type: ignore[no-untyped-def]
+    """Compute all layers.
+
+    Args:
+        nodes: Inputs of each layer, and the output of the last. Shape (L + 1, M, H).
+        globs: The same of the global nodes. Shape (L + 1, B, H).
+        edge: See `message_passing`.
+        connectivity: See `message_passing`.
+        weights: See `message_passing`.
+        saved: Where the activations are written.
+    """
     for k in range(len(nodes) - 1):
-        _layer(k, nodes[k], globs[k], edge, links, weights, kept, nodes[k + 1], globs[k + 1])
+        _layer(
+            k, nodes[k], globs[k], edge, connectivity, weights, saved, nodes[k + 1], globs[k + 1]
+        )
 
 
 @njit(cache=True, nogil=True)
-def _columns(array):  # type: ignore[no-untyped-def]
+def _sum_rows(array):  # type: ignore[no-untyped-def]
     total = np.zeros(array.shape[1], array.dtype)
     for row in array:
         total += row
@@ -229,170 +290,215 @@ def _columns(array):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _layer_gradient(k, to_out, to_out_glob, node, glob, edge, links, w, kept, out, to_w):  # type: ignore[no-untyped-def]
-    """What is called `to_x` is the gradient of x."""
-    width, slope, most, winner, pooled = (
-        node.shape[1],
-        _slope(node),
-        kept.most[k],
-        kept.winner[k],
-        kept.pooled[k],
+def _layer_gradient(  # type: ignore[no-untyped-def]
+    k,
+    grad_node_out,
+    grad_glob_out,
+    node,
+    glob,
+    edge,
+    connectivity,
+    weights,
+    saved,
+    node_out,
+    grad_weights,
+):
+    """Return the gradients of layer k's nodes, global nodes and edge embeddings.
+
+    `grad_x` is the gradient of the loss with respect to x. Those of the layer's weights are written
+    to `grad_weights`.
+    """
+    width = node.shape[1]
+    slope = _slope(node)
+    max_message = saved.max_message[k]
+    argmax_edge = saved.argmax_edge[k]
+    pooled = saved.pooled[k]
+    grad_global_update = np.where(
+        saved.global_preactivation[k] > 0, grad_glob_out, grad_glob_out * slope
     )
-    to_update_glob = np.where(kept.update_glob[k] > 0, to_out_glob, to_out_glob * slope)
-    to_pooled = np.dot(to_update_glob, w.pooled[k])
-    to_node, to_logit = np.empty_like(node), np.empty((len(node), 1), node.dtype)
-    to_update, from_glob = np.empty_like(node), np.zeros_like(glob)
-    of_attention = w.attention[k, 0]
+    grad_pooled = np.dot(grad_global_update, weights.pooled[k])
+    grad_node = np.empty_like(node)
+    grad_logit = np.empty((len(node), 1), node.dtype)
+    grad_node_update = np.empty_like(node)
+    grad_from_global = np.zeros_like(glob)
+    attention_weights = weights.attention[k, 0]
     for m in range(len(node)):
-        share, a, b, c = (
-            kept.share[k, m],
-            to_pooled[links.node_graph[m]],
-            out[m],
-            pooled[links.node_graph[m]],
-        )
-        to_share = share * 0
+        graph = connectivity.node_graph[m]
+        attention = saved.attention[k, m]
+        grad_graph_pooled = grad_pooled[graph]
+        embedding = node_out[m]
+        graph_pooled = pooled[graph]
+        grad_attention = attention * 0
         for h in range(width):
-            to_share += a[h] * (b[h] - c[h])
-        logit = share * to_share
-        to_logit[m, 0] = logit
-        b, c, d, e, f = (
-            to_out[m],
-            to_node[m],
-            to_update[m],
-            kept.update[k, m],
-            from_glob[links.node_graph[m]],
-        )
+            grad_attention += grad_graph_pooled[h] * (embedding[h] - graph_pooled[h])
+        grad_node_logit = attention * grad_attention
+        grad_logit[m, 0] = grad_node_logit
+        grad_out = grad_node_out[m]
+        grad_skip = grad_node[m]
+        grad_update = grad_node_update[m]
+        preactivation = saved.node_preactivation[k, m]
+        grad_graph = grad_from_global[graph]
         for h in range(width):
-            value = b[h] + share * a[h] + logit * of_attention[h]
-            c[h] = value  # by the skip connection
-            value *= 1 if e[h] > 0 else slope
-            d[h] = value
-            f[h] += value
-    to_most = np.dot(to_update, w.max_message[k])
-    to_sent, to_from_edge = np.zeros_like(node), np.zeros((len(edge), width), node.dtype)
+            value = (
+                grad_out[h]
+                + attention * grad_graph_pooled[h]
+                + grad_node_logit * attention_weights[h]
+            )
+            grad_skip[h] = value
+            value *= 1 if preactivation[h] > 0 else slope
+            grad_update[h] = value
+            grad_graph[h] += value
+    grad_max_message = np.dot(grad_node_update, weights.max_message[k])
+    grad_from_sender = np.zeros_like(node)
+    grad_from_edge = np.zeros((len(edge), width), node.dtype)
     for m in range(len(node)):
         for h in range(width):
-            z = winner[m, h]
+            z = argmax_edge[m, h]
             if z >= 0:
-                value = to_most[m, h] if most[m, h] > 0 else to_most[m, h] * slope
-                to_sent[links.senders[z], h] += value
-                to_from_edge[links.edge_kind[z], h] += value
-    to_node += np.dot(to_update, w.node[k])
-    to_node += np.dot(to_sent, w.sender[k])
-    to_glob = (
-        to_out_glob
-        + np.dot(to_update_glob, w.global_self[k])
-        + np.dot(from_glob, w.global_to_node[k])
+                value = (
+                    grad_max_message[m, h]
+                    if max_message[m, h] > 0
+                    else grad_max_message[m, h] * slope
+                )
+                grad_from_sender[connectivity.senders[z], h] += value
+                grad_from_edge[connectivity.edge_kind[z], h] += value
+    grad_node += np.dot(grad_node_update, weights.node[k])
+    grad_node += np.dot(grad_from_sender, weights.sender[k])
+    grad_glob = (
+        grad_glob_out
+        + np.dot(grad_global_update, weights.global_self[k])
+        + np.dot(grad_from_global, weights.global_to_node[k])
     )
-    to_w.sender[k], to_w.sender_bias[k] = np.dot(to_sent.T, node), _columns(to_sent)
-    to_w.edge[k] = np.dot(to_from_edge.T, edge)
-    to_w.node[k], to_w.node_bias[k] = np.dot(to_update.T, node), _columns(to_update)
-    to_w.max_message[k] = np.dot(to_update.T, most)
-    to_w.global_to_node[k] = np.dot(from_glob.T, glob)
-    to_w.attention[k], to_w.attention_bias[k] = np.dot(to_logit.T, out), _columns(to_logit)
-    to_w.pooled[k], to_w.pooled_bias[k] = np.dot(to_update_glob.T, pooled), _columns(to_update_glob)
-    to_w.global_self[k] = np.dot(to_update_glob.T, glob)
-    return to_node, to_glob, np.dot(to_from_edge, w.edge[k])
+    grad_weights.sender[k] = np.dot(grad_from_sender.T, node)
+    grad_weights.sender_bias[k] = _sum_rows(grad_from_sender)
+    grad_weights.edge[k] = np.dot(grad_from_edge.T, edge)
+    grad_weights.node[k] = np.dot(grad_node_update.T, node)
+    grad_weights.node_bias[k] = _sum_rows(grad_node_update)
+    grad_weights.max_message[k] = np.dot(grad_node_update.T, max_message)
+    grad_weights.global_to_node[k] = np.dot(grad_from_global.T, glob)
+    grad_weights.attention[k] = np.dot(grad_logit.T, node_out)
+    grad_weights.attention_bias[k] = _sum_rows(grad_logit)
+    grad_weights.pooled[k] = np.dot(grad_global_update.T, pooled)
+    grad_weights.pooled_bias[k] = _sum_rows(grad_global_update)
+    grad_weights.global_self[k] = np.dot(grad_global_update.T, glob)
+    return grad_node, grad_glob, np.dot(grad_from_edge, weights.edge[k])
 
 
 @njit(cache=True, nogil=True)
-def _gradient(to_node, to_glob, nodes, globs, edge, links, weights, kept, to_weights):  # type: ignore[no-untyped-def]
-    """Gradients of the inputs; those of the weights are written to `to_weights`."""
-    to_edge = np.zeros_like(edge)
+def _backward(grad_node, grad_glob, nodes, globs, edge, connectivity, weights, saved, grad_weights):  # type: ignore[no-untyped-def]
+    """Return the gradients of the inputs; write those of the weights to `grad_weights`."""
+    grad_edge = np.zeros_like(edge)
     for k in range(len(nodes) - 2, -1, -1):
-        before = nodes[k], globs[k], edge, links, weights, kept
-        to_node, to_glob, more = _layer_gradient(
-            k, to_node, to_glob, *before, nodes[k + 1], to_weights
+        inputs = nodes[k], globs[k], edge, connectivity, weights, saved
+        grad_node, grad_glob, grad_layer_edge = _layer_gradient(
+            k, grad_node, grad_glob, *inputs, nodes[k + 1], grad_weights
         )
-        to_edge += more
-    return to_node, to_glob, to_edge
+        grad_edge += grad_layer_edge
+    return grad_node, grad_glob, grad_edge
 
 
 class _MessagePassing(torch.autograd.Function):
+    """Connects the compiled layers to PyTorch's automatic differentiation."""
+
     @staticmethod
     def forward(
-        ctx: Any, node: Tensor, glob: Tensor, edge: Tensor, *links_and_weights: Tensor
+        ctx: Any, node: Tensor, glob: Tensor, edge: Tensor, *connectivity_and_weights: Tensor
     ) -> tuple[Tensor, Tensor]:
-        arrays = [tensor.detach().numpy() for tensor in links_and_weights]
-        links, weights = (
-            BatchConnectivity(*arrays[: len(BatchConnectivity._fields)]),
-            LayerWeights(*arrays[len(BatchConnectivity._fields) :]),
+        """Return the embeddings after the last layer; see `message_passing`."""
+        arrays = [tensor.detach().numpy() for tensor in connectivity_and_weights]
+        num_connectivity = len(BatchConnectivity._fields)
+        connectivity = BatchConnectivity(*arrays[:num_connectivity])
+        weights = LayerWeights(*arrays[num_connectivity:])
+        edges = edge.detach().numpy()
+        layers = len(weights.sender)
+        dtype = edges.dtype
+        node_shape = (layers, *node.shape)
+        graph_shape = (layers, *glob.shape)
+        saved = _Activations(
+            max_message=np.empty(node_shape, dtype),
+            argmax_edge=np.empty(node_shape, np.int32),
+            node_preactivation=np.empty(node_shape, dtype),
+            attention=np.empty(node_shape[:2], dtype),
+            pooled=np.empty(graph_shape, dtype),
+            global_preactivation=np.empty(graph_shape, dtype),
         )
-        layers, edges = len(weights.sender), edge.detach().numpy()
-        of_nodes, of_graphs = (layers, *node.shape), (layers, *glob.shape)
-        shapes = (of_nodes, of_nodes, of_nodes, of_nodes[:2], of_graphs, of_graphs)
-        kept = _Kept(
-            *(
-                np.empty(shape, np.int32 if k == 1 else edges.dtype)
-                for k, shape in enumerate(shapes)
-            )
-        )
-        nodes, globs = (np.empty((layers + 1, *array.shape), edges.dtype) for array in (node, glob))
-        nodes[0], globs[0] = node.detach().numpy(), glob.detach().numpy()
-        ctx.arrays = nodes, globs, edges, links, weights, kept
+        nodes = np.empty((layers + 1, *node.shape), dtype)
+        globs = np.empty((layers + 1, *glob.shape), dtype)
+        nodes[0] = node.detach().numpy()
+        globs[0] = glob.detach().numpy()
+        ctx.weights = weights
+        ctx.arrays = nodes, globs, edges, connectivity, weights, saved
         _forward(*ctx.arrays)
         return torch.from_numpy(nodes[-1]), torch.from_numpy(globs[-1])
 
     @staticmethod
-    def backward(ctx: Any, to_node: Tensor, to_glob: Tensor) -> tuple[Tensor | None, ...]:
-        to_weights = LayerWeights(*(np.empty_like(weight) for weight in ctx.arrays[4]))
-        given = (
-            to_node.contiguous().numpy(),
-            to_glob.contiguous().numpy(),
+    def backward(ctx: Any, grad_node: Tensor, grad_glob: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradients of the arguments of `forward`; connectivity has none."""
+        grad_weights = LayerWeights(*(np.empty_like(weight) for weight in ctx.weights))
+        arguments = (
+            grad_node.contiguous().numpy(),
+            grad_glob.contiguous().numpy(),
             *ctx.arrays,
-            to_weights,
+            grad_weights,
         )
-        inputs, of_weights = (
-            [torch.from_numpy(array) for array in arrays]
-            for arrays in (_gradient(*given), to_weights)
+        grad_inputs = _backward(*arguments)
+        return (
+            *(torch.from_numpy(array) for array in grad_inputs),
+            *(None for _ in BatchConnectivity._fields),
+            *(torch.from_numpy(array) for array in grad_weights),
         )
-        return *inputs, None, None, None, None, *of_weights
 
 
 @njit(cache=True, nogil=True)
-def pack_graphs(node_kind, edge, edge_kind, edge_kinds):  # type: ignore[no-untyped-def]
-    """Padded graphs, B of them, behind each other in one list of nodes and one of edges, which go both ways.
+def pack_graphs(node_kind, edge_links, edge_kind, num_edge_kinds):  # type: ignore[no-untyped-def]
+    """Pack padded graphs into one list of nodes and one list of directed edges.
+
+    Every edge is turned into two directed ones; the kind of the reverse edge is
+    `num_edge_kinds` higher.
 
     Args:
-        node_kind: (B, N) from 1 on, the nodes first, then zeros.
-        edge: (B, E, 2) parent and child.
-        edge_kind: (B, E) from 1 on, 0 where there is no edge.
-        edge_kinds: their number; backwards, an edge is of the kind that many further on.
+        node_kind: Kinds of the nodes from 1 on, then zeros as padding. Shape (B, N).
+        edge_links: Parent and child of each edge, numbered within their graph. Shape (B, E, 2).
+        edge_kind: Kinds of the edges from 1 on; 0 where there is no edge. Shape (B, E).
+        num_edge_kinds: Number of kinds of edges.
 
     Returns:
-        graph, number in its graph, kind (M,); sender, receiver, kind (Z,).
+        Graph, index within its graph and kind of each node, (M,) each; sender, receiver and kind
+        of each directed edge, (Z,) each. Kinds count from 0 on.
     """
-    nodes, edges = 0, 0
+    num_nodes = 0
+    num_edges = 0
     for b in range(len(node_kind)):
         for n in range(node_kind.shape[1]):
-            nodes += node_kind[b, n] > 0
-        for e in range(edge.shape[1]):
-            edges += edge_kind[b, e] > 0
-    graph, number, kind = (
-        np.empty(nodes, np.int64),
-        np.empty(nodes, np.int64),
-        np.empty(nodes, np.int64),
-    )
-    sender, receiver, both = (
-        np.empty(2 * edges, np.int64),
-        np.empty(2 * edges, np.int64),
-        np.empty(2 * edges, np.int64),
-    )
-    m, z = 0, 0
+            num_nodes += node_kind[b, n] > 0
+        for e in range(edge_links.shape[1]):
+            num_edges += edge_kind[b, e] > 0
+    node_graph = np.empty(num_nodes, np.int64)
+    node_index = np.empty(num_nodes, np.int64)
+    packed_node_kind = np.empty(num_nodes, np.int64)
+    senders = np.empty(2 * num_edges, np.int64)
+    receivers = np.empty(2 * num_edges, np.int64)
+    packed_edge_kind = np.empty(2 * num_edges, np.int64)
+    m = 0
+    z = 0
     for b in range(len(node_kind)):
         first = m
         for n in range(node_kind.shape[1]):
             if node_kind[b, n] > 0:
-                graph[m], number[m], kind[m] = b, n, node_kind[b, n] - 1
+                node_graph[m] = b
+                node_index[m] = n
+                packed_node_kind[m] = node_kind[b, n] - 1
                 m += 1
-        for e in range(edge.shape[1]):
+        for e in range(edge_links.shape[1]):
             if edge_kind[b, e] > 0:
-                parent, child = first + edge[b, e, 0], first + edge[b, e, 1]
-                sender[z], receiver[z], both[z] = parent, child, edge_kind[b, e] - 1
-                sender[z + 1], receiver[z + 1], both[z + 1] = (
-                    child,
-                    parent,
-                    edge_kind[b, e] - 1 + edge_kinds,
-                )
+                parent = first + edge_links[b, e, 0]
+                child = first + edge_links[b, e, 1]
+                kind = edge_kind[b, e] - 1
+                senders[z] = parent
+                receivers[z] = child
+                packed_edge_kind[z] = kind
+                senders[z + 1] = child
+                receivers[z + 1] = parent
+                packed_edge_kind[z + 1] = kind + num_edge_kinds
                 z += 2
-    return graph, number, kind, sender, receiver, both
+    return node_graph, node_index, packed_node_kind, senders, receivers, packed_edge_kind

@@ -1,7 +1,8 @@
-"""Actor-critic learning of an explorer: proximal policy optimisation (Schulman et al. 2017) on whole episodes.
+"""Proximal policy optimization (PPO, Schulman et al. 2017) of an exploration policy.
 
-Every round plays fresh episodes to their ends with the present policy, whose seeds follow from the round's number: so the state
-between two rounds is the network, its optimiser and the number of rounds.
+Every iteration collects complete episodes with the current policy. Their seeds follow from the
+iteration's number, so the state between two iterations consists of the network, its optimizer and
+that number.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drake_clutter.agents.explorer_network import ExplorerNetwork, action_log_probs, collate_graphs
+from drake_clutter.agents.explorer_network import (
+    ExplorerNetwork,
+    PolicyOutput,
+    action_log_probs,
+    collate_graphs,
+)
 from drake_clutter.agents.rollouts import Rollout, collect_rollouts, make_policy_fn
 from drake_clutter.learning.checkpoint import (
     learner_tensors,
@@ -23,6 +29,12 @@ from drake_clutter.learning.checkpoint import (
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
+
+MIN_LEARNING_RATE_FRACTION = 0.02
+"""Fraction of the initial learning rate below which the rate is not annealed.
+
+The last iterations still change the policy.
+"""
 
 
 @config_class
@@ -38,18 +50,20 @@ from drake_clutter.validation import InRange, NonNegative, config_class, renamed
     value="vf_coef",
 )
 class PPOConfig:
-    """How a teacher learns.
+    """Hyperparameters of PPO.
 
     Attributes:
-        total_timesteps: moves, in all.
-        episodes_per_iteration: per round.
-        update_epochs: over a round's moves; minibatch_size: moves per update.
-        gamma: per move: finding something later is worth less.
-        gae_lambda: of the advantage's estimate (GAE, Schulman et al. 2016).
-        clip_coef: of the ratio of probabilities.
-        ent_coef, vf_coef: weights in the loss.
-        learning_rate: at the beginning; it falls in a straight line, to a fiftieth.
-        width: of the network.
+        total_timesteps: Total number of moves.
+        episodes_per_iteration: Number of episodes per iteration.
+        update_epochs: Number of passes over the moves of an iteration.
+        minibatch_size: Approximate number of moves per update.
+        gamma: Discount factor per move; below 1, an object found later is worth less.
+        gae_lambda: Lambda of generalized advantage estimation (GAE, Schulman et al. 2016).
+        clip_coef: Clipping range of the probability ratio.
+        ent_coef: Weight of the entropy bonus.
+        vf_coef: Weight of the value loss.
+        learning_rate: Initial learning rate of Adam; annealed linearly to a fiftieth of it.
+        width: Width of the network's embeddings.
     """
 
     total_timesteps: Annotated[int, InRange(1)] = 150_000
@@ -66,12 +80,13 @@ class PPOConfig:
 
 
 class PPOLearner:
-    """One training, round by round.
+    """A PPO run.
 
     Attributes:
-        step: moves so far.
-        network: policy and value.
-        losses: of the latest round.
+        config: Hyperparameters.
+        step: Number of moves so far.
+        network: Policy and value function.
+        losses: Mean losses of the latest iteration by name.
     """
 
     def __init__(
@@ -81,95 +96,135 @@ class PPOLearner:
         seed: int,
         device: torch.device,
     ) -> None:
-        """Begins a training; the environment shows what the explorer is to see."""
-        self.config, self._environment, self._seed = config, environment, seed
+        """Start a run.
+
+        Args:
+            environment: Where the policy is trained.
+            config: Hyperparameters.
+            seed: Seed of the run.
+            device: Device of the network.
+        """
+        self.config = config
+        self._environment = environment
+        self._seed = seed
         torch.manual_seed(seed)
         self.network = ExplorerNetwork(len(environment.node_kind_ids), config.width).to(device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
-        self.step, self._round = 0, 0
+        self.step = 0
+        self._iteration = 0
         self.losses: dict[str, float] = {}
 
     def train_iteration(self) -> list[Rollout]:
-        """One round; returns its episodes."""
-        rng = item_rng(self._seed, 1, self._round)
-        played = collect_rollouts(
+        """Collect episodes, update the network, and return the episodes."""
+        rng = item_rng(self._seed, 1, self._iteration)
+        rollouts = collect_rollouts(
             self._environment,
             self.config.episodes_per_iteration,
-            (self._seed, 2, self._round),
+            (self._seed, 2, self._iteration),
             make_policy_fn(self.network, rng),
         )
-        self.update(played, rng)
-        self.step += sum(len(episode.actions) for episode in played)
-        self._round += 1
-        return played
+        self.update(rollouts, rng)
+        self.step += sum(len(rollout.actions) for rollout in rollouts)
+        self._iteration += 1
+        return rollouts
 
     def update(self, rollouts: Sequence[Rollout], rng: np.random.Generator) -> None:
-        """Takes its passes over the moves of episodes that the network has played, noted as by `acting`; `rng` orders them."""
+        """Update the network in several epochs over the moves of episodes.
+
+        Args:
+            rollouts: Episodes that were collected with `make_policy_fn` of the current network.
+            rng: Shuffles the moves.
+        """
         config = self.config
-        moves = torch.from_numpy(
-            np.array([move for episode in rollouts for move in episode.actions])
+        actions = torch.from_numpy(
+            np.array([action for rollout in rollouts for action in rollout.actions])
         )
-        before = torch.tensor(
-            [chance for episode in rollouts for chance, _ in episode.policy_extras]
+        extras = [extra for rollout in rollouts for extra in rollout.policy_extras]
+        old_log_probs = torch.tensor([log_prob for log_prob, _ in extras])
+        advantages = torch.from_numpy(
+            np.concatenate(
+                [compute_gae(rollout, config.gamma, config.gae_lambda) for rollout in rollouts]
+            )
         )
-        advantages = [compute_gae(episode, config.gamma, config.gae_lambda) for episode in rollouts]
-        gain = torch.from_numpy(np.concatenate(advantages))
-        aim = gain + torch.tensor(
-            [value for episode in rollouts for _, value in episode.policy_extras]
-        )
-        gain = (gain - gain.mean()) / (gain.std(correction=0) + 1e-6)
+        returns = advantages + torch.tensor([value for _, value in extras])
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-6)
         observations = collate_graphs(
-            [observation for episode in rollouts for observation in episode.observations]
+            [observation for rollout in rollouts for observation in rollout.observations]
         )
+        annealing = max(MIN_LEARNING_RATE_FRACTION, 1 - self.step / config.total_timesteps)
         for group in self._optimizer.param_groups:
-            group["lr"] = config.learning_rate * max(0.02, 1 - self.step / config.total_timesteps)
-        sums, updates = np.zeros(3), 0
+            group["lr"] = config.learning_rate * annealing
+        loss_sums = np.zeros(3)
+        num_updates = 0
         device = self.network.pick_marker.device
         for _ in range(config.update_epochs):
-            order = rng.permutation(len(moves))
-            for part in np.array_split(order, max(1, round(len(order) / config.minibatch_size))):
-                found = self.network({name: array[part] for name, array in observations.items()})
-                chosen = moves[part].to(device)
-                places = self.network.place_log_probs(found, chosen[:, 0])
-                ratio = (action_log_probs(found, places, chosen) - before[part].to(device)).exp()
-                better = gain[part].to(device)
-                policy = -torch.minimum(
-                    ratio * better, ratio.clamp(1 - config.clip_coef, 1 + config.clip_coef) * better
+            order = rng.permutation(len(actions))
+            num_minibatches = max(1, round(len(order) / config.minibatch_size))
+            for minibatch in np.array_split(order, num_minibatches):
+                output: PolicyOutput = self.network(
+                    {name: array[minibatch] for name, array in observations.items()}
+                )
+                minibatch_actions = actions[minibatch].to(device)
+                place_log_probs = self.network.place_log_probs(output, minibatch_actions[:, 0])
+                log_probs = action_log_probs(output, place_log_probs, minibatch_actions)
+                ratio = (log_probs - old_log_probs[minibatch].to(device)).exp()
+                advantage = advantages[minibatch].to(device)
+                policy_loss = -torch.minimum(
+                    ratio * advantage,
+                    ratio.clamp(1 - config.clip_coef, 1 + config.clip_coef) * advantage,
                 ).mean()
-                value = torch.nn.functional.smooth_l1_loss(found.value, aim[part].to(device))
-                entropy = _entropy(found.pick_log_probs) + _entropy(places)
-                loss = policy + config.vf_coef * value - config.ent_coef * entropy
+                value_loss = torch.nn.functional.smooth_l1_loss(
+                    output.value, returns[minibatch].to(device)
+                )
+                entropy = _mean_entropy(output.pick_log_probs) + _mean_entropy(place_log_probs)
+                loss = policy_loss + config.vf_coef * value_loss - config.ent_coef * entropy
                 self._optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
                 torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
                 self._optimizer.step()
-                sums += [policy.item(), value.item(), entropy.item()]
-                updates += 1
+                loss_sums += [policy_loss.item(), value_loss.item(), entropy.item()]
+                num_updates += 1
         self.losses = dict(
-            zip(("policy", "value", "entropy"), (sums / updates).tolist(), strict=True)
+            zip(("policy", "value", "entropy"), (loss_sums / num_updates).tolist(), strict=True)
         )
 
     def save(self, path: Path) -> None:
-        """Writes all that the training needs to go on as if it had never been interrupted."""
-        state = {"step": self.step, "round": self._round}
+        """Write the complete state of the run; see `Learner`."""
+        state = {"step": self.step, "round": self._iteration}
         save_tensors(path, learner_tensors(self.network, self._optimizer), state)
 
     def load(self, path: Path) -> None:
-        """Goes on where `save` was called, in a training of the same config and seed."""
+        """Restore the state of a run of the same config and seed; see `Learner`."""
         tensors, state = load_tensors(path)
         restore_learner(self.network, self._optimizer, tensors)
-        self.step, self._round = state["step"], state["round"]
+        self.step = state["step"]
+        self._iteration = state["round"]
 
 
-def compute_gae(episode: Rollout, gamma: float, gae_lambda: float) -> NDArray[np.float32]:
-    """(moves,) by how much better each move was than expected, see GAE; an episode's end is worth nothing more."""
-    values = [value for _, value in episode.policy_extras] + [0.0]
-    found, later = np.zeros(len(episode.actions), np.float32), 0.0
-    for k in reversed(range(len(found))):
-        later = episode.rewards[k] + gamma * values[k + 1] - values[k] + gamma * gae_lambda * later
-        found[k] = later
-    return found
+def compute_gae(rollout: Rollout, gamma: float, gae_lambda: float) -> NDArray[np.float32]:
+    """Compute generalized advantage estimates (Schulman et al. 2016, eq. 16).
+
+    The value after the last move is 0, however the episode ended.
+
+    Args:
+        rollout: An episode that was collected with `make_policy_fn`.
+        gamma: Discount factor.
+        gae_lambda: Weight of later temporal-difference errors.
+
+    Returns:
+        Advantages. Shape (number of moves,).
+    """
+    values = [value for _, value in rollout.policy_extras] + [0.0]
+    advantages = np.zeros(len(rollout.actions), np.float32)
+    advantage = 0.0
+    for k in reversed(range(len(advantages))):
+        advantage = (
+            rollout.rewards[k] + gamma * values[k + 1] - values[k] + gamma * gae_lambda * advantage
+        )
+        advantages[k] = advantage
+    return advantages
 
 
-def _entropy(log_probabilities: torch.Tensor) -> torch.Tensor:
-    return -(log_probabilities.exp() * log_probabilities.clamp(min=-1e4)).sum(dim=1).mean()
+def _mean_entropy(log_probs: torch.Tensor) -> torch.Tensor:
+    """Return the mean entropy of distributions. Shape of the log-probabilities: (B, N)."""
+    return -(log_probs.exp() * log_probs.clamp(min=-1e4)).sum(dim=1).mean()

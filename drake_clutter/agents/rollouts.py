@@ -1,4 +1,4 @@
-"""Episodes of exploration played side by side, for learning and for watching how it goes."""
+"""Rollouts of exploration policies in several environments at a time, and their metrics."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -18,17 +18,29 @@ PolicyFn = Callable[
     [Sequence[ClutterExploration], Sequence[ExplorationObservation]],
     tuple[NDArray[np.int64], list[Any]],
 ]
-"""From environments and what they show: (B, 2) moves, and what is to be noted with each."""
+"""A policy for a batch of environments.
+
+Args:
+    environments: B environments.
+    observations: Their current observations.
+
+Returns:
+    Actions (B, 2), and for each action an object that is stored with it in the rollout.
+"""
 
 
 @dataclass
 class Rollout:
-    """One episode, move by move.
+    """One episode.
 
     Attributes:
-        observations, actions, rewards: of each move; policy_extras: what `Act` returned with it.
-        termination: why it ended.
-        num_hidden, num_found: objects hidden at the start, and those of them that were found.
+        observations: Observation before each action.
+        actions: Picked node and place of each move. Shape (2,) each.
+        rewards: Reward of each action.
+        policy_extras: What the `PolicyFn` returned along with each action.
+        termination: Why the episode ended.
+        num_hidden: Number of objects that were hidden at the start.
+        num_found: Number of those objects that were detected.
     """
 
     observations: list[ExplorationObservation] = field(default_factory=list)
@@ -47,68 +59,85 @@ def collect_rollouts(
     policy_fn: PolicyFn,
     num_envs: int = 32,
 ) -> list[Rollout]:
-    """Plays episodes; the same for the same path of seeds.
+    """Collect complete episodes; equal seeds give equal episodes.
 
     Args:
-        environment: copies of it are played; they share its judge's memory.
-        count: of episodes.
-        seed: path under which each episode has a seed of its own.
-        policy_fn: chooses the moves.
-        num_envs: episodes at a time.
+        environment: Template of the environments. Its copies share the cache of its judge.
+        count: Number of episodes.
+        seed: Seed path, below which every episode has a seed of its own.
+        policy_fn: Selects the actions.
+        num_envs: Maximum number of environments that are stepped together.
     """
-    played = [Rollout() for _ in range(count)]
-    waiting = iter(range(count))
+    rollouts = [Rollout() for _ in range(count)]
+    indices = iter(range(count))
     running: dict[int, tuple[ClutterExploration, ExplorationObservation]] = {}
     while True:
-        while len(running) < num_envs and (number := next(waiting, None)) is not None:
-            twin = copy(environment)
-            observation, _ = twin.reset(seed=int(item_rng(*seed, number).integers(2**31)))
-            running[number] = twin, observation
+        while len(running) < num_envs and (index := next(indices, None)) is not None:
+            env = copy(environment)
+            observation, _ = env.reset(seed=int(item_rng(*seed, index).integers(2**31)))
+            running[index] = env, observation
         if not running:
-            return played
-        moves, notes = policy_fn(
-            [twin for twin, _ in running.values()],
+            return rollouts
+        actions, extras = policy_fn(
+            [env for env, _ in running.values()],
             [observation for _, observation in running.values()],
         )
-        for number, move, note in zip(list(running), moves, notes, strict=True):
-            twin, before = running[number]
-            episode = played[number]
-            observation, reward, over, out_of_moves, info = twin.step(move)
-            episode.observations.append(before)
-            episode.actions.append(move)
-            episode.rewards.append(float(reward))
-            episode.policy_extras.append(note)
-            running[number] = twin, observation
-            if over or out_of_moves:
-                episode.termination, episode.num_hidden, episode.num_found = (
-                    info["end"],
-                    len(twin.task.initially_hidden),
-                    len(twin.task.found),
-                )
-                del running[number]
+        for index, action, extra in zip(list(running), actions, extras, strict=True):
+            env, observation = running[index]
+            next_observation, reward, terminated, truncated, info = env.step(action)
+            rollout = rollouts[index]
+            rollout.observations.append(observation)
+            rollout.actions.append(action)
+            rollout.rewards.append(float(reward))
+            rollout.policy_extras.append(extra)
+            running[index] = env, next_observation
+            if terminated or truncated:
+                rollout.termination = info["termination"]
+                rollout.num_hidden = len(env.task.initially_hidden)
+                rollout.num_found = len(env.task.found)
+                del running[index]
 
 
 def make_policy_fn(network: ExplorerNetwork, rng: np.random.Generator | None) -> PolicyFn:
-    """A network's moves, drawn, or without a generator the most likely; noted are log-probability and value."""
+    """Return the policy of a network; it stores (log-probability, value) with each action.
 
-    def act(
-        _: Sequence[ClutterExploration], observations: Sequence[ExplorationObservation]
+    Args:
+        network: Policy and value function.
+        rng: Random generator; None selects the most probable actions.
+    """
+
+    def policy_fn(
+        environments: Sequence[ClutterExploration], observations: Sequence[ExplorationObservation]
     ) -> tuple[NDArray[np.int64], list[Any]]:
-        moves, chance, value = sample_actions(network, collate_graphs(observations), rng)[:3]
-        return moves, list(zip(chance.tolist(), value.tolist(), strict=True))
+        sampled = sample_actions(network, collate_graphs(observations), rng)
+        extras = list(zip(sampled.log_probs.tolist(), sampled.values.tolist(), strict=True))
+        return sampled.actions, extras
 
-    return act
+    return policy_fn
 
 
-def episode_metrics(episodes: Sequence[Rollout]) -> dict[str, float]:
-    """What to watch while an explorer learns."""
-    won = [len(e.actions) for e in episodes if e.termination is TerminationReason.ALL_FOUND]
+def episode_metrics(rollouts: Sequence[Rollout]) -> dict[str, float]:
+    """Return metrics of the learning progress.
+
+    Returns:
+        success: Fraction of episodes in which all hidden objects were found.
+        found_share: Fraction of all hidden objects that were found.
+        collapsed: Fraction of episodes in which the scene collapsed.
+        moves_of_successes: Mean number of moves of the successful episodes; 0 without any.
+        score: Mean return.
+    """
+    lengths = [
+        len(rollout.actions)
+        for rollout in rollouts
+        if rollout.termination is TerminationReason.ALL_FOUND
+    ]
+    num_collapsed = sum(rollout.termination is TerminationReason.COLLAPSED for rollout in rollouts)
+    num_hidden = sum(rollout.num_hidden for rollout in rollouts)
+    num_found = sum(rollout.num_found for rollout in rollouts)
     return {
-        "success": len(won) / len(episodes),
-        "found_share": sum(e.num_found for e in episodes)
-        / max(1, sum(e.num_hidden for e in episodes)),
-        "collapsed": sum(e.termination is TerminationReason.COLLAPSED for e in episodes)
-        / len(episodes),
-        "moves_of_successes": float(np.mean(won)) if won else 0.0,
-        "score": float(np.mean([sum(e.rewards) for e in episodes])),
+        "success": len(lengths) / len(rollouts),
+        "found_share": num_found / max(1, num_hidden),
+        "collapsed": num_collapsed / len(rollouts),
+        "moves_of_successes": float(np.mean(lengths)) if lengths else 0.0,
+        "score": float(np.mean([sum(rollout.rewards) for rollout in rollouts])),
     }

@@ -1,11 +1,15 @@
-"""Soft Q-learning of a scene generator (SPEC section 3): the policy is the softmax of Q / temperature over the feasible rules.
+"""Soft Q-learning of a scene generator.
 
-Its entropy is taken relative to the uniform choice among the feasible rules. Without discount, and with a deterministic
-grammar, the optimal soft policy then draws every derivation as the random generator RG does, times exp(return / temperature):
-a distribution of scenes, the better the likelier, and no state is worth more because more rules are feasible there.
+The policy is the softmax of Q / temperature over the feasible rules (Haarnoja et al. 2017). Its
+entropy is measured relative to the uniform choice among the feasible rules. Without discount, and
+with a deterministic grammar, the optimal soft policy therefore samples each derivation with the
+probability that the random generator gives it, times exp(return / temperature), up to
+normalization. In particular, a state is not worth more because more rules are feasible in it.
+
+Symbols in shapes: S sequences of L steps; B the batch size.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from itertools import pairwise
@@ -18,6 +22,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drake_clutter.agents.graph_network import RuleQNetwork
+from drake_clutter.agents.replay_buffer import (
+    NETWORK_INPUT_KEYS,
+    RENAMED_ARRAYS,
+    ReplayBuffer,
+    collate,
+)
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import (
     learner_tensors,
@@ -32,27 +42,12 @@ from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationObs
 from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
 
 NUM_GRADIENT_SHARDS = 2
-"""Of an update, that are worked on side by side; always so many, so that the number of threads changes no result."""
+"""Number of parts into which the batch of an update is split.
 
-NETWORK_INPUT_KEYS = (
-    "node_kind",
-    "node_flags",
-    "position",
-    "edge_links",
-    "edge_kind",
-    "remaining_nodes",
-)
-"""What of an observation the network looks at; the masks follow from the kinds."""
+The parts can be computed in parallel. Their number is fixed, so that the sum of their gradients,
+and thereby the training, does not depend on the number of threads.
+"""
 
-
-RENAMED_ARRAYS: Mapping[str, str] = {
-    "edge": "edge_links",
-    "remaining": "remaining_nodes",
-    "mask": "action_mask",
-    "chance": "behavior_prob",
-    "over": "terminated",
-}
-"""Current name of a replay buffer's array by its name in version 0.1."""
 RENAMED_STATE: Mapping[str, str] = {"remembered": "num_added", "score": "episodic_return"}
 """Current key of a saved training state by its name in version 0.1."""
 
@@ -71,21 +66,22 @@ RENAMED_STATE: Mapping[str, str] = {"remembered": "num_added", "score": "episodi
     target_rate="tau",
 )
 class SoftQConfig:
-    """How a generator learns.
+    """Hyperparameters of soft Q-learning.
 
     Attributes:
-        total_timesteps: of the environments, in all.
-        num_envs: that are stepped side by side.
-        batch_size: steps per update.
-        sequence_length: steps that follow each other in it.
-        retrace_lambda: by which the later ones count for the earlier, see `retrace_targets`.
-        train_frequency: steps of the environments between two updates.
-        buffer_size: steps that are remembered.
-        learning_starts: steps, at the beginning, by uniform choice.
-        learning_rate: at the beginning; it is halved every `lr_halving_steps` steps (SPEC section 3).
-        temperature: of the policy, in units of the reward.
-        tau: by which the target network moves towards the other at every update.
-        width: of the network.
+        total_timesteps: Total number of environment steps.
+        num_envs: Number of environments that are stepped together.
+        batch_size: Number of environment steps in the batch of an update.
+        sequence_length: Number of consecutive steps for which Retrace computes targets.
+        retrace_lambda: Weight of later steps in the targets; 0 gives one-step targets.
+        train_frequency: Number of environment steps per update.
+        buffer_size: Number of environment steps in the replay buffer.
+        learning_starts: Number of steps with uniformly random actions before the first update.
+        learning_rate: Initial learning rate of Adam.
+        lr_halving_steps: Number of environment steps after which the learning rate is halved.
+        temperature: Temperature of the policy, in units of the reward.
+        tau: Fraction by which the target network moves toward the network at each update.
+        width: Width of the network's embeddings.
     """
 
     total_timesteps: Annotated[int, InRange(1)] = 640_000
@@ -104,49 +100,74 @@ class SoftQConfig:
 
 
 class SampledEpisode(NamedTuple):
-    """How an episode ended: what its rewards sum up to, and the last `info`."""
+    """A finished episode.
+
+    Attributes:
+        episodic_return: Sum of the rewards.
+        info: Last `info` of the environment.
+    """
 
     episodic_return: float
     info: dict[str, Any]
 
 
-def collate(observations: Sequence[GenerationObservation]) -> dict[str, NDArray[Any]]:
-    """A batch of observations, those of their arrays that the network looks at."""
-    return {
-        name: np.stack([observation[name] for observation in observations])
-        for name in NETWORK_INPUT_KEYS
-    }
-
-
 def sample_softmax_actions(
     values: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    action_mask: NDArray[np.bool_],
     temperature: float,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """(B,) a feasible action for each row, drawn with probabilities softmax(values / temperature); values, mask: (B, actions)."""
-    noise = rng.gumbel(size=values.shape)  # the largest of values with Gumbel noise is such a draw
-    return np.asarray(np.where(mask, values / temperature + noise, -np.inf).argmax(axis=1))
+    """Sample actions from softmax(values / temperature) by the Gumbel-max trick.
+
+    Args:
+        values: Action values. Shape (B, number of actions).
+        action_mask: Feasible actions. Shape (B, number of actions).
+        temperature: Temperature of the softmax, in units of the values.
+        rng: Random generator.
+
+    Returns:
+        A feasible action for each row. Shape (B,).
+    """
+    noise = rng.gumbel(size=values.shape)
+    return np.asarray(np.where(action_mask, values / temperature + noise, -np.inf).argmax(axis=1))
 
 
 def action_probabilities(
     values: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    action_mask: NDArray[np.bool_],
     actions: NDArray[np.int64],
     temperature: float,
 ) -> NDArray[np.float32]:
-    """(B,) the probability with which `softmax_choice` takes each action."""
-    exponent = np.where(mask, values / temperature, -np.inf)
+    """Return the probability with which `sample_softmax_actions` samples each action.
+
+    Args:
+        values: Action values. Shape (B, number of actions).
+        action_mask: Feasible actions. Shape (B, number of actions).
+        actions: Actions. Shape (B,).
+        temperature: Temperature of the softmax, in units of the values.
+
+    Returns:
+        Probabilities. Shape (B,).
+    """
+    exponent = np.where(action_mask, values / temperature, -np.inf)
     weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
     return np.asarray(weight[np.arange(len(actions)), actions] / weight.sum(axis=1), np.float32)
 
 
-def soft_value(values: Tensor, mask: Tensor, temperature: float) -> Tensor:
-    """(B,) V = temperature * log mean exp(Q / temperature) over the feasible actions; 0 where there are none."""
-    exponent = (values / temperature).masked_fill(~mask, -torch.inf)
-    return torch.where(
-        mask.any(dim=1), temperature * (exponent.logsumexp(dim=1) - mask.sum(dim=1).log()), 0.0
-    )
+def soft_value(values: Tensor, action_mask: Tensor, temperature: float) -> Tensor:
+    """Return the soft state value V = temperature * log(mean(exp(Q / temperature))).
+
+    Args:
+        values: Action values Q. Shape (B, number of actions).
+        action_mask: Feasible actions, over which the mean is taken. Shape (B, number of actions).
+        temperature: Temperature of the policy, in units of the values.
+
+    Returns:
+        State values; 0 where no action is feasible. Shape (B,).
+    """
+    exponent = (values / temperature).masked_fill(~action_mask, -torch.inf)
+    log_mean = exponent.logsumexp(dim=1) - action_mask.sum(dim=1).log()
+    return torch.where(action_mask.any(dim=1), temperature * log_mean, 0.0)
 
 
 def sample_episodes(
@@ -157,80 +178,43 @@ def sample_episodes(
     seed: int,
     num_envs: int = 64,
 ) -> list[SampledEpisode]:
-    """Samples episodes, the same for the same seed."""
+    """Sample episodes with the softmax policy; equal seeds give equal episodes.
+
+    Args:
+        network: The Q-network.
+        make_env: Creates an environment.
+        count: Number of episodes.
+        temperature: Temperature of the policy, in units of the reward.
+        seed: Seed of the policy and the environments.
+        num_envs: Maximum number of environments that are stepped together.
+    """
     environments = [make_env() for _ in range(min(num_envs, count))]
-    rng, episodes = item_rng(seed, 2), list[SampledEpisode]()
+    rng = item_rng(seed, 2)
+    episodes = list[SampledEpisode]()
     while len(episodes) < count:
-        # So many at a time, and none in the place of one that ends: short episodes are not to be more frequent.
+        # All environments finish before any is reset. Otherwise short episodes, which finish
+        # first, would be overrepresented.
         running = {
             k: environment.reset(seed=int(rng.integers(2**31)))
             for k, environment in enumerate(environments)
         }
-        scores, ended = [0.0] * len(environments), dict[int, SampledEpisode]()
+        returns = [0.0] * len(environments)
+        finished = dict[int, SampledEpisode]()
         while running:
             observations = collate([observation for observation, _ in running.values()])
             masks = np.array([info["action_mask"] for _, info in running.values()]).astype(bool)
             with torch.no_grad():
-                actions = sample_softmax_actions(
-                    network(observations).cpu().numpy(), masks, temperature, rng
-                )
+                values = network(observations).cpu().numpy()
+            actions = sample_softmax_actions(values, masks, temperature, rng)
             for k, action in zip(list(running), actions.tolist(), strict=True):
-                observation, reward, over, _, info = environments[k].step(action)
-                scores[k] += float(reward)
+                observation, reward, terminated, _, info = environments[k].step(action)
+                returns[k] += float(reward)
                 running[k] = observation, info
-                if over:
-                    ended[k] = SampledEpisode(scores[k], info)
+                if terminated:
+                    finished[k] = SampledEpisode(returns[k], info)
                     del running[k]
-        episodes += [ended[k] for k in range(len(environments))]
+        episodes += [finished[k] for k in range(len(environments))]
     return episodes[:count]
-
-
-class ReplayBuffer:
-    """The latest steps of some environments that are stepped side by side.
-
-    Attributes:
-        arrays: by name, (times, environments, ...), a ring over the times: the observation before the step, `mask`, what was
-            feasible, `action`, the `chance` that it had, `reward`, and `over`, whether the episode ended with it.
-        num_added: that were ever added.
-    """
-
-    def __init__(
-        self, capacity: int, environments: int, observation: GenerationObservation, actions: int
-    ) -> None:
-        """Room for that many steps, of all environments together."""
-
-        def room(like: NDArray[Any]) -> NDArray[Any]:
-            return np.zeros((capacity // environments, environments, *like.shape), like.dtype)
-
-        self.arrays = {name: room(observation[name]) for name in NETWORK_INPUT_KEYS}
-        others = {
-            "action_mask": np.zeros(actions, bool),
-            "action": np.int64(0),
-            "behavior_prob": np.float32(0),
-            "reward": np.float32(0),
-            "terminated": np.bool_(False),
-        }
-        self.arrays |= {name: room(np.asarray(like)) for name, like in others.items()}
-        self.num_added = 0
-
-    def add(self, **step: NDArray[Any]) -> None:
-        """Remembers one step of every environment: arrays (environments, ...)."""
-        for name, array in step.items():
-            self.arrays[name][self.num_added % len(self.arrays[name])] = array
-        self.num_added += 1
-
-    def sample_sequences(
-        self, segments: int, length: int, rng: np.random.Generator
-    ) -> dict[str, NDArray[Any]] | None:
-        """Steps of one environment after another, (segments, length + 1, ...), uniformly; None as long as there are too few."""
-        capacity, environments = self.arrays["action"].shape
-        held = min(self.num_added, capacity)
-        if held <= length:
-            return None
-        start = self.num_added - held + rng.integers(held - length, size=segments)
-        time = (start[:, None] + np.arange(length + 1)) % capacity
-        number = rng.integers(environments, size=segments)[:, None]
-        return {name: array[time, number] for name, array in self.arrays.items()}
 
 
 def retrace_targets(
@@ -243,40 +227,53 @@ def retrace_targets(
     temperature: float,
     retrace_lambda: float,
 ) -> Tensor:
-    """(S, L) what Q(s, a) should be, for S segments of L steps: Retrace (Munos et al. 2016, eq. 3 and 4) with soft values.
+    """Compute Retrace targets (Munos et al. 2016, eqs. 3-4) with soft state values.
 
-    The errors of the later steps are added to the one-step aim, as far as the policy would take these steps today:
+    Without discount, with pi the softmax policy, mu the behavior policy and V the soft value:
 
-        aim(k) = r(k) + V(k + 1) + c(k + 1) * (aim(k + 1) - Q(k + 1, a(k + 1))), without what lies beyond an episode's end,
-        c = trace * min(1, policy(a) / chance), where policy(a) = exp((Q(a) - V) / temperature) / number of feasible actions.
+        target[k] = r[k] + V[k+1] + c[k+1] * (target[k+1] - Q[k+1, a[k+1]])
+        c = retrace_lambda * min(1, pi(a) / mu(a))
+        pi(a) = exp((Q(a) - V) / temperature) / number of feasible actions
+
+    The targets are truncated at the ends of episodes.
 
     Args:
-        values: (S, L + 1, actions) the target network's.
-        action_mask: (S, L + 1, actions) feasible actions.
-        action, reward, terminated: (S, L + 1). chance: (S, L + 1), that the action had when it was taken.
-        temperature: of the policy.
-        retrace_lambda: 0 takes one step into account, 1 all that there are.
+        values: Action values Q of the target network. Shape (S, L + 1, number of actions).
+        action_mask: Feasible actions. Shape (S, L + 1, number of actions).
+        action: Action of each step. Shape (S, L + 1).
+        behavior_prob: Probability mu with which each action was sampled. Shape (S, L + 1).
+        reward: Reward of each step. Shape (S, L + 1).
+        terminated: Whether the episode ended with the step. Shape (S, L + 1).
+        temperature: Temperature of the policy, in units of the reward.
+        retrace_lambda: Weight of later steps; 0 gives one-step targets, 1 uses all steps.
+
+    Returns:
+        Targets for Q(s, a) of the first L steps. Shape (S, L).
     """
-    value = soft_value(values.flatten(0, 1), action_mask.flatten(0, 1), temperature).view_as(reward)
-    taken = values.gather(2, action[:, :, None]).squeeze(2)
-    policy = ((taken - value) / temperature).exp() / action_mask.sum(dim=2)
-    passed_on = retrace_lambda * (policy / behavior_prob).clamp(max=1.0)
+    flat_value = soft_value(values.flatten(0, 1), action_mask.flatten(0, 1), temperature)
+    value = flat_value.view_as(reward)
+    action_value = values.gather(2, action[:, :, None]).squeeze(2)
+    policy_prob = ((action_value - value) / temperature).exp() / action_mask.sum(dim=2)
+    coefficient = retrace_lambda * (policy_prob / behavior_prob).clamp(max=1.0)
     length = reward.shape[1] - 1
-    found: list[Tensor] = []
-    later = value[:, length]
+    targets: list[Tensor] = []
+    next_value = value[:, length]
     for k in reversed(range(length)):
-        found.append(reward[:, k] + torch.where(terminated[:, k], 0.0, later))
-        later = value[:, k] + passed_on[:, k] * (found[-1] - taken[:, k])
-    return torch.stack(found[::-1], dim=1)
+        targets.append(reward[:, k] + torch.where(terminated[:, k], 0.0, next_value))
+        next_value = value[:, k] + coefficient[:, k] * (targets[-1] - action_value[:, k])
+    return torch.stack(targets[::-1], dim=1)
 
 
 class SoftQLearner:
-    """Environments, networks and replay of one training, step by step.
+    """A soft Q-learning run: environments, networks and replay buffer.
 
     Attributes:
-        step: of the environments, so far.
-        network: Q.
-        losses: the latest, one per update.
+        config: Hyperparameters.
+        seed: Seed of the run.
+        device: Device of the networks.
+        step: Number of environment steps so far.
+        network: The Q-network.
+        losses: Losses of the updates of the latest iteration.
     """
 
     def __init__(
@@ -287,26 +284,33 @@ class SoftQLearner:
         device: torch.device,
         num_threads: int = NUM_GRADIENT_SHARDS,
     ) -> None:
-        """Begins a training; `make_environment()` makes a `ClutterGeneration`; `num_threads` work on the parts of an update.
+        """Start a run.
+
+        Args:
+            make_env: Creates an environment.
+            config: Hyperparameters.
+            seed: Seed of the run.
+            device: Device of the networks.
+            num_threads: Number of threads that compute an update; does not change the result.
 
         Raises:
-            InputError: a replay too small for a segment of every environment.
+            InputError: The replay buffer has no room for a sequence of every environment.
         """
-        least = config.num_envs * (config.sequence_length + 1)
-        if config.buffer_size < least:
+        min_buffer_size = config.num_envs * (config.sequence_length + 1)
+        if config.buffer_size < min_buffer_size:
             raise InputError(
-                f"learning.buffer_size: {config.buffer_size}; allowed is {least} "
+                f"learning.buffer_size: {config.buffer_size}; allowed is {min_buffer_size} "
                 "(num_envs * (sequence_length + 1)) or more"
             )
-        self.config, self.seed, self.device = config, seed, device
+        self.config = config
+        self.seed = seed
+        self.device = device
         self._environments: list[ClutterGeneration] = [make_env() for _ in range(config.num_envs)]
-        vocabulary, rules = (
-            self._environments[0].vocabulary,
-            len(self._environments[0].grammar.rules),
-        )
+        vocabulary = self._environments[0].vocabulary
+        num_rules = len(self._environments[0].grammar.rules)
         torch.manual_seed(seed)
         self.network = RuleQNetwork(
-            len(vocabulary.node_kinds), len(vocabulary.edge_kinds), rules, config.width
+            len(vocabulary.node_kinds), len(vocabulary.edge_kinds), num_rules, config.width
         ).to(device)
         self._target = deepcopy(self.network).requires_grad_(False)
         self._optimizer = torch.optim.Adam(
@@ -314,25 +318,25 @@ class SoftQLearner:
         )
         self._workers = ThreadPoolExecutor(num_threads)
         self._rng = item_rng(seed, 0)
-        self.step, self.losses = 0, list[float]()
-        self._scores = [0.0] * config.num_envs
+        self.step = 0
+        self.losses = list[float]()
+        self._returns = [0.0] * config.num_envs
         self._observations: list[GenerationObservation] = []
         self._masks: list[NDArray[np.bool_]] = []
-        for number, environment in enumerate(self._environments):
-            observation, info = environment.reset(
-                seed=int(item_rng(seed, 1, number).integers(2**31))
-            )
+        for k, environment in enumerate(self._environments):
+            env_seed = int(item_rng(seed, 1, k).integers(2**31))
+            observation, info = environment.reset(seed=env_seed)
             self._observations.append(observation)
             self._masks.append(info["action_mask"].astype(bool))
-        self._replay = ReplayBuffer(
-            config.buffer_size, config.num_envs, self._observations[0], rules
+        self._buffer = ReplayBuffer(
+            config.buffer_size, config.num_envs, self._observations[0], num_rules
         )
 
     def warm_start(self, network: RuleQNetwork) -> None:
-        """Takes over what another network has learned.
+        """Take over the weights of another network.
 
         Raises:
-            InputError: it is of another width.
+            InputError: The other network has another width.
         """
         if network.q_head.in_features != self.network.q_head.in_features:
             raise InputError(
@@ -343,11 +347,12 @@ class SoftQLearner:
 
     @property
     def learning_rate(self) -> float:
-        """Of the present step."""
-        return float(self.config.learning_rate * 0.5 ** (self.step // self.config.lr_halving_steps))
+        """Learning rate at the current step."""
+        num_halvings = self.step // self.config.lr_halving_steps
+        return float(self.config.learning_rate * 0.5**num_halvings)
 
     def train_iteration(self) -> list[SampledEpisode]:
-        """One step of every environment, and the updates that are due; returns the episodes that ended."""
+        """Step every environment once, make the updates that are due, return ended episodes."""
         ended = []
         masks = np.array(self._masks)
         values = np.zeros(masks.shape, np.float32)
@@ -355,43 +360,49 @@ class SoftQLearner:
             with torch.no_grad():
                 values = self.network(collate(self._observations)).cpu().numpy()
         actions = sample_softmax_actions(values, masks, self.config.temperature, self._rng)
-        step = collate(self._observations) | {"action_mask": masks, "action": actions}
+        step = collate(self._observations)
+        step["action_mask"] = masks
+        step["action"] = actions
         step["behavior_prob"] = action_probabilities(
             values, masks, actions, self.config.temperature
         )
-        rewards, overs = np.zeros(len(actions), np.float32), np.zeros(len(actions), bool)
+        rewards = np.zeros(len(actions), np.float32)
+        terminations = np.zeros(len(actions), bool)
         for k, environment in enumerate(self._environments):
-            observation, reward, over, _, info = environment.step(int(actions[k]))
-            rewards[k], overs[k] = reward, over
-            self._scores[k] += float(reward)
-            if over:
-                ended.append(SampledEpisode(self._scores[k], info))
-                self._scores[k] = 0.0
+            observation, reward, terminated, _, info = environment.step(int(actions[k]))
+            rewards[k] = reward
+            terminations[k] = terminated
+            self._returns[k] += float(reward)
+            if terminated:
+                ended.append(SampledEpisode(self._returns[k], info))
+                self._returns[k] = 0.0
                 observation, info = environment.reset()
-            self._observations[k], self._masks[k] = observation, info["action_mask"].astype(bool)
-        self._replay.add(**step, reward=rewards, terminated=overs)
-        updates_before, self.step = self._updates_due(), self.step + len(self._environments)
-        self.losses = [
-            loss
-            for _ in range(self._updates_due() - updates_before)
-            if (loss := self._update()) is not None
-        ]
+            self._observations[k] = observation
+            self._masks[k] = info["action_mask"].astype(bool)
+        self._buffer.add(**step, reward=rewards, terminated=terminations)
+        updates_before = self._num_updates_due()
+        self.step += len(self._environments)
+        losses = [self._update() for _ in range(self._num_updates_due() - updates_before)]
+        self.losses = [loss for loss in losses if loss is not None]
         return ended
 
-    def _updates_due(self) -> int:
+    def _num_updates_due(self) -> int:
+        """Return the number of updates that belong to the steps so far."""
         return max(0, self.step - self.config.learning_starts) // self.config.train_frequency
 
     def _update(self) -> float | None:
+        """Make one update; return its loss, or None if the replay buffer has too few steps."""
         config = self.config
-        segments = max(NUM_GRADIENT_SHARDS, config.batch_size // config.sequence_length)
-        drawn = self._replay.sample_sequences(segments, config.sequence_length, self._rng)
-        if drawn is None:
+        count = max(NUM_GRADIENT_SHARDS, config.batch_size // config.sequence_length)
+        batch = self._buffer.sample_sequences(count, config.sequence_length, self._rng)
+        if batch is None:
             return None
-        bounds = [segments * part // NUM_GRADIENT_SHARDS for part in range(NUM_GRADIENT_SHARDS + 1)]
-        parts = [{name: array[a:b] for name, array in drawn.items()} for a, b in pairwise(bounds)]
-        losses, gradients = zip(*self._workers.map(self._loss, parts), strict=True)
-        for parameter, *of_parts in zip(self.network.parameters(), *gradients, strict=True):
-            parameter.grad = sum(of_parts[1:], of_parts[0]) / (segments * config.sequence_length)
+        bounds = [count * shard // NUM_GRADIENT_SHARDS for shard in range(NUM_GRADIENT_SHARDS + 1)]
+        shards = [{name: array[a:b] for name, array in batch.items()} for a, b in pairwise(bounds)]
+        losses, gradients = zip(*self._workers.map(self._shard_loss, shards), strict=True)
+        num_targets = count * config.sequence_length
+        for parameter, *shares in zip(self.network.parameters(), *gradients, strict=True):
+            parameter.grad = sum(shares[1:], shares[0]) / num_targets
         for group in self._optimizer.param_groups:
             group["lr"] = self.learning_rate
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
@@ -400,85 +411,82 @@ class SoftQLearner:
             torch._foreach_lerp_(
                 [*self._target.parameters()], [*self.network.parameters()], config.tau
             )
-        return float(sum(losses)) / (segments * config.sequence_length)
+        return float(sum(losses)) / num_targets
 
-    def _loss(self, drawn: dict[str, NDArray[Any]]) -> tuple[float, tuple[Tensor, ...]]:
-        """Summed over some segments, and its gradients."""
+    def _shard_loss(self, shard: dict[str, NDArray[Any]]) -> tuple[float, tuple[Tensor, ...]]:
+        """Return the Huber loss summed over some sequences, and its gradients."""
         names = ("action_mask", "action", "behavior_prob", "reward", "terminated")
-        mask, action, chance, reward, over = (
-            torch.from_numpy(drawn[name]).to(self.device) for name in names
+        action_mask, action, behavior_prob, reward, terminated = (
+            torch.from_numpy(shard[name]).to(self.device) for name in names
         )
         with torch.no_grad():
-            values = self._target(
-                {
-                    name: drawn[name].reshape(-1, *drawn[name].shape[2:])
-                    for name in NETWORK_INPUT_KEYS
-                }
-            ).view(mask.shape)
-            aim = retrace_targets(
-                values,
-                mask,
+            inputs = {
+                name: shard[name].reshape(-1, *shard[name].shape[2:]) for name in NETWORK_INPUT_KEYS
+            }
+            targets = retrace_targets(
+                self._target(inputs).view(action_mask.shape),
+                action_mask,
                 action,
-                chance,
+                behavior_prob,
                 reward,
-                over,
+                terminated,
                 self.config.temperature,
                 self.config.retrace_lambda,
             ).flatten()
-        before = {
-            name: drawn[name][:, :-1].reshape(-1, *drawn[name].shape[2:])
+        first_inputs = {
+            name: shard[name][:, :-1].reshape(-1, *shard[name].shape[2:])
             for name in NETWORK_INPUT_KEYS
         }
-        chosen = self.network(before).gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
-        loss = torch.nn.functional.smooth_l1_loss(chosen, aim, reduction="sum")
+        values = self.network(first_inputs)
+        action_values = values.gather(1, action[:, :-1].reshape(-1, 1)).squeeze(1)
+        loss = torch.nn.functional.smooth_l1_loss(action_values, targets, reduction="sum")
         return loss.item(), torch.autograd.grad(loss, [*self.network.parameters()])
 
     def save(self, path: Path) -> None:
-        """Writes all that the training needs to go on as if it had never been interrupted."""
+        """Write the complete state of the run; see `Learner`."""
         tensors = learner_tensors(self.network, self._optimizer)
         tensors |= {f"target.{name}": value for name, value in self._target.state_dict().items()}
         tensors |= {
-            f"replay.{name}": torch.from_numpy(array[: self._replay.num_added])
-            for name, array in self._replay.arrays.items()
+            f"replay.{name}": torch.from_numpy(array[: self._buffer.num_added])
+            for name, array in self._buffer.arrays.items()
         }
         state = {
             "step": self.step,
-            "num_added": self._replay.num_added,
+            "num_added": self._buffer.num_added,
             "rng": self._rng.bit_generator.state,
             "environments": [
                 {
                     "rules": environment.partial.rules,
-                    "episodic_return": score,
+                    "episodic_return": episodic_return,
                     "rng": environment.np_random.bit_generator.state,
                 }
-                for environment, score in zip(self._environments, self._scores, strict=True)
+                for environment, episodic_return in zip(
+                    self._environments, self._returns, strict=True
+                )
             ],
         }
         save_tensors(path, tensors, state)
 
     def load(self, path: Path) -> None:
-        """Goes on where `save` was called, in a training of the same config and seed."""
-        tensors, state = load_tensors(path)
-        state = with_current_keys(state, RENAMED_STATE)
+        """Restore the state of a run of the same config and seed; see `Learner`."""
+        tensors, saved_state = load_tensors(path)
+        state = with_current_keys(saved_state, RENAMED_STATE)
         arrays = with_current_keys(tensors_with_prefix(tensors, "replay"), RENAMED_ARRAYS)
         restore_learner(self.network, self._optimizer, tensors)
         self._target.load_state_dict(tensors_with_prefix(tensors, "target"))
         for name, value in arrays.items():
-            self._replay.arrays[name][: len(value)] = value.numpy()
-        self._replay.num_added, self.step = state["num_added"], state["step"]
+            self._buffer.arrays[name][: len(value)] = value.numpy()
+        self._buffer.num_added = state["num_added"]
+        self.step = state["step"]
         self._rng.bit_generator.state = state["rng"]
-        for k, (environment, saved) in enumerate(
-            zip(self._environments, state["environments"], strict=True)
-        ):
-            saved = with_current_keys(saved, RENAMED_STATE)
+        for k, environment in enumerate(self._environments):
+            env_state = with_current_keys(state["environments"][k], RENAMED_STATE)
             observation, info = environment.reset()
-            for rule in saved["rules"]:
+            for rule in env_state["rules"]:
                 observation, _, _, _, info = environment.step(
                     environment.grammar.rule_indices[rule]
                 )
-            environment.np_random.bit_generator.state = saved["rng"]
-            self._scores[k], self._observations[k], self._masks[k] = (
-                saved["episodic_return"],
-                observation,
-                info["action_mask"].astype(bool),
-            )
+            environment.np_random.bit_generator.state = env_state["rng"]
+            self._returns[k] = env_state["episodic_return"]
+            self._observations[k] = observation
+            self._masks[k] = info["action_mask"].astype(bool)

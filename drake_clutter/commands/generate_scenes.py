@@ -86,7 +86,7 @@ def generate_scenes(
         _ = object_class.corners  # raises if a model is missing, before anything is written
     entries = (JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER)
     prepare_output_directory(out, allowed_entries=frozenset(entries))
-    open_job_folder(out, job.to_dict)
+    open_job_folder(out, job.to_dict())
     folder = out / SCENES_FOLDER
     folder.mkdir(exist_ok=True)
     paths = [folder / f"{index:04d}.yaml" for index in range(count)]

@@ -1,1 +1,1 @@
-"""What every training of a network needs: checkpoints, and runs that can be taken up."""
+"""Checkpoints of networks, and training runs that can be interrupted and resumed."""

@@ -1,4 +1,4 @@
-"""Trained networks in files: the weights as safetensors, and beside them a JSON with what made them."""
+"""Checkpoints of networks: weights as safetensors, beside a JSON file with metadata."""
 
 import json
 from collections.abc import Mapping
@@ -36,8 +36,9 @@ class Checkpoint:
     """A trained network.
 
     Attributes:
-        weights: by name.
-        metadata: config, metrics, git commit, and what the network's inputs and outputs stand for.
+        weights: Weights by name of the parameter.
+        metadata: Kind of the network, meaning of its inputs and outputs, configuration, metrics and
+            commits of its training.
     """
 
     weights: dict[str, Tensor]
@@ -45,23 +46,26 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: dict[str, Any]) -> None:
-    """Writes `path` (.safetensors) and a .json beside it."""
+    """Write a network's weights, and a .json file with metadata beside them.
+
+    Args:
+        path: The .safetensors file.
+        network: The network.
+        metadata: See `Checkpoint`.
+    """
     with atomic_write(path) as temporary:
-        save_file(
-            {
-                name: value.detach().cpu().contiguous()
-                for name, value in network.state_dict().items()
-            },
-            temporary,
-        )
+        save_file(_contiguous(network.state_dict()), temporary)
     write_json(path.with_suffix(".json"), metadata)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Reads what `save_checkpoint` wrote.
+    """Read what `save_checkpoint` wrote.
+
+    Args:
+        path: The .safetensors file.
 
     Raises:
-        InputError: a file is missing or broken.
+        InputError: A file is missing or broken.
     """
     try:
         return Checkpoint(
@@ -69,24 +73,36 @@ def load_checkpoint(path: Path) -> Checkpoint:
         )
     except (OSError, SafetensorError) as error:
         raise InputError(
-            f"{path}: cannot be read ({error}); allowed is a checkpoint, .safetensors with a .json beside it"
+            f"{path}: cannot be read ({error}); "
+            "allowed is a checkpoint, .safetensors with a .json beside it"
         ) from error
     except ValueError as error:
         raise InputError(f"{path.with_suffix('.json')}: is not JSON ({error})") from error
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
-    """Writes tensors by name, and beside them what JSON can hold, in one file and in one step."""
+    """Write tensors and a JSON-compatible state to one file, atomically.
+
+    Args:
+        path: The .safetensors file.
+        tensors: Tensors by name.
+        state: Anything that JSON can represent.
+    """
     with atomic_write(path) as temporary:
-        held = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        save_file(held, temporary, metadata={"state": json.dumps(state)})
+        save_file(_contiguous(tensors), temporary, metadata={"state": json.dumps(state)})
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
-    """Reads what `save_tensors` wrote."""
+    """Return the tensors and the state that `save_tensors` wrote."""
     with safe_open(path, "pt") as file:
         names = file.keys()
-        return {name: file.get_tensor(name) for name in names}, json.loads(file.metadata()["state"])
+        tensors = {name: file.get_tensor(name) for name in names}
+        return tensors, json.loads(file.metadata()["state"])
+
+
+def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors as safetensors can store them."""
+    return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
 
 def with_current_keys(mapping: Mapping[str, Any], renamed: Mapping[str, str]) -> dict[str, Any]:
@@ -100,7 +116,7 @@ def with_current_keys(mapping: Mapping[str, Any], renamed: Mapping[str, str]) ->
 
 
 def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Those that are called `PART.NAME`, by NAME."""
+    """Return the tensors whose names begin with `PREFIX.`, by the rest of their names."""
     return {
         name.removeprefix(f"{prefix}."): value
         for name, value in tensors.items()
@@ -109,23 +125,27 @@ def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str,
 
 
 def learner_tensors(network: nn.Module, optimizer: Optimizer) -> dict[str, Tensor]:
-    """A network's weights, as `network.NAME`, and what its optimiser remembers, as `optimizer.NUMBER.NAME`."""
+    """Return the tensors of a network and its optimizer.
+
+    Returns:
+        Weights as `network.NAME`, state of the optimizer as `optimizer.PARAMETER_INDEX.NAME`.
+    """
     weights = {f"network.{name}": value for name, value in network.state_dict().items()}
-    moments = optimizer.state_dict()["state"].items()
-    return weights | {
-        f"optimizer.{number}.{name}": value
-        for number, of_one in moments
-        for name, value in of_one.items()
+    optimizer_state = {
+        f"optimizer.{index}.{name}": value
+        for index, parameter_state in optimizer.state_dict()["state"].items()
+        for name, value in parameter_state.items()
     }
+    return weights | optimizer_state
 
 
 def restore_learner(
     network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]
 ) -> None:
-    """Gives back what `learner_tensors` took; other names are left alone."""
+    """Restore a network and its optimizer from `learner_tensors`; ignore other tensors."""
     network.load_state_dict(tensors_with_prefix(tensors, "network"))
-    moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors_with_prefix(tensors, "optimizer").items():
-        number, _, moment = name.partition(".")
-        moments.setdefault(int(number), {})[moment] = value
-    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
+    optimizer_state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors_with_prefix(tensors, "optimizer").items():
+        index, _, name = key.partition(".")
+        optimizer_state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": optimizer_state})

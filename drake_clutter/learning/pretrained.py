@@ -1,4 +1,4 @@
-"""Where the checkpoints of trained agents are, without PyTorch."""
+"""Lookup of the checkpoints of trained agents, without importing PyTorch."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -9,19 +9,19 @@ from drake_clutter.resources import resource_path
 
 
 def checkpoint_path(name: str, pretrained: Mapping[str, str]) -> Path:
-    """The file of a trained agent.
+    """Return the checkpoint file of a trained agent.
 
     Args:
-        name: of a shipped one, or a user's own .safetensors file.
-        pretrained: where those are, by name.
+        name: Name of a pretrained agent, or the path of a .safetensors file.
+        pretrained: Resource paths of the pretrained agents by name.
 
     Raises:
-        InputError: it is not shipped yet, or PyTorch is not installed.
+        InputError: The checkpoint is not part of this installation, or PyTorch is not installed.
     """
     missing = [module for module in ("torch", "safetensors") if find_spec(module) is None]
     if missing:
         raise InputError(
-            f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [learned]"
+            f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]"
         )
     try:
         return resource_path(pretrained[name]) if name in pretrained else Path(name)
@@ -32,10 +32,14 @@ def checkpoint_path(name: str, pretrained: Mapping[str, str]) -> Path:
 
 
 def checkpoint_sha256(name: str, pretrained: Mapping[str, str]) -> str:
-    """The hash of a trained agent's weights; "" for an agent that has none. Arguments as for `checkpoint_path`.
+    """Return the SHA-256 hash of a trained agent's weights; "" for an agent without weights.
+
+    Args:
+        name: Name of an agent, or the path of a .safetensors file.
+        pretrained: Resource paths of the pretrained agents by name.
 
     Raises:
-        InputError: they cannot be read.
+        InputError: The checkpoint cannot be read.
     """
     if name not in pretrained and not name.endswith(".safetensors"):
         return ""

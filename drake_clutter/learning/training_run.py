@@ -1,4 +1,4 @@
-"""What every training script does around its learning: a folder with config, history, curves and state, taken up after a kill."""
+"""Training runs in a folder with configuration, history, curves and resumable state."""
 
 import json
 import time
@@ -23,31 +23,37 @@ from drake_clutter.resources import git_commit
 from drake_clutter.validation import config_yaml, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
-CONFIG_FILE, STATE_FILE, HISTORY_FILE, TENSORBOARD_FOLDER = (
-    "config.yaml",
-    "state.safetensors",
-    "history.json",
-    "tensorboard",
-)
+CONFIG_FILE = "config.yaml"
+"""Configuration of the run, and hashes of its input files as comments."""
+STATE_FILE = "state.safetensors"
+"""Complete state of the learner."""
+HISTORY_FILE = "history.json"
+"""One row for each evaluation."""
+TENSORBOARD_FOLDER = "tensorboard"
+"""Curves of all evaluations."""
 
 
 class Learner(Protocol):
-    """What learns; `step` counts what the config's number of steps is reached in."""
+    """A learning algorithm whose state can be saved and restored.
+
+    Attributes:
+        step: Progress, in the unit of the run's total number of steps.
+    """
 
     step: int
 
     def save(self, path: Path) -> None:
-        """Writes all that is needed to go on as if it had never been interrupted."""
+        """Write the complete state, from which the training continues as if uninterrupted."""
 
     def load(self, path: Path) -> None:
-        """Goes on where `save` was called."""
+        """Restore the state that `save` wrote."""
 
 
 class TrainingRun:
     """A run in a folder.
 
     Attributes:
-        history: a row for each evaluation.
+        history: One row for each evaluation.
     """
 
     def __init__(
@@ -58,23 +64,31 @@ class TrainingRun:
         total_steps: int,
         input_files: Sequence[Path] = (),
     ) -> None:
-        """Begins a run, or takes up the one that is in the folder.
+        """Start a run, or resume the one in the folder.
 
         Args:
-            folder: the folder; config: a dataclass; learner: as it begins; total_steps: at which it ends.
-            input_files: that the config names and the run learns from; must be the same when it is taken up.
+            folder: The run's folder.
+            config: Configuration, a dataclass.
+            learner: The learner in its initial state.
+            total_steps: Step at which the run ends.
+            input_files: Files that the run learns from; they must be unchanged when it is resumed.
 
         Raises:
-            InputError: the folder holds something else, or a run of another config or of other files.
+            InputError: The folder holds something else, or a run with another configuration or
+                other input files.
         """
-        self._out, self._config, self._learner, self._steps = folder, config, learner, total_steps
-        self._files = {str(file): file_sha256(file) for file in input_files}
-        text = config_yaml(config)
-        hashes = "".join(f"# {file}: sha256 {digest}\n" for file, digest in self._files.items())
+        self._folder = folder
+        self._config = config
+        self._learner = learner
+        self._total_steps = total_steps
+        self._input_hashes = {str(file): file_sha256(file) for file in input_files}
+        text = config_yaml(config) + "".join(
+            f"# {file}: sha256 {digest}\n" for file, digest in self._input_hashes.items()
+        )
         if not (folder / CONFIG_FILE).exists():
             prepare_output_directory(folder)
-            write_text(folder / CONFIG_FILE, text + hashes)
-        elif _with_current_names(folder / CONFIG_FILE, type(config)) != text + hashes:
+            write_text(folder / CONFIG_FILE, text)
+        elif _with_current_names(folder / CONFIG_FILE, type(config)) != text:
             raise InputError(
                 f"--out {folder}: holds a run of another config or other files, see {CONFIG_FILE}; "
                 "give the same ones or another folder"
@@ -82,88 +96,107 @@ class TrainingRun:
         self.history: list[dict[str, Any]] = []
         if (folder / STATE_FILE).exists():
             learner.load(folder / STATE_FILE)
-            rows = (
-                json.loads((folder / HISTORY_FILE).read_text())
-                if (folder / HISTORY_FILE).exists()
-                else []
-            )
+            path = folder / HISTORY_FILE
+            rows = json.loads(path.read_text()) if path.exists() else []
             self.history = [row for row in rows if row["step"] <= learner.step]
         self._console = Console(stderr=True)
         self._writer = SummaryWriter(str(folder / TENSORBOARD_FOLDER), purge_step=learner.step)
-        self._seconds = self.history[-1]["seconds"] if self.history else 0.0
-        self._begun, self._begun_at = time.monotonic(), learner.step
+        self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
+        self._start_time = time.monotonic()
+        self._start_step = learner.step
 
     def report(self, charts: Mapping[str, float], losses: Mapping[str, float]) -> None:
-        """Notes an evaluation: in the history, as curves, and on the screen."""
-        step, spent = self._learner.step, time.monotonic() - self._begun
-        rate = (step - self._begun_at) / spent if step > self._begun_at else 0.0
+        """Record an evaluation in the history, as curves and on the screen.
+
+        Args:
+            charts: Metrics by name.
+            losses: Losses by name.
+        """
+        step = self._learner.step
+        elapsed = time.monotonic() - self._start_time
+        rate = (step - self._start_step) / elapsed if step > self._start_step else 0.0
         row = {
             "step": step,
-            "seconds": self._seconds + spent,
+            "seconds": self._seconds_before + elapsed,
             "commit": git_commit(),
             **losses,
             **charts,
         }
         self.history.append(row)
-        write_json(self._out / HISTORY_FILE, self.history)
-        for folder, values in (
+        write_json(self._folder / HISTORY_FILE, self.history)
+        for group, values in (
             ("charts", {**charts, "steps_per_second": rate}),
             ("losses", losses),
         ):
             for name, value in values.items():
-                self._writer.add_scalar(f"{folder}/{name}", value, step)
-        left = (self._steps - step) / rate / 60 if rate else float("nan")
-        told = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
+                self._writer.add_scalar(f"{group}/{name}", value, step)
+        minutes_left = (self._total_steps - step) / rate / 60 if rate else float("nan")
+        metrics = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
         self._console.print(
-            f"{step:>7} of {self._steps}: {told}; {rate:.0f} steps/s, {left:.0f} min left",
+            f"{step:>7} of {self._total_steps}: {metrics}; {rate:.0f} steps/s, "
+            f"{minutes_left:.0f} min left",
             highlight=False,
             soft_wrap=True,
         )
 
     def save(self) -> None:
-        """Writes the state."""
-        self._learner.save(self._out / STATE_FILE)
+        """Write the learner's state."""
+        self._learner.save(self._folder / STATE_FILE)
 
     def finish(self, name: str, network: nn.Module, metadata: Mapping[str, Any]) -> None:
-        """Writes the checkpoint, with config, hashes of files, last figures and commits, and the state."""
-        metrics, commits = (
-            self.history[-1],
-            list(dict.fromkeys(row["commit"] for row in self.history)),
-        )
+        """Write the checkpoint and the learner's state.
+
+        Args:
+            name: File name of the checkpoint.
+            network: The trained network.
+            metadata: Metadata of the checkpoint. Configuration, hashes of the input files, metrics
+                of the latest evaluation and commits are added.
+        """
         save_checkpoint(
-            self._out / name,
+            self._folder / name,
             network,
             {
                 **metadata,
                 "config": to_plain(self._config),
-                "files": self._files,
-                "metrics": metrics,
-                "commits": commits,
+                "files": self._input_hashes,
+                "metrics": self.history[-1],
+                "commits": list(dict.fromkeys(row["commit"] for row in self.history)),
             },
         )
         self.save()
 
 
 def _with_current_names(path: Path, schema: type) -> str:
-    """Return the text of a run's config file, with the current names of the config's fields."""
+    """Return the text of a run's `CONFIG_FILE` with the current names of the fields.
+
+    Args:
+        path: The file, which an earlier version may have written.
+        schema: Class of the configuration.
+
+    Returns:
+        The text, or "" if the file holds a configuration of another class.
+    """
     hashes = [line for line in path.read_text().splitlines(keepends=True) if line[0] == "#"]
     try:
         config: Any = validate(schema, read_yaml(path, "a mapping of config fields"), str(path))
-    except InputError:  # of another training
+    except InputError:
         return ""
     return config_yaml(config) + "".join(hashes)
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of an option: auto, cpu or cuda.
+    """Return a PyTorch device.
+
+    Args:
+        name: `auto`, `cpu` or `cuda`; `auto` selects CUDA where it is available.
 
     Raises:
-        InputError: another name, or a device that is not there.
+        InputError: The name is unknown, or the device is not available.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {name}; allowed are auto, cpu, cuda")
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch finds none; allowed here are auto, cpu")
-    return torch.device(
-        ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
-    )
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(name)

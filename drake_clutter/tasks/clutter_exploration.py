@@ -192,7 +192,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
                 0.0,
                 False,
                 self._spent,
-                {"end": TerminationReason.OUT_OF_MOVES} if self._spent else {},
+                {"termination": TerminationReason.OUT_OF_MOVES} if self._spent else {},
             )
         move = Move(names[x - 1], names[y - 1] if y else TRAY)
         outcome = self.backend.step(move)
@@ -205,9 +205,9 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         if end is None and not observation["action_mask"].any():
             end = TerminationReason.GAVE_UP
         over = end in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
-        info: dict[str, Any] = {"step": step}
+        info: dict[str, Any] = {"transition": step}
         if end is not None:
-            info["end"] = end
+            info["termination"] = end
         return observation, step.reward, over, end is not None and not over, info
 
 

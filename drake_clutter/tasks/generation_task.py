@@ -312,7 +312,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         if over:
             made = partial.lay_out_and_judge(self.np_random) if partial.failure is None else None
             if made is None:
-                worth, info["fault"] = self.task.instability_reward, partial.failure
+                worth, info["failure"] = self.task.instability_reward, partial.failure
             else:
                 info["scene"], info["verdict"] = made
                 worth = partial.terminal_reward(len(made[1].hidden))
