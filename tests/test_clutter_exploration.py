@@ -126,7 +126,7 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -
             total += float(reward)
             assert environment.objects[: len(known)] == known
             known = environment.objects
-            assert (over or out_of_moves) == ("end" in info)
+            assert (over or out_of_moves) == ("termination" in info)
         ends.add(environment.task.termination)
         collapsed = environment.task.termination is TerminationReason.COLLAPSED
         assert total == len(environment.task.found) - collapsed
