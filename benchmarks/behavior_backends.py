@@ -112,7 +112,7 @@ def _policy_factory(agent: str) -> PolicyFactory:
 
 @cache
 def _backend_factory(fidelity: str) -> BackendFactory:
-    return make_backend_factory(fidelity, WORLD, follow_falls=True)
+    return make_backend_factory(fidelity, WORLD, simulate_collapse=True)
 
 
 def _run_at_fidelity(case: Case, fidelity: str) -> list[Line]:

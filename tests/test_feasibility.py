@@ -75,7 +75,7 @@ def test_every_legal_move_has_a_row() -> None:
     for row in rows:
         assert math.isfinite(row.motion_s) == (row.result == PLANNED)
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
-        assert row.below == (1 if row.pick == "gelatin_box" else 0)
+        assert row.num_below == (1 if row.pick == "gelatin_box" else 0)
     again = study().plan_all_moves("scene", 0, SCENE)
     assert [str(replace(row, planning_s=0.0)) for row in rows] == [
         str(replace(row, planning_s=0.0)) for row in again
@@ -253,7 +253,7 @@ def test_a_study_from_the_command_line(
         rows = [row for row in moves if row["setup"] == name]
         assert found["moves"] == len(rows) > 0
         assert found["planned"] == sum(row["result"] == PLANNED for row in rows) > 0
-        for group in ("object_class", "rest"):
+        for group in ("object_class", "resting_side"):
             assert found["groups"][group] == {
                 value: {
                     "moves": sum(row[group] == value for row in rows),

@@ -68,7 +68,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def task(config: ClutterConfig) -> ExplorationTask:
     """Episode of one move, which uncovers the gelatin box."""
-    backend = make_teleport_backend_factory("settle", config, follow_falls=True)(SCENE, rng())
+    backend = make_teleport_backend_factory("settle", config, simulate_collapse=True)(SCENE, rng())
     task = run_episode(backend, lambda *_: Decision(UNCOVER), max_moves=1)
     assert task.found == ("gelatin_box_1",)
     return task

@@ -17,15 +17,15 @@ FIDELITIES = (*TELEPORT_FIDELITIES, "arm")
 
 
 def make_backend_factory(
-    fidelity: str, config: ClutterConfig, *, follow_falls: bool = False
+    fidelity: str, config: ClutterConfig, *, simulate_collapse: bool = False
 ) -> BackendFactory:
     """Return a factory of the backends of episodes.
 
     Args:
         fidelity: One of `FIDELITIES`.
         config: The simulated world.
-        follow_falls: See `make_teleport_backend_factory`; the arm's simulation always follows a
-            collapse to its end.
+        simulate_collapse: See `make_teleport_backend_factory`. The arm's simulation always follows
+            a collapse to its end.
 
     Raises:
         InputError: The fidelity is unknown.
@@ -33,4 +33,4 @@ def make_backend_factory(
     if fidelity == "arm":
         detector = LabelDetector(config.cell.camera)
         return partial(SteppedBackend, ArmExecutor(config), detector, config.exploration)
-    return make_teleport_backend_factory(fidelity, config, follow_falls=follow_falls)
+    return make_teleport_backend_factory(fidelity, config, simulate_collapse=simulate_collapse)

@@ -70,7 +70,7 @@ def explore_scene(
         config: Configuration.
         on_transition: Called after each move.
     """
-    backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+    backend = make_backend_factory(fidelity, config, simulate_collapse=True)(scene, item_rng(seed))
     policy = make_policy_factory(agent_name, config)(backend)
     return run_episode(backend, policy, max_moves=max_moves, on_transition=on_transition)
 
@@ -122,7 +122,7 @@ def execute_moves(
     Raises:
         InputError: A move names an object that is not visible, or places an object on itself.
     """
-    backend = make_backend_factory(fidelity, config, follow_falls=True)(scene, item_rng(seed))
+    backend = make_backend_factory(fidelity, config, simulate_collapse=True)(scene, item_rng(seed))
 
     def next_move(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
         """Return the next move of the list; a `Policy`."""

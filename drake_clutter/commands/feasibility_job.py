@@ -68,6 +68,12 @@ _RENAMED_PART_FIELDS = {
     "share": "reachable_fraction",
     "branches": "num_solutions",
     "in_the_way": "blocking_bodies",
+    "rest": "resting_side",
+    "below": "num_below",
+    "about": "detail",
+    "number": "failure_value",
+    "attempts": "num_attempts",
+    "between": "nearest_pair",
 }
 """Current names of fields in part files by those that version 0.1 wrote."""
 
@@ -467,8 +473,8 @@ def _write_csv(
 
 GROUP_KEYS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "object_class": lambda row: row["object_class"],
-    "rest": lambda row: row["rest"],
-    "objects_below": lambda row: str(row["below"]),
+    "resting_side": lambda row: row["resting_side"],
+    "objects_below": lambda row: str(row["num_below"]),
     "top_height_cm": lambda row: (
         f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}"
     ),

@@ -281,7 +281,9 @@ def _plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
     _plot_planned_fractions(
         axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class"
     )
-    _plot_planned_fractions(axes[1], moves, setups, lambda row: str(row["rest"]), "resting pose")
+    _plot_planned_fractions(
+        axes[1], moves, setups, lambda row: str(row["resting_side"]), "resting pose"
+    )
     _plot_planned_fractions(
         axes[2],
         moves,
@@ -456,7 +458,7 @@ def _case_html(
     if row["result"] == PLANNED:
         distance = "more than 30 mm"
         if row["clearance"] is not None:
-            distance = f"{1000 * row['clearance']:.1f} mm ({row['between']})"
+            distance = f"{1000 * row['clearance']:.1f} mm ({row['nearest_pair']})"
         detail = f"motion {row['motion_s']:.2f} s, smallest distance {distance}"
         if X_TO is not None:
             planner = PickPlacePlanner(
@@ -466,7 +468,7 @@ def _case_html(
             if isinstance(plan, PickPlacePlan):
                 images.append(render_filmstrip(scene, _plan_key_frames(plan, scene, cell), cell))
     else:
-        detail = ": ".join(filter(None, (row["result"], row["about"])))
+        detail = ": ".join(filter(None, (row["result"], row["detail"])))
     embedded = "".join(_embedded_image(_encode_png(image), title) for image in images)
     return (
         f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(title)}: {escape(detail)}</p>'

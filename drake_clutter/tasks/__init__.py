@@ -1,4 +1,8 @@
-"""The two tasks, as gymnasium environments: `gymnasium.make("drake_clutter.tasks:ClutterGeneration-v0")`."""
+"""The two tasks of Kumar et al. 2022 as gymnasium environments, and what they are built on.
+
+Importing this package registers `ClutterGeneration-v0` and `ClutterExploration-v0`, as does
+`gymnasium.make("drake_clutter.tasks:ClutterGeneration-v0")`.
+"""
 
 import gymnasium
 

@@ -1,4 +1,4 @@
-"""What no arm finds in a scene, whatever it does: the ceiling for explorers that have one."""
+"""Upper bound on the objects that exploration with the arm can find."""
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
@@ -10,20 +10,33 @@ from drake_clutter.tasks.oracle_search import OracleSearch
 
 
 class ArmReachabilityBound:
-    """Knows everything of a scene, and what the cup holds."""
+    """Finds objects that stay hidden behind objects which the gripper cannot grasp."""
 
-    def __init__(self, world: ClutterConfig) -> None:
-        """For scenes in a world."""
-        self._world, self._judge = world, StaticStabilityJudge(world)
-        self._search = OracleSearch(world, self._judge)
+    def __init__(self, config: ClutterConfig) -> None:
+        """Create the bound.
+
+        Args:
+            config: The simulated world.
+        """
+        self._config = config
+        self._judge = StaticStabilityJudge(config)
+        self._search = OracleSearch(config, self._judge)
 
     def find_unrevealable(self, scene: Scene) -> tuple[str, ...]:
-        """What stays hidden behind what no cup holds, and behind what carries that; the scene is at rest."""
-        planner = PickPlacePlanner(self._world.cell.with_support(scene.support), PlannerConfig())
+        """Return the names of the objects that no sequence of the arm's moves can reveal.
+
+        They stay hidden behind objects that the gripper cannot grasp, or behind their supports.
+
+        Args:
+            scene: A scene at rest.
+        """
+        cell = self._config.cell.with_support(scene.support)
+        planner = PickPlacePlanner(cell, PlannerConfig())
         fixed = {o.name for o in scene.objects if not planner.can_grasp(o)}
         supports = self._judge.find_supports(scene)
         if not isinstance(supports, InconclusiveVerdict):
             while below := set[str]().union(*(supports[name] for name in fixed)) - fixed - {TRAY}:
                 fixed |= below
-        in_view = self._judge.ray_caster.observe(scene)[0].detections
-        return self._search.find_unrevealable(scene, [d.name for d in in_view], fixed)
+        observation, _ = self._judge.ray_caster.observe(scene)
+        in_view = [detection.name for detection in observation.detections]
+        return self._search.find_unrevealable(scene, in_view, fixed)

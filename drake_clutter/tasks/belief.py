@@ -1,4 +1,8 @@
-"""What an explorer knows, and how it decides: the same for every backend."""
+"""Belief of an exploration policy, and the interfaces of policies.
+
+An explorer is an agent with an exploration policy. K_t is the set of the objects that have been in
+view up to time t.
+"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,24 +13,29 @@ from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 
 UNMOVED_TOLERANCE = 0.01
-"""Largest distance at which an object counts as not moved by the move that was to place it [m]."""
+"""Largest displacement of an object that counts as not moved [m].
+
+A pose estimate is more accurate than this, and a placement moves an object farther.
+"""
 
 
 def legal_moves(observation: Observation) -> list[Move]:
-    """Return every (x, y) with x in view, y in view or the tray, y != x."""
+    """Return the moves of every object in view to the tray or onto another object in view."""
     names = [detection.name for detection in observation.detections]
     return [Move(x, y) for x in names for y in (TRAY, *names) if y != x]
 
 
 @dataclass(frozen=True)
 class Decision:
-    """An explorer's choice of a move, and what it went by.
+    """A policy's choice of a move, with the information that it was based on.
 
     Attributes:
-        move: What to do; None: the explorer has no move.
-        pick_probabilities: The probability of each pick, by name; empty if the explorer has none.
-        considered: Names of the objects that it went by; empty if those are the ones in view.
-        observation: What it was shown, if that is not what a perfect detector sees.
+        move: The move; None if the policy has no move.
+        pick_probabilities: Probability of picking each object, by name; empty for a policy without
+            probabilities.
+        considered: Names of the objects that the choice was based on; empty for those in view.
+        observation: Observation that the choice was based on, if it is not that of a perfect
+            detector.
     """
 
     move: Move | None
@@ -37,15 +46,15 @@ class Decision:
 
 @dataclass(frozen=True)
 class Belief:
-    """Everything that an explorer remembers of an episode.
+    """State of an explorer's knowledge during an episode.
 
     Attributes:
-        objects: K_t, every object that has been in view, as it was seen last, in the order in
-            which they were found. Until it is seen there, an object is where a move placed it.
+        objects: K_t, all objects that have been in view, in the order of their detection, each at
+            the pose at which it was last detected or, since then, placed.
         history: All moves so far.
-        invalid_moves: Moves that could not be carried out since anything last changed.
-        previous_pose: X_TO of the latest move's object before it was placed, until the next
-            observation shows whether it has left there; else None.
+        invalid_moves: Moves that could not be carried out since the belief last changed.
+        previous_pose: Pose X_TO of the object of the latest move before it was placed, until the
+            next observation shows whether it has moved; otherwise None.
     """
 
     objects: tuple[SceneObject, ...] = ()
@@ -54,59 +63,90 @@ class Belief:
     previous_pose: Pose | None = None
 
     def update(self, observation: Observation) -> "Belief":
-        """Return the belief after an observation: what is in view is where it is seen.
+        """Return the belief after an observation.
 
-        A placed object that is seen where it was has not been picked; all its moves are invalid.
+        Objects in view are at their detected poses. If the object of the latest move is detected
+        where it was before the move, it was not picked, and all its moves become invalid.
         """
         objects = {o.name: o for o in self.objects}
         for d in observation.detections:
-            there = objects.get(d.name)
-            # What is seen as it was keeps its object, which has cached its corners.
-            if there is None or (there.object_class, there.X_TO) != (d.object_class, d.X_TO):
+            known_object = objects.get(d.name)
+            # Unchanged objects are kept, as they have cached their corners.
+            if known_object is None or (known_object.object_class, known_object.X_TO) != (
+                d.object_class,
+                d.X_TO,
+            ):
                 objects[d.name] = SceneObject(d.name, d.object_class, d.X_TO)
-        known = replace(self, objects=tuple(objects.values()), previous_pose=None)
+        updated = replace(self, objects=tuple(objects.values()), previous_pose=None)
         if self.previous_pose is None:
-            return known
-        pick = objects.get(self.history[-1].pick)
-        if pick is None or np.linalg.norm(self.previous_pose.p - pick.X_TO.p) > UNMOVED_TOLERANCE:
-            return replace(known, invalid_moves=())
-        stuck = [move for move in legal_moves(observation) if move.pick == pick.name]
-        invalid = (*self.invalid_moves, *stuck) if stuck else ()
-        return replace(known, invalid_moves=invalid)
+            return updated
+        picked = objects.get(self.history[-1].pick)
+        if picked is None or np.linalg.norm(self.previous_pose.p - picked.X_TO.p) > (
+            UNMOVED_TOLERANCE
+        ):
+            return replace(updated, invalid_moves=())
+        moves_of_picked = [move for move in legal_moves(observation) if move.pick == picked.name]
+        invalid_moves = (*self.invalid_moves, *moves_of_picked) if moves_of_picked else ()
+        return replace(updated, invalid_moves=invalid_moves)
 
     def record(self, move: Move, result: MoveResult, X_TO_place: Pose | None = None) -> "Belief":
         """Return the belief after a move.
 
         Args:
-            move: What was tried.
-            result: How it ended, as far as the explorer can know.
-            X_TO_place: Where the object was released, if it was placed.
+            move: The attempted move.
+            result: Its result, as far as the explorer can observe it.
+            X_TO_place: Pose at which the object was released, if it was placed.
         """
         history = (*self.history, move)
         if not result.was_executed:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
         if result is not MoveResult.PLACED or X_TO_place is None:
             return replace(self, history=history, invalid_moves=())
-        picked_from = next(o.X_TO for o in self.objects if o.name == move.pick)
-        objects = (replace(o, X_TO=X_TO_place) if o.name == move.pick else o for o in self.objects)
-        return replace(self, objects=tuple(objects), history=history, previous_pose=picked_from)
+        previous_pose = next(o.X_TO for o in self.objects if o.name == move.pick)
+        objects = tuple(
+            replace(o, X_TO=X_TO_place) if o.name == move.pick else o for o in self.objects
+        )
+        return replace(self, objects=objects, history=history, previous_pose=previous_pose)
 
     def remove(self, names: Collection[str]) -> "Belief":
-        """Return the belief without some objects, which may be found again as others."""
+        """Return the belief without some objects, which may be detected again as new objects.
+
+        Args:
+            names: Names of the objects.
+        """
         if not names:
             return self
         objects = tuple(o for o in self.objects if o.name not in names)
-        left = (move for move in self.invalid_moves if not {move.pick, move.place} & set(names))
-        return replace(self, objects=objects, invalid_moves=tuple(left))
+        invalid_moves = tuple(
+            move for move in self.invalid_moves if not {move.pick, move.place} & set(names)
+        )
+        return replace(self, objects=objects, invalid_moves=invalid_moves)
 
 
 Policy = Callable[[Belief, Observation, np.random.Generator], Decision]
-"""Chooses the next move from a belief, what is in view, and chance."""
+"""Exploration policy.
+
+Args:
+    belief: State of the knowledge; its invalid moves must not be chosen.
+    observation: Latest observation, with the names of the belief.
+    rng: Random generator.
+
+Returns:
+    The next move.
+"""
 Tracker = Callable[[Sequence[SceneObject], Observation], tuple[Observation, tuple[str, ...]]]
-"""From K_t and an observation whose names mean nothing: the observation in the names of K_t, and
-the names of known objects that are not where they were, nor in view elsewhere."""
+"""Data association of detections with known objects.
+
+Args:
+    objects: K_t.
+    observation: Observation with arbitrary names of the detections.
+
+Returns:
+    The observation with the names of K_t, and the names of known objects that are neither at their
+    pose nor in view elsewhere.
+"""
 ActionFilter = Callable[[Belief, Observation], Sequence[Move]]
-"""The moves in view that are not worth trying."""
+"""Returns the infeasible ones among the legal moves."""
 
 
 def update_belief(
@@ -114,12 +154,15 @@ def update_belief(
     observation: Observation,
     tracker: Tracker | None = None,
 ) -> tuple[Belief, Observation]:
-    """Return the belief after an observation, and the observation in the belief's names.
+    """Update a belief with an observation.
 
     Args:
-        belief: Before the observation.
-        observation: What is in view.
-        tracker: Gives detections names that last; None: they have them.
+        belief: The belief before the observation.
+        observation: The observation.
+        tracker: Associates detections with known objects; None if their names persist.
+
+    Returns:
+        The belief, and the observation with the names of the belief.
     """
     if tracker is not None:
         observation, lost = tracker(belief.objects, observation)
@@ -137,11 +180,11 @@ def select_move(
     """Return a policy's decision.
 
     Args:
-        policy: Chooses among the moves in view.
-        belief: After the observation.
-        observation: What is in view, in the names of the belief.
-        rng: Of the policy's chances.
-        action_filter: Adds to the invalid moves; None: every legal move may be tried.
+        policy: The policy.
+        belief: The belief after the observation.
+        observation: The observation, with the names of the belief.
+        rng: Random generator of the policy.
+        action_filter: Adds infeasible moves to the invalid ones; None adds none.
     """
     if action_filter is not None:
         infeasible = action_filter(belief, observation)

@@ -1,4 +1,4 @@
-"""`ClutterExploration-v0`: the exploration task as a gymnasium environment (SPEC section 4)."""
+"""Gymnasium environment of scene exploration."""
 
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -27,23 +27,31 @@ from drake_clutter.tasks.exploration_graph import (
 from drake_clutter.tasks.exploration_task import ExplorationTask, MoveAttempt, TerminationReason
 
 DEFAULT_SCENES = "training/scenes/train_sg_star.json"
+"""Scene dataset of the environment by default."""
 MAX_RESET_ATTEMPTS = 100
+"""Maximum number of scenes that a reset lays out until one is stable and hides objects."""
 
 
 class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
-    """Find every object that is hidden.
+    """Environment `ClutterExploration-v0`: find every hidden object.
 
-    A reset draws a graph from a set of scenes and lays it out with its stacks in new places; with `options={"scene": k}` it takes
-    the k-th scene of a frozen set as it is.
+    A reset samples a scene of a dataset, and lays it out with its stacks at new places. With
+    `options={"scene": k}` it uses the settled scene k of the dataset instead.
 
-    Observation: see `exploration_graph`, with room for `most_objects`; of K_t (pose and class of what has ever been in view), or,
-        if `privileged`, of all objects as they are. Node 0 is the tray. Nodes keep their numbers while an episode lasts.
-    Action: (x, y), nodes: x goes onto y. `allowed` of the observation says which moves may be made; any other changes nothing but
-        counts as one of `max_moves`.
-    Reward: r_d per newly detected object; r_s, and the end, when the scene collapses. `truncated` after `max_moves`, or when
-        no move is left that has not failed.
-    The `info` of a step has the `step` (a `tasks.exploration.Step`), if the move was allowed, and, when the episode is over, the
-    `end`.
+    Observation space, a `Dict` with N = `max_objects` + 1: the arrays of `build_exploration_graph`,
+    of K_t (the objects that have been in view) or, if privileged, of all objects. Node 0 is the
+    tray. Nodes keep their indices during an episode.
+
+    Action space: `MultiDiscrete([N, N])`, the nodes x and y of a move of x onto y. `action_mask` of
+    the observation marks the allowed moves; any other changes nothing, but counts as a move.
+
+    Reward: `detection_reward` per newly detected object; `collapse_penalty` if the scene collapses.
+
+    Termination: all objects have been detected, or the scene has collapsed. Truncation: after
+    `max_moves` moves, or if no move is allowed.
+
+    The `info` of a step has the `transition` (a `Transition`) if the move was allowed, and at the
+    end of an episode the `termination` (a `TerminationReason`).
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
@@ -58,31 +66,33 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         max_objects: int = 24,
         config: ClutterConfig | None = None,
     ) -> None:
-        """Makes an environment.
+        """Create an environment.
 
         Args:
-            scenes: a set, or the file of one; None: the shipped training set.
-            privileged: whether all objects are seen, or K_t.
-            fidelity: one of `TELEPORT_FIDELITIES`, or what starts episodes on other backends.
-            max_moves: after which an episode ends; None: the config's.
-            max_objects: that a scene may have.
-            config: the world; None: the default one, in the cell that the scenes were made with.
+            scenes: A scene dataset or its file; None selects `DEFAULT_SCENES`.
+            privileged: Whether observations show all objects as they are, instead of K_t.
+            fidelity: One of `TELEPORT_FIDELITIES`, or a factory of other backends.
+            max_moves: Maximum number of moves of an episode; None selects that of the config.
+            max_objects: Maximum number of objects of a scene.
+            config: The simulated world; None selects the default with the dataset's work cell.
         """
         if not isinstance(scenes, SceneDataset):
-            scenes = load_scene_dataset(
-                resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes), load_catalog()
-            )
+            path = resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes)
+            scenes = load_scene_dataset(path, load_catalog())
+        self.scenes = scenes
         self._config = config or ClutterConfig(cell=scenes.cell)
-        self._privileged, self.scenes = privileged, scenes
+        self._privileged = privileged
         self._max_moves = max_moves or self._config.exploration.max_moves
-        self._nodes = max_objects + 1
+        self._max_nodes = max_objects + 1
         self.grammar = scenes.grammar
         self.node_kind_ids = assign_node_kind_ids([c.name for c in scenes.classes])
         if isinstance(fidelity, str):
             fidelity = make_teleport_backend_factory(fidelity, self._config)
-        self._start_backend = fidelity
+        self._make_backend = fidelity
         self._judge = StaticStabilityJudge(self._config)
-        box, n, e = gymnasium.spaces.Box, self._nodes, self._nodes * (self._nodes - 1) // 2
+        n = self._max_nodes
+        e = n * (n - 1) // 2
+        box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.node_kind_ids), (n,), np.int8),
             "node_features": box(
@@ -99,21 +109,25 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ExplorationObservation, dict[str, Any]]:
-        """A scene at rest, and the first look at it."""
-        super().reset(seed=seed)
-        number = None if options is None else options.get("scene")
-        if number is None:
-            return self._begin_anew(), {}
-        if not 0 <= number < len(self.scenes.scenes):
-            raise InputError(
-                f"scene: {number}; allowed is 0 to {len(self.scenes.scenes) - 1}, as {self.scenes.name} has them"
-            )
-        return self.reset_to_scene(
-            self.scenes.settled_scene(number, self.grammar, self._config)
-        ), {}
+        """Start an episode on a scene at rest, and observe it.
 
-    def _begin_anew(self) -> ExplorationObservation:
-        """With a scene that stands and hides something where its stacks are put now."""
+        Raises:
+            InputError: The dataset has no scene of the given index, or no suitable scene was found.
+        """
+        super().reset(seed=seed)
+        index = None if options is None else options.get("scene")
+        if index is None:
+            return self._reset_to_random_scene(), {}
+        if not 0 <= index < len(self.scenes.scenes):
+            raise InputError(
+                f"scene: {index}; allowed is 0 to {len(self.scenes.scenes) - 1}, "
+                f"as {self.scenes.name} has them"
+            )
+        scene = self.scenes.settled_scene(index, self.grammar, self._config)
+        return self.reset_to_scene(scene), {}
+
+    def _reset_to_random_scene(self) -> ExplorationObservation:
+        """Start an episode on a new layout that is stable and hides objects."""
         for _ in range(MAX_RESET_ATTEMPTS):
             index = int(self.np_random.integers(len(self.scenes.scenes)))
             scene = relayout(
@@ -122,95 +136,108 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
                 self._config,
                 self.np_random,
             )
-            if self._judge.find_instability(scene) is None and len(scene.objects) < self._nodes:
+            is_stable = self._judge.find_instability(scene) is None
+            if is_stable and len(scene.objects) < self._max_nodes:
                 observation = self.reset_to_scene(scene)
                 if self.task.termination is None:
                     return observation
-        most = self._nodes - 1
         raise InputError(
-            f"{self.scenes.name}: of {MAX_RESET_ATTEMPTS} scenes none stands and hides something, with at most {most} objects"
+            f"{self.scenes.name}: of {MAX_RESET_ATTEMPTS} scenes none stands and hides something, "
+            f"with at most {self._max_nodes - 1} objects"
         )
 
     def reset_to_scene(self, scene: Scene) -> ExplorationObservation:
-        """Starts an episode on a scene at rest, and looks.
+        """Start an episode on a given scene at rest, and return the observation.
 
         Raises:
-            InputError: it has more objects than there is room for.
+            InputError: The scene has more than `max_objects` objects.
         """
-        if len(scene.objects) >= self._nodes:
-            raise InputError(f"max_objects: {self._nodes - 1}; this scene has {len(scene.objects)}")
-        self.backend, self._refused = self._start_backend(scene, self.np_random), 0
+        if len(scene.objects) >= self._max_nodes:
+            raise InputError(
+                f"max_objects: {self._max_nodes - 1}; this scene has {len(scene.objects)}"
+            )
+        self.backend = self._make_backend(scene, self.np_random)
+        self._num_masked_moves = 0
         self.task = ExplorationTask(
             scene,
             self.backend.perception,
             self._config.exploration,
             self._max_moves,
         )
-        return self._noted(self.observe())
+        return self._observe_and_keep_mask()
 
-    def _noted(self, observation: ExplorationObservation) -> ExplorationObservation:
-        """Keeps which moves it allows, for the next step."""
-        self._allowed = observation["action_mask"].copy()
+    def _observe_and_keep_mask(self) -> ExplorationObservation:
+        """Return the observation, and keep its action mask for the next step."""
+        observation = self.observe()
+        self._action_mask = observation["action_mask"].copy()
         return observation
 
     @property
-    def _spent(self) -> bool:
-        """Whether all moves have been made, those included that were not allowed."""
-        return len(self.task.transitions) + self._refused >= self._max_moves
+    def _is_out_of_moves(self) -> bool:
+        """Whether the maximum number of moves was made, including masked ones."""
+        return len(self.task.transitions) + self._num_masked_moves >= self._max_moves
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """The objects that nodes 1, 2, ... stand for."""
-        return tuple(o.name for o in self._shown(self._privileged))
+        """Names of the objects of nodes 1, 2, ..."""
+        return tuple(o.name for o in self._observed_objects(self._privileged))
 
-    def _shown(self, privileged: bool) -> tuple[SceneObject, ...]:
+    def _observed_objects(self, privileged: bool) -> tuple[SceneObject, ...]:
         return self.backend.scene.objects if privileged else self.backend.belief.objects
 
     def observe(self, *, privileged: bool | None = None) -> ExplorationObservation:
-        """The observation; or the other one, for a teacher that watches a student."""
-        shown = self._shown(self._privileged if privileged is None else privileged)
-        belief, observation = self.backend.belief, self.backend.perception.observation
+        """Return the current observation.
+
+        Args:
+            privileged: Whether to show all objects, instead of K_t; None selects the setting of the
+                environment. A teacher that labels a student's states needs the other observation.
+        """
+        if privileged is None:
+            privileged = self._privileged
+        belief = self.backend.belief
         return build_exploration_graph(
-            shown,
-            observation,
+            self._observed_objects(privileged),
+            self.backend.perception.observation,
             belief.history,
             self.node_kind_ids,
             belief.invalid_moves,
-            max_nodes=self._nodes,
+            max_nodes=self._max_nodes,
         )
 
     def step(
         self, action: Any
     ) -> tuple[ExplorationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Carries a move out; one that is not allowed changes nothing, but counts towards the number of moves."""
+        """Carry out a move; a masked move changes nothing, but counts as a move."""
         x, y = (int(v) for v in action)
         names = self.objects
-        if not self._allowed[x, y]:
-            self._refused += 1
-            return (
-                self.observe(),
-                0.0,
-                False,
-                self._spent,
-                {"termination": TerminationReason.OUT_OF_MOVES} if self._spent else {},
-            )
+        if not self._action_mask[x, y]:
+            self._num_masked_moves += 1
+            truncated = self._is_out_of_moves
+            masked_info = {"termination": TerminationReason.OUT_OF_MOVES} if truncated else {}
+            return self.observe(), 0.0, False, truncated, masked_info
         move = Move(names[x - 1], names[y - 1] if y else TRAY)
         outcome = self.backend.step(move)
         if outcome.result is not MoveResult.COLLAPSED:
             self.backend.update_belief()
-        step = self.task.record(MoveAttempt(Decision(move), outcome, self.backend.perception))
-        observation, end = self._noted(self.observe()), self.task.termination
-        if end is None and self._spent:
-            end = TerminationReason.OUT_OF_MOVES
-        if end is None and not observation["action_mask"].any():
-            end = TerminationReason.GAVE_UP
-        over = end in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
-        info: dict[str, Any] = {"transition": step}
-        if end is not None:
-            info["termination"] = end
-        return observation, step.reward, over, end is not None and not over, info
+        transition = self.task.record(MoveAttempt(Decision(move), outcome, self.backend.perception))
+        observation = self._observe_and_keep_mask()
+        termination = self.task.termination
+        if termination is None and self._is_out_of_moves:
+            termination = TerminationReason.OUT_OF_MOVES
+        if termination is None and not observation["action_mask"].any():
+            termination = TerminationReason.GAVE_UP
+        terminated = termination in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
+        truncated = termination is not None and not terminated
+        info: dict[str, Any] = {"transition": transition}
+        if termination is not None:
+            info["termination"] = termination
+        return observation, transition.reward, terminated, truncated, info
 
 
 def assign_node_kind_ids(classes: list[str]) -> dict[str, int]:
-    """The kinds of nodes of `exploration_graph`, by name: the tray's, then the classes'."""
+    """Return the numbers of the kinds of nodes by name: the tray's, then the classes', from 1 on.
+
+    Args:
+        classes: Names of the object classes.
+    """
     return {name: number for number, name in enumerate((TRAY, *classes), start=1)}

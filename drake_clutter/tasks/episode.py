@@ -1,4 +1,4 @@
-"""One loop that plays an episode, over backends in which an explorer's moves are carried out."""
+"""Exploration episodes: one loop, over backends that carry out a policy's moves."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -45,24 +45,27 @@ class Backend(Protocol):
 
     @property
     def config(self) -> ExplorationConfig:
-        """The task's config."""
+        """Configuration of the task."""
 
     @property
     def scene(self) -> Scene:
-        """The true objects, now."""
+        """The true scene, now."""
 
     @property
     def perception(self) -> PerceptionResult:
-        """What a perfect detector sees, now."""
+        """Result of a perfect detector, now."""
 
     @property
     def belief(self) -> Belief:
-        """What the policy knows, now."""
+        """The policy's belief, now."""
 
     def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
-        """Yield each attempt of a policy, once the scene has been observed again.
+        """Yield each move that the policy attempts, after the scene was observed again.
 
-        It ends when the policy has no move left.
+        The iterator ends when the policy has no move.
+
+        Args:
+            policy: Chooses the moves.
         """
 
 
@@ -74,19 +77,19 @@ def run_episode(
     on_transition: Callable[[Transition], None] = lambda _: None,
     stop_when_all_found: bool = True,
 ) -> ExplorationTask:
-    """Play an episode, and return its record.
+    """Run an episode, and return its record.
 
     Args:
-        backend: Where it takes place.
+        backend: Carries out the moves.
         policy: Chooses the moves.
-        max_moves: Attempts after which the episode ends.
-        on_transition: Called after each attempt.
-        stop_when_all_found: Whether the episode ends when every object has been found.
+        max_moves: Maximum number of attempted moves.
+        on_transition: Called after each attempted move.
+        stop_when_all_found: Whether the episode ends when every object has been detected.
     """
     task = ExplorationTask(backend.scene, backend.perception, backend.config, max_moves)
-    goes_on = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
+    continuing = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
     attempts = backend.rollout(policy)
-    while task.termination in goes_on and (attempt := next(attempts, None)) is not None:
+    while task.termination in continuing and (attempt := next(attempts, None)) is not None:
         on_transition(task.record(attempt))
     return task
 
@@ -99,16 +102,16 @@ class Detector(Protocol):
 
 
 class SteppedBackend:
-    """A backend that carries out one command at a time, and observes the scene in between.
+    """Backend that executes one command at a time and observes the scene in between.
 
-    It is observed by a perfect detector, whose names are those of the true objects.
+    The observations are those of a perfect detector. Derived backends may replace them.
 
     Attributes:
-        config: Of the task.
-        scene: The true objects, now.
-        perception: What a perfect detector sees, now.
-        belief: What the policy knows, now.
-        observation: The latest, in the names of the belief.
+        config: Configuration of the task.
+        scene: The true scene, now.
+        perception: Result of the perfect detector, now.
+        belief: The policy's belief, now.
+        observation: Latest observation, with the names of the belief.
     """
 
     def __init__(
@@ -122,62 +125,73 @@ class SteppedBackend:
         tracker: Tracker | None = None,
         action_filter: ActionFilter | None = None,
     ) -> None:
-        """Start on a scene at rest, and observe it.
+        """Start an episode, and observe the scene.
 
         Args:
-            executor: Carries out the commands.
+            executor: Executes the commands.
             detector: The perfect detector.
-            config: Of the task.
-            scene: The objects, at rest.
-            rng: Draws for the policy, the placement and the world.
-            tracker: Gives detections names that last; None: they have them.
-            action_filter: Adds to the invalid moves; None: every legal move may be tried.
+            config: Configuration of the task.
+            scene: The scene, at rest.
+            rng: Random generator of the policy, the placements and the outcomes.
+            tracker: Associates detections with known objects; None if their names persist.
+            action_filter: Adds infeasible moves to the invalid ones; None adds none.
         """
-        self._tracker, self._action_filter = tracker, action_filter
-        self._executor, self._detector, self._rng = executor, detector, rng
-        self.config, self.scene, self.perception = config, scene, detector.perceive(scene)
+        self._tracker = tracker
+        self._action_filter = action_filter
+        self._executor = executor
+        self._detector = detector
+        self._rng = rng
+        self.config = config
+        self.scene = scene
+        self.perception = detector.perceive(scene)
         self.belief = Belief()
         self.update_belief()
 
     @property
     def policy_rng(self) -> np.random.Generator:
-        """What the policy draws the next move from."""
+        """Random generator of the policy for the next move."""
         return self._rng
 
     @property
     def world_rng(self) -> np.random.Generator:
-        """What the placement and the outcome of the next move are drawn from."""
+        """Random generator of the placement and the outcome of the next move."""
         return self._rng
 
     def observe(self) -> Observation:
-        """Return what is in view now."""
+        """Return the current observation."""
         return self.perception.observation
 
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """Carry out a command."""
+        """Execute a command, and return its outcome.
+
+        Args:
+            command: The command.
+            rng: Random generator of the outcome.
+        """
         outcome = self._executor.execute(self.scene, command, rng)
         if outcome.result.was_executed:
-            self.scene, self.perception = outcome.scene, self._detector.perceive(outcome.scene)
+            self.scene = outcome.scene
+            self.perception = self._detector.perceive(outcome.scene)
         return outcome
 
     def observable_result(self, outcome: Outcome) -> MoveResult:
-        """Return what the policy can know of an outcome."""
+        """Return what the policy can observe of an outcome."""
         return outcome.result
 
     def to_ground_truth(self, decision: Decision) -> Decision:
-        """Return a decision in the names of the true objects."""
+        """Return a decision with the names of the true objects."""
         return decision
 
     def update_belief(self) -> None:
-        """Observe the scene."""
+        """Observe the scene, and update the belief."""
         self.belief, self.observation = update_belief(self.belief, self.observe(), self._tracker)
 
     def step(self, move: Move) -> Outcome:
-        """Carry out a move, if there is a free place, and record it in the belief.
+        """Carry out a move if it has a free placement, and record it in the belief.
 
         Raises:
             KeyError: The move names an object that is not in view.
-            ValueError: The move puts an object on itself.
+            ValueError: The move places an object on itself.
         """
         rng = self.world_rng
         command = resolve_placement(move, self.observation, self.config, rng)
@@ -191,7 +205,7 @@ class SteppedBackend:
         return outcome
 
     def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
-        """See `Backend.rollout`."""
+        """Yield each move that the policy attempts; see `Backend.rollout`."""
         while True:
             decision = select_move(
                 policy,
@@ -202,20 +216,31 @@ class SteppedBackend:
             )
             if decision.move is None:
                 return
-            recorded = self.to_ground_truth(decision)
+            # Translated before the move, after which the names of the belief may change.
+            true_decision = self.to_ground_truth(decision)
             outcome = self.step(decision.move)
             self.update_belief()
-            yield MoveAttempt(recorded, outcome, self.perception)
+            yield MoveAttempt(true_decision, outcome, self.perception)
 
 
 BackendFactory = Callable[[Scene, np.random.Generator], SteppedBackend]
-"""Starts an episode on a scene at rest; its executor and detector are kept from one to the next."""
+"""Creates the backend of an episode.
+
+The executor and the detector are shared by all its backends.
+
+Args:
+    scene: The scene, at rest.
+    rng: Random generator of the episode.
+"""
 
 TELEPORT_FIDELITIES = ("static", "static_or_drake", "settle")
-"""How moves are judged when objects are teleported: by the static judge; by Drake where that cannot
-judge; by Drake. What `static` cannot judge cannot be done: for training, where asking Drake
-about one move in a hundred would take half the time."""
+"""Models of the outcome of a move in which objects are teleported.
 
+- `static`: The static stability judge decides. A move with an inconclusive verdict is not carried
+  out. Used for training, where simulating one move in a hundred would double the time.
+- `static_or_drake`: Drake decides where the static stability judge is inconclusive.
+- `settle`: Drake simulates every move.
+"""
 
 RENAMED_FIDELITIES: Mapping[str, str] = {"equilibrium": "static", "fast": "static_or_drake"}
 """Current name of a fidelity by its name in version 0.1."""
@@ -230,18 +255,18 @@ def make_teleport_backend_factory(
     fidelity: str,
     config: ClutterConfig,
     *,
-    follow_falls: bool = False,
+    simulate_collapse: bool = False,
 ) -> BackendFactory:
-    """Return what starts episodes in which objects are teleported.
+    """Return a factory of backends in which objects are teleported.
 
     Args:
         fidelity: One of `TELEPORT_FIDELITIES`.
-        config: The world.
-        follow_falls: Whether Drake simulates what a collapse, which ends the episode, does to the
-            whole scene; for pictures.
+        config: The simulated world.
+        simulate_collapse: Whether Drake simulates a collapse to its end, for pictures of the scene.
+            The result of a move is the same.
 
     Raises:
-        InputError: No such fidelity.
+        InputError: The fidelity is unknown.
     """
     executor: MoveExecutor
     detector: Detector = RayDetector(config.cell.camera)
@@ -249,9 +274,9 @@ def make_teleport_backend_factory(
         case "static":
             executor = StaticExecutor(config)
         case "static_or_drake":
-            executor = HybridExecutor(config, simulate_collapse=follow_falls)
+            executor = HybridExecutor(config, simulate_collapse=simulate_collapse)
         case "settle":
-            executor = SettleExecutor(config, simulate_collapse=follow_falls)
+            executor = SettleExecutor(config, simulate_collapse=simulate_collapse)
             detector = LabelDetector(config.cell.camera)
         case _:
             allowed = ", ".join(TELEPORT_FIDELITIES)

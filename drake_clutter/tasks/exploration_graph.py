@@ -1,7 +1,8 @@
-"""The graph that an explorer's network sees: objects with pose and class, and how they lie to each other.
+"""Graph observation of an exploration policy: objects with pose and class, and their relations.
 
-The same arrays hold the privileged graph of all objects as they are, and the graph of K_t as it was seen: what differs is which
-objects are given. Everything in it follows from their poses and classes, and from what is in view.
+The same arrays represent the privileged graph of all objects and the graph of K_t, the objects that
+have been in view; only the given objects differ. All features follow from the objects' poses and
+classes and from the latest observation.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -14,6 +15,7 @@ from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
 
 ExplorationObservation = dict[str, NDArray[Any]]
+"""Arrays of `build_exploration_graph` by name."""
 
 NODE_FEATURES = (
     *("x", "y", "z"),
@@ -21,9 +23,19 @@ NODE_FEATURES = (
     *("extent_x", "extent_y", "extent_z"),
     *("in_view", "visible_fraction", "is_covered", "support_gap", "pick_count"),
 )
-"""Of a node: position and extents of its axis-aligned box in `_LENGTH`; quaternion; whether it is in view; of its box seen from
-above, the share that is seen; whether another object of the graph is above it; how far below it, in `_LENGTH`, the next object of
-the graph or the tray is, so that something else must carry it; how often it was picked, in `_MANY_PICKS`."""
+"""Features of a node.
+
+- `x`, `y`, `z`: Position of the object, in units of `_LENGTH_SCALE`.
+- `qw`, `qx`, `qy`, `qz`: Quaternion of the object.
+- `extent_x`, `extent_y`, `extent_z`: Extents of its axis-aligned bounding box, in units of
+  `_LENGTH_SCALE`.
+- `in_view`: Whether the object is in view.
+- `visible_fraction`: Visible fraction of the bounding box, seen from above.
+- `is_covered`: Whether another object of the graph is above it.
+- `support_gap`: Gap to the next lower object of the graph or the tray, in units of `_LENGTH_SCALE`.
+  A positive gap shows that an unknown object supports it.
+- `pick_count`: Number of times the object was picked, in units of `_PICK_COUNT_SCALE`.
+"""
 EDGE_KINDS = (
     "supports",
     "is_below",
@@ -32,10 +44,13 @@ EDGE_KINDS = (
     "tray_supports",
     "tray_is_below",
 )
-"""Of the edge from the lower to the upper of two objects, or from the tray to an object: the upper rests on the lower, is above
-it without touching it, is beside it, or is further away."""
+"""Kinds of the edge from the lower to the upper one of two objects, or from the tray to an object.
+
+The upper object rests on the lower one, is above it without contact, is beside it, or is farther
+away; an object rests on the tray, or is above it without contact.
+"""
 GLOBAL_FEATURES = ("num_moves",)
-"""Of the graph, in `_MANY_MOVES`."""
+"""Features of the graph: the number of moves so far, in units of `_NUM_MOVES_SCALE`."""
 
 RENAMED_ARRAYS: Mapping[str, str] = {
     "feature": "node_features",
@@ -55,25 +70,44 @@ RENAMED_FEATURES: Mapping[str, str] = {
 """Current name of a node feature or kind of edges by its name in version 0.1."""
 
 FEATURE_BOUND = 10.0
-"""That no number of the graph exceeds."""
-_LENGTH, _MANY_PICKS, _MANY_MOVES = 0.35, 3.0, 20.0
-_OVERLAP = 0.003
-"""m, by which two outlines overlap at least, seen from above, for one object to be above the other."""
-_TOUCHING = 0.006
-"""m between two heights that count as the same."""
-_BESIDE = 0.03
-"""m between the outlines of objects that are beside each other."""
-_ANGLE = np.radians(np.arange(0, 180, 30))
-_DIRECTIONS = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
-"""(D, 2) in which outlines are compared; boxes as the grammar lays them have their sides across some of them."""
+"""Upper bound of the absolute values of all features."""
+_LENGTH_SCALE = 0.35
+"""Length that is represented by 1 [m]: half the side of the default tray."""
+_PICK_COUNT_SCALE = 3.0
+"""Number of picks that is represented by 1."""
+_NUM_MOVES_SCALE = 20.0
+"""Number of moves that is represented by 1: the maximum of an episode in training."""
+_MIN_OVERLAP = 0.003
+"""Smallest overlap, seen from above, of an object that is above another one [m]."""
+_HEIGHT_TOLERANCE = 0.006
+"""Largest difference of heights that are considered equal [m]."""
+_MAX_BESIDE_GAP = 0.03
+"""Largest gap between objects that are beside each other [m]."""
+_ANGLES = np.radians(np.arange(0, 180, 30))
+_DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+"""Horizontal directions along which outlines are compared. Shape (6, 2).
+
+They contain the normals of the sides of boxes in the orientations that the grammar generates.
+"""
 
 
-def _overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
-    """(n, n) m, by which two outlines overlap seen from above; negative: the gap between them."""
-    along = np.array(
-        [[(p := o.corners_T[:, :2] @ _DIRECTIONS.T).min(axis=0), p.max(axis=0)] for o in objects]
-    )
-    lower, upper = along[:, 0], along[:, 1]
+def _horizontal_overlaps(objects: Sequence[SceneObject]) -> NDArray[np.float64]:
+    """Return by how much the objects' outlines overlap pairwise, seen from above [m].
+
+    Negative values are gaps. Outlines are compared along `_DIRECTIONS`.
+
+    Args:
+        objects: n objects.
+
+    Returns:
+        Overlaps. Shape (n, n).
+    """
+    intervals = []
+    for o in objects:
+        projections = o.corners_T[:, :2] @ _DIRECTIONS.T
+        intervals.append([projections.min(axis=0), projections.max(axis=0)])
+    lower = np.array(intervals)[:, 0]
+    upper = np.array(intervals)[:, 1]
     overlap = np.minimum(upper[:, None], upper[None]) - np.maximum(lower[:, None], lower[None])
     return np.asarray(overlap.min(axis=2))
 
@@ -86,85 +120,124 @@ def build_exploration_graph(
     invalid_moves: Collection[Move] = (),
     max_nodes: int = 0,
 ) -> ExplorationObservation:
-    """The graph as arrays; node 0 is the tray, node k the k-th object.
+    """Return the graph of some objects as arrays; node 0 is the tray, node k the k-th object.
 
     Args:
-        objects: n of them.
-        observation: what is in view; those in view must be among the objects.
-        history: the episode's moves so far.
-        node_kind_ids: of the kinds of nodes, from 1 on: the tray's and the classes', by name.
-        invalid_moves: moves that may not be made.
-        max_nodes: N, that there is room for; 0: as many as there are.
+        objects: n objects, among them all objects in view.
+        observation: Latest observation.
+        history: Moves of the episode so far.
+        node_kind_ids: Numbers of the kinds of nodes, the tray and the classes, from 1 on.
+        invalid_moves: Moves that are masked.
+        max_nodes: Number N of nodes of the arrays; 0 for n + 1.
 
     Returns:
-        node_kind (N,), 0 is padding; feature (N, `FEATURES`); edge (N (N - 1) / 2, 2) lower and upper; edge_kind, number in
-        `EDGE_KINDS` from 1 on, 0 is padding; glob (`GLOBALS`,); allowed (N, N), which moves may be made: to pick a row's
-        node and put it onto a column's. It follows from what is in view, and from what has failed.
+        node_kind: Numbers of the kinds of the nodes; 0 is padding. Shape (N,).
+        node_features: See `NODE_FEATURES`. Shape (N, number of features).
+        edge_links: Lower and upper node of each edge. Shape (N (N - 1) / 2, 2).
+        edge_kind: Position in `EDGE_KINDS` from 1 on; 0 is padding. Shape (N (N - 1) / 2,).
+        global_features: See `GLOBAL_FEATURES`. Shape (1,).
+        action_mask: Whether the row's node may be placed on the column's node: both are in view, or
+            the latter is the tray, and the move is not invalid. Shape (N, N).
     """
-    count, room = len(objects), max_nodes or len(objects) + 1
-    seen = {detection.name: detection for detection in observation.detections}
-    kind, feature = np.zeros(room, np.int8), np.zeros((room, len(NODE_FEATURES)), np.float32)
-    allowed = np.zeros((room, room), np.int8)
-    kind[0] = node_kind_ids[TRAY]
-    edge, edge_kind = (
-        np.zeros((room * (room - 1) // 2, 2), np.int16),
-        np.zeros(room * (room - 1) // 2, np.int8),
-    )
+    count = len(objects)
+    num_nodes = max_nodes or count + 1
+    num_edges = num_nodes * (num_nodes - 1) // 2
+    node_kind = np.zeros(num_nodes, np.int8)
+    node_features = np.zeros((num_nodes, len(NODE_FEATURES)), np.float32)
+    edge_links = np.zeros((num_edges, 2), np.int16)
+    edge_kind = np.zeros(num_edges, np.int8)
+    action_mask = np.zeros((num_nodes, num_nodes), np.int8)
+    node_kind[0] = node_kind_ids[TRAY]
     if count:
         bounds = np.array([o.bounds_T for o in objects])
-        low, high = bounds[:, 0, 2], bounds[:, 1, 2]
-        overlap = _overlaps(objects)
-        above = (overlap > _OVERLAP) & (low[None] > high[:, None] - _TOUCHING)  # [lower, upper]
-        np.fill_diagonal(above, False)
-        floor = np.where(above, high[:, None], 0.0).max(axis=0)
-        tops = np.column_stack([bounds[:, :, :2].mean(axis=1), high])
-        pixel = observation.camera.depth(tops) / observation.camera.focal_length
-        for k, o in enumerate(objects):
-            extent = bounds[k, 1] - bounds[k, 0]
-            detection = seen.get(o.name)
-            share = 0.0
-            if detection is not None:
-                share = min(
-                    1.0,
-                    np.count_nonzero(detection.mask) * pixel[k] ** 2 / float(extent[0] * extent[1]),
-                )
-            picks = sum(move.pick == o.name for move in history)
-            kind[k + 1] = node_kind_ids[o.object_class.name]
-            # Of a rotation's two, always the same, also when a component that should be 0 is a little off.
-            sign = 1 if next((q for q in o.X_TO.quaternion if abs(q) > 0.01), 1) > 0 else -1
-            feature[k + 1] = (
-                *(o.X_TO.p / _LENGTH),
-                *(sign * q for q in o.X_TO.quaternion),
-                *(extent / _LENGTH),
-                detection is not None,
-                share,
-                above[k].any(),
-                max(0.0, low[k] - floor[k] - _TOUCHING) / _LENGTH,
-                min(FEATURE_BOUND, picks / _MANY_PICKS),
-            )
-        # From the lower to the upper; of equally low ones, in an order that does not depend on theirs.
-        order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], low))
-        a, b = np.triu_indices(count, 1)
-        lower, upper = order[a], order[b]
-        over, gap = above[lower, upper], -overlap[lower, upper]
-        rests = over & (np.abs(low[upper] - high[lower]) < _TOUCHING)
-        pairs = len(a)
-        edge[:pairs, 0], edge[:pairs, 1] = lower + 1, upper + 1
-        edge_kind[:pairs] = np.where(rests, 1, np.where(over, 2, np.where(gap < _BESIDE, 3, 4)))
-        edge[pairs : pairs + count, 1] = np.arange(1, count + 1)
-        edge_kind[pairs : pairs + count] = np.where(low < _TOUCHING, 5, 6)
-        in_view = np.flatnonzero(feature[:, NODE_FEATURES.index("in_view")])
-        allowed[in_view[:, None], in_view] = allowed[in_view, 0] = 1
-        np.fill_diagonal(allowed, 0)
+        bottom = bounds[:, 0, 2]
+        top = bounds[:, 1, 2]
+        overlap = _horizontal_overlaps(objects)
+        is_above = (overlap > _MIN_OVERLAP) & (bottom[None] > top[:, None] - _HEIGHT_TOLERANCE)
+        np.fill_diagonal(is_above, False)  # is_above[lower, upper]
+        node_kind[1 : count + 1] = [node_kind_ids[o.object_class.name] for o in objects]
+        node_features[1 : count + 1] = _object_features(
+            objects, observation, history, bounds, is_above
+        )
+        # Edges lead from the lower to the upper object; objects of equal height are ordered by
+        # position, so that the graph does not depend on the order of the objects.
+        order = np.lexsort((bounds[:, 0, 1], bounds[:, 0, 0], bottom))
+        first, second = np.triu_indices(count, 1)
+        lower = order[first]
+        upper = order[second]
+        upper_is_above = is_above[lower, upper]
+        gap = -overlap[lower, upper]
+        is_supported = upper_is_above & (np.abs(bottom[upper] - top[lower]) < _HEIGHT_TOLERANCE)
+        pairs = len(first)
+        edge_links[:pairs, 0] = lower + 1
+        edge_links[:pairs, 1] = upper + 1
+        edge_kind[:pairs] = np.where(
+            is_supported, 1, np.where(upper_is_above, 2, np.where(gap < _MAX_BESIDE_GAP, 3, 4))
+        )
+        edge_links[pairs : pairs + count, 1] = np.arange(1, count + 1)
+        edge_kind[pairs : pairs + count] = np.where(bottom < _HEIGHT_TOLERANCE, 5, 6)
+        in_view = np.flatnonzero(node_features[:, NODE_FEATURES.index("in_view")])
+        action_mask[in_view[:, None], in_view] = 1
+        action_mask[in_view, 0] = 1
+        np.fill_diagonal(action_mask, 0)
         node = {TRAY: 0} | {o.name: k for k, o in enumerate(objects, start=1)}
         for move in invalid_moves:
-            allowed[node[move.pick], node[move.place]] = 0
-    glob = np.array([min(FEATURE_BOUND, len(history) / _MANY_MOVES)], np.float32)
+            action_mask[node[move.pick], node[move.place]] = 0
+    num_moves = min(FEATURE_BOUND, len(history) / _NUM_MOVES_SCALE)
     return {
-        "node_kind": kind,
-        "node_features": feature,
-        "edge_links": edge,
+        "node_kind": node_kind,
+        "node_features": node_features,
+        "edge_links": edge_links,
         "edge_kind": edge_kind,
-        "global_features": glob,
-        "action_mask": allowed,
+        "global_features": np.array([num_moves], np.float32),
+        "action_mask": action_mask,
     }
+
+
+def _object_features(
+    objects: Sequence[SceneObject],
+    observation: Observation,
+    history: Sequence[Move],
+    bounds: NDArray[np.float64],
+    is_above: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Return the `NODE_FEATURES` of n objects. Shape (n, number of features).
+
+    Args:
+        objects: The objects.
+        observation: Latest observation.
+        history: Moves of the episode so far.
+        bounds: Corners of the objects' bounding boxes [m]. Shape (n, 2, 3).
+        is_above: Whether the column's object is above the row's. Shape (n, n).
+    """
+    detections = {detection.name: detection for detection in observation.detections}
+    bottom = bounds[:, 0, 2]
+    top = bounds[:, 1, 2]
+    floor = np.where(is_above, top[:, None], 0.0).max(axis=0)
+    top_centers = np.column_stack([bounds[:, :, :2].mean(axis=1), top])
+    camera = observation.camera
+    pixel_size = camera.depth(top_centers) / camera.focal_length
+    features = np.zeros((len(objects), len(NODE_FEATURES)), np.float32)
+    for k, o in enumerate(objects):
+        extent = bounds[k, 1] - bounds[k, 0]
+        detection = detections.get(o.name)
+        visible_fraction = 0.0
+        if detection is not None:
+            visible_area = np.count_nonzero(detection.mask) * pixel_size[k] ** 2
+            visible_fraction = min(1.0, visible_area / float(extent[0] * extent[1]))
+        pick_count = sum(move.pick == o.name for move in history)
+        # q and -q are the same rotation. The sign is that of the first component that is clearly
+        # not zero, so that it does not depend on rounding.
+        quaternion = o.X_TO.quaternion
+        sign = 1 if next((q for q in quaternion if abs(q) > 0.01), 1) > 0 else -1
+        features[k] = (
+            *(o.X_TO.p / _LENGTH_SCALE),
+            *(sign * q for q in quaternion),
+            *(extent / _LENGTH_SCALE),
+            detection is not None,
+            visible_fraction,
+            is_above[k].any(),
+            max(0.0, bottom[k] - floor[k] - _HEIGHT_TOLERANCE) / _LENGTH_SCALE,
+            min(FEATURE_BOUND, pick_count / _PICK_COUNT_SCALE),
+        )
+    return features

@@ -1,4 +1,8 @@
-"""The scene exploration task: find every hidden object by moving what is in view."""
+"""Scene exploration: find every hidden object by moving objects that are in view.
+
+`ExplorationTask` evaluates an episode with the ground truth: discovered objects, rewards and the
+reason of its termination.
+"""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -11,7 +15,7 @@ from drake_clutter.tasks.belief import Decision
 
 
 class TerminationReason(Enum):
-    """Why an episode is over."""
+    """Why an episode ended."""
 
     ALL_FOUND = "all found"
     COLLAPSED = "collapsed"
@@ -21,12 +25,12 @@ class TerminationReason(Enum):
 
 @dataclass(frozen=True)
 class MoveAttempt:
-    """A decision, and what it led to.
+    """An attempted move and its outcome.
 
     Attributes:
-        decision: In the names of the true objects; its move is not None.
-        outcome: How the move went.
-        next_perception: What a perfect detector sees afterwards.
+        decision: The policy's decision, with the names of the true objects. It has a move.
+        outcome: Outcome of the move.
+        next_perception: Result of a perfect detector after the move.
     """
 
     decision: Decision
@@ -35,18 +39,20 @@ class MoveAttempt:
 
     @property
     def move(self) -> Move:
-        """What was tried."""
+        """The attempted move."""
         assert self.decision.move is not None
         return self.decision.move
 
 
 @dataclass(frozen=True)
 class Transition(MoveAttempt):
-    """An attempt, and what it was worth.
+    """An attempted move with its reward.
 
     Attributes:
-        newly_found: Objects detected for the first time, in the scene's order.
-        reward: r_d per newly found object, plus the penalty if the scene collapsed.
+        newly_found: Names of the objects that were detected for the first time, in the order of
+            the scene.
+        reward: `detection_reward` per newly found object, plus `collapse_penalty` if the scene
+            collapsed.
     """
 
     newly_found: tuple[str, ...]
@@ -54,19 +60,20 @@ class Transition(MoveAttempt):
 
 
 class ExplorationTask:
-    """The record of an episode by the ground truth: what was found, its reward, and its end.
+    """Ground-truth record of an exploration episode.
 
-    An episode is over when every object has been in view, when the scene collapses (what that
-    uncovers does not count), or after a number of moves; a move that could not be carried out
-    counts as one.
+    An episode ends when every object has been in view, when the scene collapses, or after a maximum
+    number of moves. Objects that a collapse uncovers do not count as found. A move that could not
+    be carried out counts as a move.
 
     Attributes:
         initial_scene: The scene at the start.
-        scene: The scene now.
-        initial_perception: What a perfect detector sees at the start.
-        perception: What a perfect detector sees now.
+        scene: The current scene.
+        initial_perception: Result of a perfect detector at the start.
+        perception: Result of a perfect detector for the current scene.
         detected: Names of all objects that have been in view.
-        transitions: The attempts so far.
+        initially_hidden: Names of the objects that were hidden at the start.
+        transitions: The attempted moves so far.
     """
 
     def __init__(
@@ -76,10 +83,20 @@ class ExplorationTask:
         config: ExplorationConfig,
         max_moves: int,
     ) -> None:
-        """Start the record of an episode on a scene at rest."""
-        self._config, self._max_moves = config, max_moves
-        self.initial_scene = self.scene = scene
-        self.initial_perception = self.perception = initial_perception
+        """Start the record of an episode.
+
+        Args:
+            scene: The scene, at rest.
+            initial_perception: Result of a perfect detector for the scene.
+            config: Rewards.
+            max_moves: Maximum number of moves.
+        """
+        self._config = config
+        self._max_moves = max_moves
+        self.initial_scene = scene
+        self.scene = scene
+        self.initial_perception = initial_perception
+        self.perception = initial_perception
         self.detected: tuple[str, ...] = tuple(
             d.name for d in initial_perception.observation.detections
         )
@@ -88,7 +105,7 @@ class ExplorationTask:
 
     @property
     def termination(self) -> TerminationReason | None:
-        """Why the episode is over, or None while it goes on."""
+        """Why the episode has ended; None while it continues."""
         if self.transitions and self.transitions[-1].outcome.result is MoveResult.COLLAPSED:
             return TerminationReason.COLLAPSED
         if len(self.detected) == len(self.scene.objects):
@@ -97,26 +114,32 @@ class ExplorationTask:
 
     @property
     def found(self) -> tuple[str, ...]:
-        """The objects that were hidden at the start and are known now."""
+        """Names of the initially hidden objects that have been detected."""
         return tuple(name for name in self.initially_hidden if name in self.detected)
 
     def record(self, attempt: MoveAttempt) -> Transition:
-        """Take in an attempt.
+        """Record an attempted move, and return it with its reward.
 
         Raises:
-            ValueError: The scene has collapsed; after any other end an episode may go on.
+            ValueError: The scene has collapsed. After any other termination, an episode may
+                continue.
         """
         if self.termination is TerminationReason.COLLAPSED:
             raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
-        collapsed = attempt.outcome.result is MoveResult.COLLAPSED
-        self.scene, self.perception = attempt.outcome.scene, attempt.next_perception
-        seen = {d.name for d in self.perception.observation.detections}
-        newly = tuple(n for n in self.scene.names if n in seen and n not in self.detected)
-        if collapsed:
-            newly = ()
-        self.detected += newly
-        reward = self._config.detection_reward * len(newly)
-        reward += self._config.collapse_penalty if collapsed else 0.0
-        step = Transition(attempt.decision, attempt.outcome, attempt.next_perception, newly, reward)
-        self.transitions.append(step)
-        return step
+        has_collapsed = attempt.outcome.result is MoveResult.COLLAPSED
+        self.scene = attempt.outcome.scene
+        self.perception = attempt.next_perception
+        in_view = {d.name for d in self.perception.observation.detections}
+        newly_found = tuple(
+            name
+            for name in self.scene.names
+            if name in in_view and name not in self.detected and not has_collapsed
+        )
+        self.detected += newly_found
+        reward = self._config.detection_reward * len(newly_found)
+        reward += self._config.collapse_penalty if has_collapsed else 0.0
+        transition = Transition(
+            attempt.decision, attempt.outcome, attempt.next_perception, newly_found, reward
+        )
+        self.transitions.append(transition)
+        return transition

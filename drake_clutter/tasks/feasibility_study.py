@@ -1,6 +1,6 @@
-"""Kinematic feasibility: which moves an arm could carry out in which cell, and if not, why.
+"""Kinematic feasibility: which moves an arm can carry out in a work cell, and why not the others.
 
-Frames: T the tray, O an object, G the cup.
+Frames: T the support (tray), O an object, G the gripper.
 """
 
 import math
@@ -31,30 +31,49 @@ from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.tasks.belief import legal_moves
 
 PLANNED = "planned"
-"""The result of a move that has a plan; any other is a `PlanningFailureReason`'s value."""
+"""Result of a move with a plan; all other results are values of `PlanningFailureReason`."""
 POSE_ERRORS = (0.002, 0.005, 0.010, 0.020, 0.040)
-"""m, standard deviations of the error of a pose along x and along y; its yaw has half a degree for each mm."""
+"""Standard deviations of the errors of estimated positions along x and along y [m]."""
+YAW_ERROR_PER_METER = 500
+"""Standard deviation of the yaw error per standard deviation of the position error [deg/m].
+
+Half a degree per millimeter: both errors displace the ends of a 25 cm long object about equally.
+"""
 MAX_NOISY_MOVES = 6
-"""Planned moves per scene that are tried with wrong poses."""
+"""Maximum number of planned moves per scene that are planned again with pose errors."""
+CONTACT_TOLERANCE = 0.002
+"""Penetration beyond the pose error that is tolerated between objects in contact [m]."""
+BELOW_TOLERANCE = 0.004
+"""Largest overlap in height of an object that is below another one [m]."""
 
 
 @dataclass(frozen=True)
 class MoveRecord:
-    """One legal move in one scene with one arm: a row of `moves.csv`.
+    """One legal move in one scene with one arm; a row of `moves.csv`.
 
     Attributes:
-        setup: name of the arm's config.
-        scene: name of the scene file.
-        pick, place: names of what is picked, and on what it is put.
-        object_class: of the picked object. rest: which of its axes points up: flat, side, upright, or lying for a cylinder.
-        pick_x, pick_y: m, middle of its top in T. pick_top: m, height of it. below: objects that lie under it.
-        place_x, place_y, place_z: m, p_TO where it is let go; NaN if no place is free.
-        result: `planned`, or why not. about: what is in the way, or out of reach.
-        number: that stands behind the reason (m, kg, s), or NaN.
-        planning_s: s to find out. motion_s: s from home to home.
-        attempts: grasps and branches that were looked at.
-        clearance: m, the least of the way; infinite if nothing is within 3 cm. between: what is so close.
-        manipulability: m^3, the least at the grasp and at the place.
+        setup: Name of the work cell.
+        scene: Name of the scene file.
+        pick: Name of the picked object.
+        place: Name of the object on which it is placed, or the tray.
+        object_class: Class of the picked object.
+        resting_side: See `resting_side`.
+        pick_x: x of the center of the picked object's top in T [m].
+        pick_y: y of the center of the picked object's top in T [m].
+        pick_top: Height of the picked object's top above the support [m].
+        num_below: Number of objects below the picked one.
+        place_x: x of p_TO where the object is released [m]; NaN without a free placement.
+        place_y: y of p_TO where the object is released [m]; NaN without a free placement.
+        place_z: z of p_TO where the object is released [m]; NaN without a free placement.
+        result: `PLANNED`, or the value of a `PlanningFailureReason`.
+        detail: What is in the way or out of reach.
+        failure_value: Quantity that the failure refers to [m, kg or s]; NaN without one.
+        planning_s: Planning time [s].
+        motion_s: Duration of the motion from home to home [s].
+        num_attempts: Number of candidates (grasps and IK solutions) that were checked.
+        clearance: Smallest distance on the path [m]; infinite if all are above 3 cm.
+        nearest_pair: Names of the two bodies at that distance.
+        manipulability: Smaller manipulability of those at the grasp and at the release [m^3].
     """
 
     setup: str
@@ -62,35 +81,43 @@ class MoveRecord:
     pick: str
     place: str
     object_class: str
-    rest: str
+    resting_side: str
     pick_x: float
     pick_y: float
     pick_top: float
-    below: int
+    num_below: int
     place_x: float = math.nan
     place_y: float = math.nan
     place_z: float = math.nan
     result: str = PlanningFailureReason.NO_FREE_SPOT.value
-    about: str = ""
-    number: float = math.nan
+    detail: str = ""
+    failure_value: float = math.nan
     planning_s: float = 0.0
     motion_s: float = math.nan
-    attempts: int = 0
+    num_attempts: int = 0
     clearance: float = math.nan
-    between: str = ""
+    nearest_pair: str = ""
     manipulability: float = math.nan
 
 
 MOVE_RECORD_FIELDS = tuple(field.name for field in fields(MoveRecord))
+"""Columns of `moves.csv`."""
 
 
 @dataclass(frozen=True)
 class PoseErrorRecord:
-    """A planned move, planned again from wrong poses and checked against the right ones: a row of `noise.csv`.
+    """A move that was planned with pose errors and checked with true poses.
+
+    It is a row of `pose_errors.csv`.
 
     Attributes:
-        setup, scene, pick, place: as in `MoveRow`.
-        error: m, the standard deviation. result: `holds`, `no plan`, `no seal`, or what is hit.
+        setup: Name of the work cell.
+        scene: Name of the scene file.
+        pick: Name of the picked object.
+        place: Name of the object on which it is placed, or the tray.
+        error: Standard deviation of the position error [m]; one of `POSE_ERRORS`.
+        result: `holds` if the plan works with the true poses, otherwise `no plan`, `no seal` or
+            what the arm hits.
     """
 
     setup: str
@@ -102,176 +129,237 @@ class PoseErrorRecord:
 
 
 class FeasibilityStudy:
-    """Asks an arm about every legal move of scenes; the same answers for the same seed, but for the times."""
+    """Plans the legal moves of scenes with one arm.
 
-    def __init__(self, setup: str, world: ClutterConfig, planner: PlannerConfig, seed: int) -> None:
-        """Of one arm, called `setup`."""
-        self._setup, self._world, self._config, self._seed = setup, world, planner, seed
-        self._detector = LabelDetector(world.cell.camera)
-        self._planner: PickPlacePlanner | None = None
+    Equal seeds give equal results, except for the planning times.
+    """
 
-    def plan_all_moves(self, name: str, number: int, scene: Scene) -> list[MoveRecord]:
-        """Every legal move in a scene at rest.
+    def __init__(
+        self, setup: str, config: ClutterConfig, planner_config: PlannerConfig, seed: int
+    ) -> None:
+        """Create a study.
 
         Args:
-            name: of the scene.
-            number: of the scene: with the seed it decides where on the tray or on an object things are put.
-            scene: at rest.
+            setup: Name of the work cell in the records.
+            config: The simulated world with the work cell.
+            planner_config: Configuration of the planner.
+            seed: Seed of the placements and the pose errors.
+        """
+        self._setup = setup
+        self._config = config
+        self._planner_config = planner_config
+        self._seed = seed
+        self._detector = LabelDetector(config.cell.camera)
+        self._planner: PickPlacePlanner | None = None
+
+    def plan_all_moves(self, name: str, index: int, scene: Scene) -> list[MoveRecord]:
+        """Plan every legal move in a scene.
+
+        Args:
+            name: Name of the scene in the records.
+            index: Index of the scene, from which the placements are seeded.
+            scene: The scene, at rest.
         """
         observation = self._detector.perceive(scene).observation
-        return [
-            self._row(
-                name,
-                scene,
-                move,
-                resolve_placement(move, observation, self._world.exploration, self._rng(number, k)),
-            )
-            for k, move in enumerate(legal_moves(observation))
-        ]
+        records = []
+        for k, move in enumerate(legal_moves(observation)):
+            rng = self._rng(index, k)
+            command = resolve_placement(move, observation, self._config.exploration, rng)
+            records.append(self._plan_move(name, scene, move, command))
+        return records
 
     def _rng(self, *path: int) -> np.random.Generator:
         return item_rng(self._seed, *path)
 
     def planner(self, support: Support) -> PickPlacePlanner:
-        """For a tray; kept."""
+        """Return the planner for a support; that of the latest support is cached."""
         if self._planner is None or self._planner.cell.support != support:
-            self._planner = PickPlacePlanner(self._world.cell.with_support(support), self._config)
+            cell = self._config.cell.with_support(support)
+            self._planner = PickPlacePlanner(cell, self._planner_config)
         return self._planner
 
-    def _row(
+    def _plan_move(
         self,
         name: str,
         scene: Scene,
         move: Move,
         command: PickPlaceCommand | None,
     ) -> MoveRecord:
+        """Return the record of a move; `command` is None without a free placement."""
         picked = scene[move.pick]
         lower, upper = picked.bounds_T
         x, y = (lower[:2] + upper[:2]) / 2
-        row = MoveRecord(
-            self._setup,
-            name,
-            move.pick,
-            move.place,
-            picked.object_class.name,
-            resting_side(picked),
-            round(float(x), 6),
-            round(float(y), 6),
-            round(picked.top_height, 6),
-            len(objects_below(picked, scene.objects)),
+        record = MoveRecord(
+            setup=self._setup,
+            scene=name,
+            pick=move.pick,
+            place=move.place,
+            object_class=picked.object_class.name,
+            resting_side=resting_side(picked),
+            pick_x=round(float(x), 6),
+            pick_y=round(float(y), 6),
+            pick_top=round(picked.top_height, 6),
+            num_below=len(objects_below(picked, scene.objects)),
         )
         if command is None:
-            return replace(row, about=move.place)
+            return replace(record, detail=move.place)
         X_TO = command.X_TO_place
-        px, py, pz = (round(v, 6) for v in X_TO.translation)
-        row = replace(row, place_x=px, place_y=py, place_z=pz)
+        place_x, place_y, place_z = (round(v, 6) for v in X_TO.translation)
         planner = self.planner(scene.support)
-        found, robot = planner.plan(scene.objects, move.pick, X_TO), planner.tool.robot
-        row = replace(row, planning_s=round(found.planning_time, 4))
-        if isinstance(found, PlanningFailure):
-            return replace(row, result=found.reason.value, about=found.detail, number=found.value)
-        carry = found.segments[1].trajectory
-        ends = carry.vector_values([0.0, carry.end_time()]).T
+        plan = planner.plan(scene.objects, move.pick, X_TO)
+        record = replace(
+            record,
+            place_x=place_x,
+            place_y=place_y,
+            place_z=place_z,
+            planning_s=round(plan.planning_time, 4),
+        )
+        if isinstance(plan, PlanningFailure):
+            return replace(
+                record, result=plan.reason.value, detail=plan.detail, failure_value=plan.value
+            )
+        carry = plan.segments[1].trajectory
+        endpoints = carry.vector_values([0.0, carry.end_time()]).T
         nearest = min(
-            (phase.min_distance for phase in found.segments),
-            key=lambda clearance: clearance.distance,
+            (segment.min_distance for segment in plan.segments),
+            key=lambda signed_distance: signed_distance.distance,
         )
         return replace(
-            row,
+            record,
             result=PLANNED,
-            motion_s=round(found.duration, 4),
-            attempts=found.num_attempts,
+            motion_s=round(plan.duration, 4),
+            num_attempts=plan.num_attempts,
             clearance=round(nearest.distance, 6),
-            between=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
-            manipulability=float(robot.manipulability(ends).min()),
+            nearest_pair=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
+            manipulability=float(planner.tool.robot.manipulability(endpoints).min()),
         )
 
     def test_pose_errors(
-        self, name: str, number: int, scene: Scene, rows: Sequence[MoveRecord]
+        self, name: str, index: int, scene: Scene, records: Sequence[MoveRecord]
     ) -> list[PoseErrorRecord]:
-        """Some of the planned moves, planned from wrong poses: do the plans hold where the objects really are?"""
-        planned = [row for row in rows if row.result == PLANNED]
-        rng, planner, found = (
-            self._rng(number, 1_000_000),
-            self.planner(scene.support),
-            list[PoseErrorRecord](),
-        )
-        for k in sorted(rng.permutation(len(planned))[:MAX_NOISY_MOVES].tolist()):
-            row = planned[k]
-            for error in POSE_ERRORS:
-                believed = [_misjudged(o, error, rng) for o in scene.objects]
-                picked = next(o for o in believed if o.name == row.pick)
-                X_TO = Pose((row.place_x, row.place_y, row.place_z), picked.X_TO.quaternion)
-                plan = planner.plan(believed, row.pick, X_TO)
-                result = (
-                    "no plan"
-                    if isinstance(plan, PlanningFailure)
-                    else self._holds(plan, scene, planner, error)
-                )
-                found.append(PoseErrorRecord(self._setup, name, row.pick, row.place, error, result))
-        return found
+        """Plan some of the planned moves with pose errors, and check them with the true poses.
 
-    def _holds(
+        Args:
+            name: Name of the scene in the records.
+            index: Index of the scene, from which the errors are seeded.
+            scene: The scene, at rest.
+            records: Result of `plan_all_moves`.
+        """
+        planned = [record for record in records if record.result == PLANNED]
+        rng = self._rng(index, 1_000_000)
+        planner = self.planner(scene.support)
+        error_records = []
+        for k in sorted(rng.permutation(len(planned))[:MAX_NOISY_MOVES].tolist()):
+            record = planned[k]
+            for error in POSE_ERRORS:
+                estimated = [_with_pose_error(o, error, rng) for o in scene.objects]
+                picked = next(o for o in estimated if o.name == record.pick)
+                X_TO = Pose(
+                    (record.place_x, record.place_y, record.place_z), picked.X_TO.quaternion
+                )
+                plan = planner.plan(estimated, record.pick, X_TO)
+                result = "no plan"
+                if isinstance(plan, PickPlacePlan):
+                    result = self._check_plan(plan, scene, planner, error)
+                error_records.append(
+                    PoseErrorRecord(self._setup, name, record.pick, record.place, error, result)
+                )
+        return error_records
+
+    def _check_plan(
         self, plan: PickPlacePlan, scene: Scene, planner: PickPlacePlanner, error: float
     ) -> str:
-        """Whether a plan that was made for other poses works with the right ones; else what goes wrong."""
-        q = plan.segments[1].trajectory.value(0.0).ravel()
-        picked, gripper = scene[plan.pick], self._world.cell.gripper
-        X_TG = RigidTransform(planner.tool.pose(q))
+        """Return the result of a plan for estimated poses when it is executed with the true ones.
+
+        Args:
+            plan: The plan.
+            scene: The scene with the true poses.
+            planner: The planner.
+            error: Standard deviation of the position error [m].
+        """
+        q_pick = plan.segments[1].trajectory.value(0.0).ravel()
+        picked = scene[plan.pick]
+        gripper = self._config.cell.gripper
+        X_TG = RigidTransform(planner.tool.pose(q_pick))
         X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
         if not gripper.can_attach(picked.object_class, X_OG):
             return PlanningFailureReason.NO_SEAL.value
-        around = planner.collision_model(scene.objects)
-        touching = (*gripper.contact_links, plan.pick)
-        for phase in plan.segments:
-            around.set_object_poses(scene.objects)
-            if phase.name == "carry":
-                around.attach_object(plan.pick, X_OG)
+        collision_model = planner.collision_model(scene.objects)
+        contact_bodies = (*gripper.contact_links, plan.pick)
+        for segment in plan.segments:
+            collision_model.set_object_poses(scene.objects)
+            if segment.name == "carry":
+                collision_model.attach_object(plan.pick, X_OG)
             else:
-                around.set_object_pose(
-                    plan.pick, picked.X_TO if phase.name == "approach" else plan.X_TO_place
+                collision_model.set_object_pose(
+                    plan.pick, picked.X_TO if segment.name == "approach" else plan.X_TO_place
                 )
-            for at in sample_path(phase.trajectory):
-                for here in around.distances_below(at, 0.0):
-                    # The cup is pressed on; what the object leaves or comes to it may graze by as much as it is misjudged.
-                    grazed = plan.pick in here.pair and here.pair[0] in touching
-                    if not grazed or here.distance < -error - 0.002:
-                        return f"hits {here.pair[1]}"
+            for q in sample_path(segment.trajectory):
+                for contact in collision_model.distances_below(q, 0.0):
+                    # The gripper is pressed onto the picked object, and that may graze its
+                    # neighbors by as much as their poses are wrong.
+                    is_expected = plan.pick in contact.pair and contact.pair[0] in contact_bodies
+                    if not is_expected or contact.distance < -error - CONTACT_TOLERANCE:
+                        return f"hits {contact.pair[1]}"
         return "holds"
 
 
-def _misjudged(o: SceneObject, error: float, rng: np.random.Generator) -> SceneObject:
-    x, y = rng.normal(0.0, error, 2)
-    half = math.radians(rng.normal(0.0, 500 * error)) / 2
+def _with_pose_error(o: SceneObject, error: float, rng: np.random.Generator) -> SceneObject:
+    """Return an object with a random error of its pose.
+
+    Args:
+        o: The object.
+        error: Standard deviation of the errors along x and along y [m].
+        rng: Random generator.
+    """
+    dx, dy = rng.normal(0.0, error, 2)
+    half_yaw = math.radians(rng.normal(0.0, YAW_ERROR_PER_METER * error)) / 2
     w, i, j, k = o.X_TO.quaternion
-    c, s = math.cos(half), math.sin(half)
-    turned = (
+    c = math.cos(half_yaw)
+    s = math.sin(half_yaw)
+    # Quaternion product (c, 0, 0, s) * (w, i, j, k): a rotation about the vertical.
+    quaternion = (
         c * w - s * k,
         c * i - s * j,
         c * j + s * i,
         c * k + s * w,
-    )  # about the vertical, on the left
-    px, py, pz = o.X_TO.translation
-    return replace(o, X_TO=Pose((px + x, py + y, pz), turned))
+    )
+    x, y, z = o.X_TO.translation
+    return replace(o, X_TO=Pose((x + dx, y + dy, z), quaternion))
 
 
 def resting_side(o: SceneObject) -> str:
-    """Which of an object's axes points up."""
+    """Return how an object rests.
+
+    Returns:
+        For a cylinder `upright` or `lying`; otherwise `flat`, `side` or `upright`, if its shortest,
+        middle or longest axis points up.
+    """
     if o.object_class.shape is Shape.CYLINDER:
         return "upright" if abs(o.X_TO.rotation[2, 2]) > 0.5 else "lying"
-    up = int(np.argmax(np.abs(o.X_TO.rotation[2])))
-    return ("flat", "side", "upright")[int(np.argsort(np.argsort(o.object_class.size))[up])]
+    vertical_axis = int(np.argmax(np.abs(o.X_TO.rotation[2])))
+    size_rank = int(np.argsort(np.argsort(o.object_class.size))[vertical_axis])
+    return ("flat", "side", "upright")[size_rank]
 
 
 def objects_below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
-    """The names of the objects under one, seen from above."""
+    """Return the names of the objects below one whose bounding boxes overlap it, seen from above.
+
+    Args:
+        picked: The object.
+        objects: All objects of the scene.
+    """
     lower, upper = picked.bounds_T
-    found = []
+    names = []
     for other in objects:
         other_lower, other_upper = other.bounds_T
         overlap: NDArray[np.float64] = (
             np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
         )
-        if other is not picked and overlap.min() > 0 and other_upper[2] < lower[2] + 0.004:
-            found.append(other.name)
-    return found
+        if (
+            other is not picked
+            and overlap.min() > 0
+            and other_upper[2] < lower[2] + BELOW_TOLERANCE
+        ):
+            names.append(other.name)
+    return names

@@ -1,4 +1,8 @@
-"""Scene generation (SPEC section 3): derive a graph, rule by rule, whose scene is stable and hides objects."""
+"""Scene generation: derive, rule by rule, a graph whose scene is stable and hides objects.
+
+This is the Markov decision process of scene generation in Kumar et al. 2022, with rewards that are
+paid as soon as a stack is finished.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,23 +32,30 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
 
 MAX_BALANCED_STACK_FRACTION = 0.6
-"""Of a balanced scene's objects."""
+"""Largest fraction of a balanced scene's objects that may be in one stack."""
+_REMAINING_NODES_SCALE = 25
+"""Number of remaining nodes that is represented by 1: the size of the largest trained graphs."""
 
 GenerationObservation = dict[str, NDArray[Any]]
+"""Arrays of the observation of `ClutterGeneration` by name."""
 
 
 @config_class
 @renamed_fields(must_come_apart="require_disassembly", margin="contact_margin")
 class GenerationTaskConfig:
-    """What is asked of a generated scene.
+    """Requirements on generated scenes, and their rewards.
 
     Attributes:
-        nodes: exact size of the graphs.
-        hidden_reward: w_u, per hidden object of a stable scene.
-        balance_reward: for a stable scene of which no stack holds more than `MOST_IN_A_STACK` of the objects. Not in the paper.
-        instability_reward: w_s, for a scene that is unstable, or that cannot be laid out or judged.
-        require_disassembly: whether a stack that cannot be taken away from the top, object by object, counts as unstable.
-        contact_margin: m, by which the fast judge shrinks contacts; more than the offsets ask for, so that Drake agrees.
+        nodes: Number of nodes of each graph.
+        hidden_reward: Reward w_u per hidden object of a stable scene.
+        balance_reward: Reward of a stable scene without a stack of more than
+            `MAX_BALANCED_STACK_FRACTION` of the objects. It is not part of Kumar et al. 2022.
+        instability_reward: Reward w_s of a scene that is unstable, cannot be laid out, or whose
+            verdict is inconclusive.
+        require_disassembly: Whether a stack counts as unstable if it cannot be taken apart from the
+            top, object by object.
+        contact_margin: Distance by which the static stability judge shrinks contacts [m]. Above the
+            random offsets of poses, so that simulations in Drake agree with the judge.
     """
 
     nodes: Annotated[int, InRange(3, 1000)] = 25
@@ -56,7 +67,7 @@ class GenerationTaskConfig:
 
 
 class StackFailure(Enum):
-    """Why a stack ends the derivation."""
+    """Why a finished stack ends the derivation."""
 
     TOO_HIGH = "stack too high"
     UNSTABLE = "unstable"
@@ -66,10 +77,11 @@ class StackFailure(Enum):
 
 @dataclass(frozen=True)
 class GraphVocabulary:
-    """Numbers for the kinds of nodes and edges of a grammar; 0 is padding.
+    """Numbers of the kinds of nodes and edges of a grammar; 0 is padding.
 
     Attributes:
-        node_kinds, edge_kinds: the kinds, in the order of their numbers, from 1 on.
+        node_kinds: Kinds of nodes in the order of their numbers, from 1 on.
+        edge_kinds: Kinds of edges in the order of their numbers, from 1 on.
     """
 
     node_kinds: tuple[str, ...]
@@ -77,19 +89,35 @@ class GraphVocabulary:
 
     @staticmethod
     def from_grammar(grammar: SceneGrammar) -> "GraphVocabulary":
-        """That of a grammar."""
+        """Return the vocabulary of a grammar."""
         return GraphVocabulary(
             (TRAY, OBJECT_SLOT, OPEN_SLOT, END, DUMMY, *grammar.classes), (PRIMITIVE, *Orientation)
         )
 
 
 def max_edges(nodes: int) -> int:
-    """Of a graph of that size: a tree's, and one more for each pair, which takes three nodes below an `end`."""
+    """Return the maximum number of edges of a graph.
+
+    The graph is a tree, except that each pair of objects below a dummy node has one more edge.
+
+    Args:
+        nodes: Number of nodes.
+    """
     return nodes - 1 + max(0, nodes - 2) // 3
 
 
 class PartialScene:
-    """A derivation under way, and what is known of its finished stacks."""
+    """A derivation in progress, with the verdicts of its finished stacks.
+
+    Attributes:
+        graph: The graph.
+        rules: Names of the rules that were applied.
+        object_positions: Position of each object of a finished stack by its node, if the stack
+            stands at the center of the tray [m]. Shape (3,) each.
+        num_hidden: Number of objects that are hidden by their own stack.
+        failure: Why the latest finished stack ends the derivation; None if it does not.
+        action_mask: Which rules are feasible. Shape (number of rules,).
+    """
 
     def __init__(
         self,
@@ -98,155 +126,203 @@ class PartialScene:
         config: ClutterConfig,
         judge: StaticStabilityJudge,
     ) -> None:
-        """Starts from the tray; `judge` is asked about every stack."""
+        """Start a derivation from the tray.
+
+        Args:
+            grammar: The scene grammar.
+            task: Requirements and rewards.
+            config: The simulated world.
+            judge: Judges finished stacks and the finished scene.
+        """
         vocabulary = GraphVocabulary.from_grammar(grammar)
-        self._grammar, self._task, self._config, self._judge = grammar, task, config, judge
+        self._grammar = grammar
+        self._task = task
+        self._config = config
+        self._judge = judge
         self._budget = NodeBudget(task.nodes)
-        self._node_number = {kind: k for k, kind in enumerate(vocabulary.node_kinds, start=1)}
-        self._edge_number = {kind: k for k, kind in enumerate(vocabulary.edge_kinds, start=1)}
+        self._node_kind_ids = {kind: k for k, kind in enumerate(vocabulary.node_kinds, start=1)}
+        self._edge_kind_ids = {kind: k for k, kind in enumerate(vocabulary.edge_kinds, start=1)}
         self.graph = ClutterGraph()
         self.rules: list[str] = []
-        self.object_positions: dict[
-            int, NDArray[np.float64]
-        ] = {}  # of the objects of finished stacks, m, over the tray's centre
+        self.object_positions: dict[int, NDArray[np.float64]] = {}
         self.num_hidden = 0
         self.failure: StackFailure | None = None
         self._match_rules()
 
     def _match_rules(self) -> None:
+        """Find the matches of all rules, and which rules are feasible."""
         self._matches = self._grammar.find_matches(self.graph)
         self.action_mask = self._grammar.feasible_rules(self.graph, self._budget, self._matches)
 
     @property
     def finished(self) -> bool:
-        """Whether no rule is feasible any more."""
+        """Whether no rule is feasible."""
         return not self.action_mask.any()
 
-    def apply(self, rule: int) -> None:
-        """Applies a feasible rule to its first match, and judges the stack that it finishes, if it finishes one."""
-        match = self._matches[self._grammar.pattern_indices[rule]]
-        assert match is not None, f"rule {self._grammar.rules[rule].name} is not feasible"
-        self._grammar.rewrite_in_place(self.graph, self._grammar.rules[rule], match)
-        self.rules.append(self._grammar.rules[rule].name)
-        changed = match[self._grammar.rules[rule].left.rewritten]
-        if changed != ClutterGraph.TRAY_NODE and (bottom := self._finished_stack(changed)):
-            self._judge_stack(Stack(self.graph, self._grammar.classes, bottom, self._config.layout))
+    def apply(self, rule_index: int) -> None:
+        """Apply a feasible rule to its first match, and judge the stack that it finishes, if any.
+
+        Args:
+            rule_index: Index of the rule in the grammar.
+        """
+        rule = self._grammar.rules[rule_index]
+        match = self._matches[self._grammar.pattern_indices[rule_index]]
+        assert match is not None, f"rule {rule.name} is not feasible"
+        self._grammar.rewrite_in_place(self.graph, rule, match)
+        self.rules.append(rule.name)
+        changed_node = match[rule.left.rewritten]
+        if changed_node != ClutterGraph.TRAY_NODE:
+            bottom = self._finished_stack_bottom(changed_node)
+            if bottom:
+                self._judge_stack(
+                    Stack(self.graph, self._grammar.classes, bottom, self._config.layout)
+                )
         self._match_rules()
 
-    def _finished_stack(self, node: int) -> list[int]:
-        """What stands on the tray of the stack that a node belongs to, if all its attributes are terminal; else nothing."""
-        above, below = self.graph.nx._adj, self.graph.nx._pred
+    def _finished_stack_bottom(self, node: int) -> list[int]:
+        """Return the bottom nodes of the stack of a node, if all its attributes are terminal.
+
+        Returns:
+            The nodes that rest on the tray; empty if the stack is not finished.
+        """
+        # The adjacency dictionaries of networkx; its views are too slow for the inner loop.
+        successors = self.graph.nx._adj
+        predecessors = self.graph.nx._pred
         while True:
-            parent = next(iter(below[node]))
+            parent = next(iter(predecessors[node]))
             if parent == ClutterGraph.TRAY_NODE:
                 break
             node = parent
-        children = list(above[node])
-        dummies = [child for child in children if self.graph.kind(child) == DUMMY]
-        bottom = list(below[dummies[0]]) if dummies else [node]
-        level, edges = bottom, [self.graph.edge_kind(ClutterGraph.TRAY_NODE, bottom[0])]
+        dummies = [child for child in successors[node] if self.graph.kind(child) == DUMMY]
+        bottom = list(predecessors[dummies[0]]) if dummies else [node]
+        level = bottom
+        edge_kinds = [self.graph.edge_kind(ClutterGraph.TRAY_NODE, bottom[0])]
         while level:
-            for at in level:
-                if self.graph.kind(at) in NON_TERMINAL_KINDS:
+            for parent in level:
+                if self.graph.kind(parent) in NON_TERMINAL_KINDS:
                     return []
-                edges += [
-                    kind["kind"]
-                    for child, kind in above[at].items()
+                edge_kinds += [
+                    edge["kind"]
+                    for child, edge in successors[parent].items()
                     if self.graph.kind(child) != END
                 ]
-            level = list(dict.fromkeys(child for at in level for child in above[at]))
-        return [] if PRIMITIVE in edges else bottom
+            level = list(dict.fromkeys(child for parent in level for child in successors[parent]))
+        return [] if PRIMITIVE in edge_kinds else bottom
 
     def _judge_stack(self, stack: Stack) -> None:
+        """Record the positions, and the failure or the hidden objects of a finished stack."""
         self.object_positions |= dict(zip(stack.nodes, stack.p_T, strict=True))
         scene = Scene(tuple(stack.objects()), self._config.cell.support)
         if stack.upper[2] > self._config.layout.max_stack_height:
             self.failure = StackFailure.TOO_HIGH
-        elif isinstance(found := self._judge.find_instability(scene), InconclusiveVerdict):
+            return
+        instability = self._judge.find_instability(scene)
+        if isinstance(instability, InconclusiveVerdict):
             self.failure = StackFailure.INCONCLUSIVE
-        elif found is not None:
+        elif instability is not None:
             self.failure = StackFailure.UNSTABLE
         elif self._task.require_disassembly and not self._judge.is_disassemblable(scene):
             self.failure = StackFailure.NOT_DISASSEMBLABLE
         else:
-            shares = self._judge.ray_caster.visible_fractions(scene.objects).values()
-            self.num_hidden += sum(
-                share < self._config.cell.camera.visibility_threshold for share in shares
-            )
+            visible_fractions = self._judge.ray_caster.visible_fractions(scene.objects)
+            threshold = self._config.cell.camera.visibility_threshold
+            self.num_hidden += sum(v < threshold for v in visible_fractions.values())
 
-    def terminal_reward(self, hidden: int) -> float:
-        """Of the derived graph, if its scene is stable and hides that many objects."""
-        balanced = self.graph.largest_stack_fraction() <= MAX_BALANCED_STACK_FRACTION
-        return self._task.hidden_reward * hidden + self._task.balance_reward * balanced
+    def terminal_reward(self, num_hidden: int) -> float:
+        """Return the sum of rewards of a derivation with a stable scene.
+
+        Args:
+            num_hidden: Number of objects that the scene hides.
+        """
+        is_balanced = self.graph.largest_stack_fraction() <= MAX_BALANCED_STACK_FRACTION
+        return self._task.hidden_reward * num_hidden + self._task.balance_reward * is_balanced
 
     def lay_out_and_judge(self, rng: np.random.Generator) -> tuple[Scene, Verdict] | None:
-        """The finished scene with its stacks in places drawn at random, judged; None if it cannot stand on the tray."""
+        """Return the finished scene with its stacks at random places, and its verdict.
+
+        Returns:
+            The scene and its verdict; None if it cannot be laid out or is not stable.
+        """
         derivation = Derivation(self.graph, tuple(self.rules))
         scene = lay_out(derivation, self._grammar.classes, self._config, rng)
         if isinstance(scene, LayoutFailure):
             return None
         verdict = self._judge.judge(scene, rng)
-        return (
-            None
-            if isinstance(verdict, InconclusiveVerdict) or not verdict.stable
-            else (scene, verdict)
-        )
+        if isinstance(verdict, InconclusiveVerdict) or not verdict.stable:
+            return None
+        return scene, verdict
 
     def observe(self) -> GenerationObservation:
-        """The graph as arrays, see `ClutterGeneration`."""
-        nodes, edges = self._task.nodes, max_edges(self._task.nodes)
-        kind, flags = np.zeros(nodes, np.int8), np.zeros((nodes, 4), np.int8)
-        position = np.zeros((nodes, 3), np.float32)
+        """Return the observation of `ClutterGeneration`."""
+        num_nodes = self._task.nodes
+        num_edges = max_edges(num_nodes)
         count = len(self.graph)
-        kind[:count] = [self._node_number[k] for k in self.graph.kinds()]
+        node_kind = np.zeros(num_nodes, np.int8)
+        node_flags = np.zeros((num_nodes, 4), np.int8)
+        position = np.zeros((num_nodes, 3), np.float32)
+        node_kind[:count] = [self._node_kind_ids[kind] for kind in self.graph.kinds()]
         for node, p_TO in self.object_positions.items():
-            flags[node, 0], position[node] = 1, p_TO
+            node_flags[node, 0] = 1
+            position[node] = p_TO
         for column, (pattern, match) in enumerate(
             zip(self._grammar.patterns, self._matches, strict=True)
         ):
-            if match is not None and column > 0:  # the tray is the tray
-                flags[match[pattern.rewritten], column] = 1
-        ends, edge_kind = np.zeros((edges, 2), np.int16), np.zeros(edges, np.int8)
+            # The first pattern always rewrites the tray, which needs no flag.
+            if match is not None and column > 0:
+                node_flags[match[pattern.rewritten], column] = 1
+        edge_links = np.zeros((num_edges, 2), np.int16)
+        edge_kind = np.zeros(num_edges, np.int8)
         e = 0
         for parent, children in self.graph.nx._adj.items():
-            for child, data in children.items():
-                ends[e, 0], ends[e, 1], edge_kind[e] = (
-                    parent,
-                    child,
-                    self._edge_number[data["kind"]],
-                )
+            for child, edge in children.items():
+                edge_links[e] = parent, child
+                edge_kind[e] = self._edge_kind_ids[edge["kind"]]
                 e += 1
-        remaining = np.array([(self._task.nodes - count) / 25], np.float32)
+        remaining_nodes = (num_nodes - count) / _REMAINING_NODES_SCALE
         return {
-            "node_kind": kind,
-            "node_mask": (kind > 0).astype(np.int8),
-            "node_flags": flags,
+            "node_kind": node_kind,
+            "node_mask": (node_kind > 0).astype(np.int8),
+            "node_flags": node_flags,
             "position": position,
-            "edge_links": ends,
+            "edge_links": edge_links,
             "edge_kind": edge_kind,
             "edge_mask": (edge_kind > 0).astype(np.int8),
-            "remaining_nodes": remaining,
+            "remaining_nodes": np.array([remaining_nodes], np.float32),
         }
 
 
 class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
-    """Derive a graph whose scene is stable and hides objects.
+    """Environment `ClutterGeneration-v0`: derive a graph whose scene is stable and hides objects.
 
-    Observation, with N = nodes, E = `most_edges(N)`; rows beyond the graph are zeros:
-        node_kind: (N,) number of the kind in the `GraphVocabulary`; 0 is padding. node_mask: (N,) where there is a node.
-        node_flags: (N, 4) whether it belongs to a finished stack, which has been judged (`is_simulated`); then whether it is what
-            the next rule of structure, of insertion, of orientation would rewrite: a rule rewrites the first match of its
-            left-hand side, breadth first from the tray.
-        position: (N, 3) m, of an object of a finished stack, when that stands over the tray's centre.
-        edge: (E, 2) parent and child; edge_kind: (E,) number of the kind, 0 is padding. edge_mask: (E,).
-        remaining: (1,) nodes still to be added, in 25.
-    Action: a rule of the grammar. `info["action_mask"]` (rules,) says which are feasible; one that is not changes nothing.
-    Reward: w_u for each object that a stack hides, as soon as it is finished and stands by itself. A stack that does not
-        stand ends the episode: what was earned is taken back, and w_s paid. At the end the finished scene is laid out and judged,
-        and what it hides more or less than its stacks is made up for; `balance_reward` is paid for a balanced one. So the rewards
-        of an episode sum up to what a stable scene is worth, or to w_s. They are meant to be summed without discount.
-    The last `info` has the `scene` and its `verdict`, or the `fault`: a `StackFault`, or None if the whole
-    found no room on the tray or does not stand.
+    Observation space, a `Dict` with N = `nodes` and E = `max_edges(N)`; rows beyond the graph are
+    zeros:
+
+    - `node_kind` (N,): Number of the node's kind in the `GraphVocabulary`; 0 is padding.
+    - `node_mask` (N,): Whether there is a node.
+    - `node_flags` (N, 4): Whether the node belongs to a finished stack, which has been judged; then
+      whether it is rewritten by the next rule of structure, of insertion and of orientation. A rule
+      rewrites the first match of its left-hand side, breadth first from the tray.
+    - `position` (N, 3): Position of an object of a finished stack that stands at the center of the
+      tray [m].
+    - `edge_links` (E, 2): Parent and child.
+    - `edge_kind` (E,): Number of the edge's kind in the `GraphVocabulary`; 0 is padding.
+    - `edge_mask` (E,): Whether there is an edge.
+    - `remaining_nodes` (1,): Number of nodes that are still to be added, divided by 25.
+
+    Action space: `Discrete`, the rules of the grammar. `info["action_mask"]` (number of rules,)
+    marks the feasible ones; any other changes nothing.
+
+    Reward: `hidden_reward` for each object that a stack hides, when the stack is finished and
+    stable. An unstable stack ends the episode: the earlier rewards are taken back, and
+    `instability_reward` is paid. At the end, the finished scene is laid out and judged; the
+    difference between the objects that it hides and those that its stacks hide is made up for, and
+    `balance_reward` is paid for a balanced scene. The rewards of an episode, summed without
+    discount, are thus `PartialScene.terminal_reward` of a stable scene, otherwise
+    `instability_reward`.
+
+    Termination: no rule is feasible, or a stack has failed. The last `info` has the `scene` and its
+    `verdict`, or the `failure`: a `StackFailure`, or None if the finished scene could not be laid
+    out or was not stable.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
@@ -257,25 +333,27 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         task: GenerationTaskConfig | None = None,
         config: ClutterConfig | None = None,
     ) -> None:
-        """Makes an environment.
+        """Create an environment.
 
         Args:
-            classes: of the grammar; None: the seven YCB objects.
-            task: what is asked.
-            config: the world.
+            classes: Object classes of the grammar; None selects the seven YCB objects.
+            task: Requirements and rewards; None selects the defaults.
+            config: The simulated world; None selects the default.
         """
-        self.task, self._config = task or GenerationTaskConfig(), config or ClutterConfig()
+        self.task = task or GenerationTaskConfig()
+        self._config = config or ClutterConfig()
         self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
         self.vocabulary = GraphVocabulary.from_grammar(self.grammar)
         self._judge = StaticStabilityJudge(self._config, margin=self.task.contact_margin)
-        n, e = self.task.nodes, max_edges(self.task.nodes)
-        far = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
+        n = self.task.nodes
+        e = max_edges(n)
+        max_coordinate = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
         box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
             "node_kind": box(0, len(self.vocabulary.node_kinds), (n,), np.int8),
             "node_mask": box(0, 1, (n,), np.int8),
             "node_flags": box(0, 1, (n, 4), np.int8),
-            "position": box(-far, far, (n, 3), np.float32),
+            "position": box(-max_coordinate, max_coordinate, (n, 3), np.float32),
             "edge_links": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(self.vocabulary.edge_kinds), (e,), np.int8),
             "edge_mask": box(0, 1, (e,), np.int8),
@@ -287,33 +365,34 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[GenerationObservation, dict[str, Any]]:
-        """The start graph: the tray."""
+        """Start an episode from the tray."""
         super().reset(seed=seed)
         self.partial = PartialScene(self.grammar, self.task, self._config, self._judge)
-        return self.partial.observe(), {"action_mask": self.partial.action_mask.astype(np.int8)}
+        return self.partial.observe(), self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {"action_mask": self.partial.action_mask.astype(np.int8)}
 
     def step(
         self, action: int
     ) -> tuple[GenerationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Applies a rule."""
-        partial, earned = self.partial, self.task.hidden_reward * self.partial.num_hidden
+        """Apply a rule, given by its index."""
+        partial = self.partial
         if not partial.action_mask[action]:
-            return (
-                partial.observe(),
-                0.0,
-                partial.finished,
-                False,
-                {"action_mask": partial.action_mask.astype(np.int8)},
-            )
+            return partial.observe(), 0.0, partial.finished, False, self._info()
+        return_before = self.task.hidden_reward * partial.num_hidden
         partial.apply(int(action))
-        info: dict[str, Any] = {"action_mask": partial.action_mask.astype(np.int8)}
-        worth = self.task.hidden_reward * partial.num_hidden
-        over = partial.finished or partial.failure is not None
-        if over:
-            made = partial.lay_out_and_judge(self.np_random) if partial.failure is None else None
-            if made is None:
-                worth, info["failure"] = self.task.instability_reward, partial.failure
+        info = self._info()
+        return_after = self.task.hidden_reward * partial.num_hidden
+        terminated = partial.finished or partial.failure is not None
+        if terminated:
+            finished_scene = None
+            if partial.failure is None:
+                finished_scene = partial.lay_out_and_judge(self.np_random)
+            if finished_scene is None:
+                info["failure"] = partial.failure
+                return_after = self.task.instability_reward
             else:
-                info["scene"], info["verdict"] = made
-                worth = partial.terminal_reward(len(made[1].hidden))
-        return partial.observe(), worth - earned, over, False, info
+                info["scene"], info["verdict"] = finished_scene
+                return_after = partial.terminal_reward(len(info["verdict"].hidden))
+        return partial.observe(), return_after - return_before, terminated, False, info

@@ -1,6 +1,8 @@
-"""The full-knowledge search: how many moves someone needs who knows where everything is, but moves like an explorer.
+"""Oracle search: the shortest sequence of moves that reveals every object of a known scene.
 
-It is the ceiling for explorers, and tells whether a scene that hides objects can be searched at all (SPEC section 6).
+The search knows the true scene, but is restricted to the moves of an explorer: it picks objects in
+view. Its plans bound what exploration policies can achieve, and it decides whether a scene that
+hides objects is solvable.
 """
 
 from collections import Counter
@@ -22,13 +24,13 @@ from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 MAX_OBJECTS = 64
-"""Objects in a scene, see `RayCaster.cover`."""
+"""Maximum number of objects of a scene; `RayCaster.occluder_sets` stores sets as 64 bits."""
 MAX_PLAN_LENGTH = 30
-"""Moves; longer plans are not looked for."""
+"""Maximum number of moves of a plan."""
 
 
 class Solvability(Enum):
-    """What a search found."""
+    """Whether a scene's hidden objects can be revealed."""
 
     SOLVABLE = "solvable"
     UNSOLVABLE = "proved unsolvable"
@@ -37,14 +39,15 @@ class Solvability(Enum):
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search found, under the fast judge.
+    """Result of an oracle search, according to the static stability judge.
 
     Attributes:
-        solvability: solvable, proved unsolvable, or neither within the budget.
-        plan: moves that reveal everything without a collapse; empty unless solvable.
-        lower_bound: no plan has fewer moves.
-        unrevealable: what no sequence of moves can reveal, if that is the proof.
-        moves_evaluated: what the search cost.
+        solvability: Whether a plan exists, as far as it is known within the budget.
+        plan: Moves that reveal every object without a collapse; empty unless solvable.
+        lower_bound: Number of moves below which no plan exists.
+        unrevealable: Names of objects that no sequence of moves can reveal, if they prove that the
+            scene is unsolvable.
+        moves_evaluated: Number of moves that the search evaluated.
     """
 
     solvability: Solvability
@@ -55,57 +58,67 @@ class SearchResult:
 
     @property
     def is_optimal(self) -> bool:
-        """Whether the plan is proved to have the fewest moves."""
+        """Whether the plan is proved to be a shortest one."""
         return self.solvability is Solvability.SOLVABLE and len(self.plan) == self.lower_bound
 
 
 @dataclass(frozen=True)
 class _State:
-    """A scene on the way.
+    """A node of the search.
 
     Attributes:
-        scene: the objects.
-        observation: what is in view.
-        known: everything that has ever been in view.
-        rng: state of the generator that decides between equal places, so that a plan comes out the same when carried out.
-        at_least: moves that are still needed.
-        blockers: what may have to be moved to find what has never been in view.
+        scene: The scene.
+        observation: Observation of the scene.
+        known: Names of the objects that have been in view.
+        rng_state: State of the random generator that chooses among equally good placements. With
+            it, a plan has the same placements when it is executed.
+        lower_bound: Number of moves that are needed at least to reveal the remaining objects.
+        blockers: Names of the objects that may have to be moved to reveal the remaining objects.
     """
 
     scene: Scene
     observation: Observation
     known: frozenset[str]
-    rng: Mapping[str, Any]
-    at_least: int
+    rng_state: Mapping[str, Any]
+    lower_bound: int
     blockers: frozenset[str]
 
     @property
     def key(self) -> tuple[frozenset[str], tuple[tuple[float, ...], ...]]:
-        """Equal for states that differ by less than 1 mm."""
+        """Key that is equal for states whose positions differ by less than 1 mm."""
         return self.known, tuple(
             tuple(round(v, 3) for v in o.X_TO.translation) for o in self.scene.objects
         )
 
 
 class _OutOfBudgetError(Exception):
-    pass
+    """The search has evaluated as many moves as it may."""
 
 
 class OracleSearch:
-    """Searches for the fewest moves that reveal every object (iterative deepening A*, Korf 1985).
+    """Searches for a shortest plan by iterative-deepening A* (Korf 1985).
 
-    First a plan is sought that moves only what is in the way; then shorter ones, exhaustively, from the lower bound on. The
-    bound: a ray reaches a hidden object only when all that is before it, and all that stands on that, has been moved; so an
-    object needs as many moves as free enough of its rays. Objects that need no move in common add up.
+    First a plan is searched that only moves objects in the way of hidden ones. Then shorter plans
+    are searched exhaustively, from the lower bound on.
+
+    The lower bound: a ray from the camera reaches a hidden object only after all objects in front
+    of it, and all objects that rest on those, have been moved. Revealing an object thus needs the
+    number of moves that frees enough of its rays. The bounds of hidden objects that have no
+    blocking object in common are added.
     """
 
     def __init__(self, config: ClutterConfig, judge: StaticStabilityJudge | None = None) -> None:
-        """Makes a search; a judge that is shared remembers more stacks."""
+        """Create a search.
+
+        Args:
+            config: The simulated world.
+            judge: A judge whose cache of verdicts is shared; None creates one.
+        """
         self._judge = judge or StaticStabilityJudge(config)
-        self._rays = self._judge.ray_caster
+        self._ray_caster = self._judge.ray_caster
         self._executor = StaticExecutor(config, self._judge)
         self._config = config.exploration
-        self._hidden_below = config.cell.camera.visibility_threshold
+        self._visibility_threshold = config.cell.camera.visibility_threshold
 
     def solve(
         self,
@@ -118,205 +131,239 @@ class OracleSearch:
         rng: np.random.Generator | None = None,
         invalid_moves: Collection[Move] = (),
     ) -> SearchResult:
-        """The fewest moves for a scene at rest.
+        """Search for a plan.
 
         Args:
-            scene: as it settled.
-            seed: of the places that are equally good; an episode of the same seed puts the objects where the plan does.
-            budget: moves to try at most.
-            optimal: whether to look for a shorter plan when there is one.
-            known: what has been in view before.
-            rng: in place of the seed: as it will be when the plan is carried out. It is left as it is.
-            invalid_moves: moves that turned out impossible in this scene; no plan begins with one of them.
+            scene: The scene, at rest.
+            seed: Seed of the choice among equally good placements. An episode with the same seed
+                has the placements of the plan.
+            budget: Maximum number of moves that are evaluated.
+            optimal: Whether to continue the search for a shorter plan after one was found.
+            known: Names of the objects that have been in view before.
+            rng: Random generator that will choose the placements, used instead of the seed. Its
+                state is not changed.
+            invalid_moves: Moves that failed in this scene, with which no plan may start.
 
         Raises:
-            InputError: the scene has more objects than the search takes.
+            InputError: The scene has more than `MAX_OBJECTS` objects.
         """
         if len(scene.objects) > MAX_OBJECTS:
             raise InputError(
-                f"objects: {len(scene.objects)}; allowed are {MAX_OBJECTS} at most, for a full-knowledge search"
+                f"objects: {len(scene.objects)}; allowed are {MAX_OBJECTS} at most, "
+                "for an oracle search"
             )
-        self._failed = invalid_moves
-        self._left, self._doubts = budget, 0
-        start = self._state(scene, frozenset(known), (rng or item_rng(seed)).bit_generator.state)
-        fixed = self._judge.immovable_objects(scene)
-        never = self.find_unrevealable(
-            scene, start.known, fixed if isinstance(fixed, frozenset) else ()
-        )
-        if never:
-            return SearchResult(Solvability.UNSOLVABLE, (), start.at_least, never, 0)
-        plan, at_least, exhausted = None, start.at_least, False
+        self._invalid_first_moves = invalid_moves
+        self._remaining_budget = budget
+        self._num_inconclusive = 0
+        rng_state = (rng or item_rng(seed)).bit_generator.state
+        start = self._make_state(scene, frozenset(known), rng_state)
+        immovable = self._judge.immovable_objects(scene)
+        fixed = immovable if isinstance(immovable, frozenset) else ()
+        unrevealable = self.find_unrevealable(scene, start.known, fixed)
+        lower_bound = start.lower_bound
+        if unrevealable:
+            return SearchResult(Solvability.UNSOLVABLE, (), lower_bound, unrevealable, 0)
+
+        def result(solvability: Solvability, plan: list[Move]) -> SearchResult:
+            moves_evaluated = budget - self._remaining_budget
+            return SearchResult(solvability, tuple(plan), lower_bound, (), moves_evaluated)
+
+        plan: list[Move] | None = None
+        is_exhausted = False
         try:
-            self._left = budget // 2
-            plan = self._dive(start, MAX_PLAN_LENGTH, only_blockers=True)
+            self._remaining_budget = budget // 2
+            plan = self._depth_limited_search(start, MAX_PLAN_LENGTH, only_blockers=True)
         except _OutOfBudgetError:
             pass
-        self._left += budget - budget // 2
+        self._remaining_budget += budget - budget // 2
         if plan is not None and not optimal:
-            return SearchResult(
-                Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left
-            )
+            return result(Solvability.SOLVABLE, plan)
         try:
-            while not exhausted and at_least < (
+            while not is_exhausted and lower_bound < (
                 len(plan) if plan is not None else MAX_PLAN_LENGTH + 1
             ):
-                self._doubts = 0
-                shorter = self._dive(start, at_least, only_blockers=False)
+                self._num_inconclusive = 0
+                shorter = self._depth_limited_search(start, lower_bound, only_blockers=False)
                 if shorter is not None:
                     plan = shorter
                     break
-                if self._doubts:
-                    break  # what was not tried might have been shorter
-                exhausted = not self._cut and plan is None
-                at_least += not exhausted
+                if self._num_inconclusive:
+                    break  # A move with an inconclusive verdict might begin a shorter plan.
+                is_exhausted = not self._limit_reached and plan is None
+                lower_bound += not is_exhausted
         except _OutOfBudgetError:
             pass
         if plan is not None:
-            return SearchResult(
-                Solvability.SOLVABLE, tuple(plan), at_least, (), budget - self._left
-            )
-        return SearchResult(
-            Solvability.UNSOLVABLE if exhausted else Solvability.UNDECIDED,
-            (),
-            at_least,
-            (),
-            budget - self._left,
-        )
+            return result(Solvability.SOLVABLE, plan)
+        return result(Solvability.UNSOLVABLE if is_exhausted else Solvability.UNDECIDED, [])
 
-    def _state(self, scene: Scene, known: frozenset[str], rng: Mapping[str, Any]) -> _State:
-        observation, _ = self._rays.observe(scene)
+    def _make_state(
+        self, scene: Scene, known: frozenset[str], rng_state: Mapping[str, Any]
+    ) -> _State:
+        """Return the node of a scene, with its lower bound."""
+        observation, _ = self._ray_caster.observe(scene)
         known |= {detection.name for detection in observation.detections}
         hidden = [name for name in scene.names if name not in known]
-        at_least, moved_first = 0, nx.Graph()
+        lower_bound = 0
+        # Bipartite graph of hidden objects and objects that may have to be moved for them. Nodes
+        # have roles, as a hidden object may itself block another one.
+        blocking = nx.Graph()
         if hidden:
-            carried = self._carried(scene)
-            needed = {}
+            move_sets = self._moved_with(scene)
+            num_moves = {}
             for name in hidden:
-                needed[name], involved = self._needed(scene, name, carried)
-                # Tagged, as an object may be hidden itself and be before another.
-                moved_first.add_edges_from(
-                    (("hidden", name), ("moved", other)) for other in involved
-                )
-            for together in nx.connected_components(moved_first):
-                at_least += max(needed[name] for role, name in together if role == "hidden")
+                num_moves[name], blockers = self._moves_to_reveal(scene, name, move_sets)
+                blocking.add_edges_from((("hidden", name), ("moved", other)) for other in blockers)
+            for component in nx.connected_components(blocking):
+                lower_bound += max(num_moves[name] for role, name in component if role == "hidden")
         return _State(
             scene,
             observation,
             known,
-            rng,
-            at_least,
-            frozenset(n for role, n in moved_first if role == "moved"),
+            rng_state,
+            lower_bound,
+            frozenset(name for role, name in blocking if role == "moved"),
         )
 
-    def _carried(self, scene: Scene) -> dict[str, frozenset[str]]:
-        """What must be moved before each object can be, itself included: everything that stands on nothing else, by name."""
+    def _moved_with(self, scene: Scene) -> dict[str, frozenset[str]]:
+        """Return, for each object, the objects that must be moved before it is out of the way.
+
+        These are the object itself and all objects that have no other support.
+        """
         supports = self._judge.find_supports(scene)
         if isinstance(supports, InconclusiveVerdict):
             return {name: frozenset({name}) for name in scene.names}
-        found = {}
+        move_sets = {}
         for name in scene.names:
-            carried = {name}
-            while (
-                more := {other for other, below in supports.items() if below <= carried} - carried
-            ):
-                carried |= more
-            found[name] = frozenset(carried)
-        return found
+            moved = {name}
+            while more := {other for other, below in supports.items() if below <= moved} - moved:
+                moved |= more
+            move_sets[name] = frozenset(moved)
+        return move_sets
 
-    def _needed(
-        self, scene: Scene, name: str, carried: Mapping[str, frozenset[str]]
+    def _moves_to_reveal(
+        self, scene: Scene, name: str, move_sets: Mapping[str, frozenset[str]]
     ) -> tuple[int, frozenset[str]]:
-        """Moves without which a hidden object stays hidden, and what may have to be moved for it."""
-        rays: Counter[int] = Counter()
-        involved: frozenset[str] = frozenset()
-        for before, count in self._rays.occluder_sets(scene, name).items():
-            moved = frozenset[str]().union(*(carried[other] for other in before))
-            rays[len(moved)] += count
-            involved |= moved
-        seen, total = 0, rays.total()
-        for moves in sorted(rays):
-            seen += rays[moves]
-            if seen >= self._hidden_below * total:
-                return moves, involved
-        return 0, involved  # out of the frame, see `never_found`
+        """Return a lower bound on the moves that reveal an object, and the objects in its way.
+
+        Args:
+            scene: The scene.
+            name: A hidden object.
+            move_sets: See `_moved_with`.
+        """
+        num_rays: Counter[int] = Counter()  # by the number of moves that free them
+        blockers: frozenset[str] = frozenset()
+        for occluders, count in self._ray_caster.occluder_sets(scene, name).items():
+            moved = frozenset[str]().union(*(move_sets[other] for other in occluders))
+            num_rays[len(moved)] += count
+            blockers |= moved
+        num_free = 0
+        for moves in sorted(num_rays):
+            num_free += num_rays[moves]
+            if num_free >= self._visibility_threshold * num_rays.total():
+                return moves, blockers
+        return 0, blockers  # Outside the image, see `find_unrevealable`.
 
     def find_unrevealable(
         self, scene: Scene, known: Collection[str], fixed: Collection[str]
     ) -> tuple[str, ...]:
-        """What is out of the camera's frame, or stays hidden behind objects that can never be moved.
+        """Return the objects outside the image or hidden behind objects that cannot be moved.
 
         Args:
-            scene: at rest.
-            known: names of what has been in view.
-            fixed: names of what can never be moved.
+            scene: A scene at rest.
+            known: Names of the objects that have been in view.
+            fixed: Names of the objects that cannot be moved.
+
+        Returns:
+            Names of the objects.
         """
-        found = []
+        unrevealable = []
         for name in scene.names:
             if name in known:
                 continue
-            left = [o for o in scene.objects if o.name == name or o.name in fixed]
-            out_of_frame = not self._rays.occluder_sets(scene, name)
-            if out_of_frame or self._rays.visible_fractions(left)[name] < self._hidden_below:
-                found.append(name)
-        return tuple(found)
+            remaining = [o for o in scene.objects if o.name == name or o.name in fixed]
+            is_in_image = bool(self._ray_caster.occluder_sets(scene, name))
+            if (
+                not is_in_image
+                or self._ray_caster.visible_fractions(remaining)[name] < self._visibility_threshold
+            ):
+                unrevealable.append(name)
+        return tuple(unrevealable)
 
-    def _dive(self, start: _State, limit: int, *, only_blockers: bool) -> list[Move] | None:
-        """Moves that reveal everything, `limit` at most, or None; `_cut` then says whether the limit is to blame."""
-        self._cut = False
-        self._reached: dict[Any, int] = {}
-        return self._deeper(start, 0, limit, only_blockers)
+    def _depth_limited_search(
+        self, start: _State, limit: int, *, only_blockers: bool
+    ) -> list[Move] | None:
+        """Return a plan of at most `limit` moves, or None.
 
-    def _deeper(
+        Sets `_limit_reached` to whether a longer plan may exist.
+
+        Args:
+            start: State in which the plan starts.
+            limit: Maximum number of moves.
+            only_blockers: Whether to move only objects in the way of hidden ones.
+        """
+        self._limit_reached = False
+        self._visited_depths: dict[Any, int] = {}
+        return self._search_below(start, 0, limit, only_blockers)
+
+    def _search_below(
         self, state: _State, depth: int, limit: int, only_blockers: bool
     ) -> list[Move] | None:
-        if not state.at_least:
+        if not state.lower_bound:
             return []
-        if self._reached.get(state.key, limit + 1) <= depth:
+        if self._visited_depths.get(state.key, limit + 1) <= depth:
             return None
-        self._reached[state.key] = depth
-        # With no move to spare, only those help that uncover something.
-        tight = depth + state.at_least == limit
-        self._cut |= tight
-        for moves in self._moves(state, only_blockers or tight):
+        self._visited_depths[state.key] = depth
+        # Without a spare move, only moves of blockers can lead to a plan within the limit.
+        is_tight = depth + state.lower_bound == limit
+        self._limit_reached |= is_tight
+        for moves in self._move_batches(state, only_blockers or is_tight):
             children = []
             for move in moves:
-                if depth == 0 and move in self._failed:
+                if depth == 0 and move in self._invalid_first_moves:
                     continue
-                child = self._after(state, move)
-                if child is not None and depth + 1 + child.at_least <= limit:
+                child = self._apply(state, move)
+                if child is None:
+                    continue
+                if depth + 1 + child.lower_bound <= limit:
                     children.append((move, child))
-                self._cut |= child is not None and depth + 1 + child.at_least > limit
-            for move, child in sorted(children, key=lambda pair: pair[1].at_least):
-                rest = self._deeper(child, depth + 1, limit, only_blockers)
-                if rest is not None:
-                    return [move, *rest]
+                else:
+                    self._limit_reached = True
+            for move, child in sorted(children, key=lambda pair: pair[1].lower_bound):
+                plan = self._search_below(child, depth + 1, limit, only_blockers)
+                if plan is not None:
+                    return [move, *plan]
         return None
 
-    def _moves(self, state: _State, only_blockers: bool) -> Iterator[list[Move]]:
-        """Legal moves that lose no support, in batches, the most promising first."""
+    def _move_batches(self, state: _State, only_blockers: bool) -> Iterator[list[Move]]:
+        """Yield batches of legal moves that leave no object unsupported, most promising first."""
         in_view = [detection.name for detection in state.observation.detections]
-        losing = {name: self._judge.objects_losing_support(state.scene, name) for name in in_view}
-        self._doubts += sum(isinstance(lost, InconclusiveVerdict) for lost in losing.values())
-        free = [name for name, lost in losing.items() if lost == ()]
-        for useful in (True, False):
-            if useful or not only_blockers:
-                picks = [name for name in free if (name in state.blockers) == useful]
+        unsupported = {
+            name: self._judge.objects_losing_support(state.scene, name) for name in in_view
+        }
+        self._num_inconclusive += sum(
+            isinstance(names, InconclusiveVerdict) for names in unsupported.values()
+        )
+        movable = [name for name, names in unsupported.items() if names == ()]
+        for is_blocker in (True, False):
+            if is_blocker or not only_blockers:
+                picks = [name for name in movable if (name in state.blockers) == is_blocker]
                 yield [Move(pick, TRAY) for pick in picks]
                 for pick in picks:
                     yield [Move(pick, place) for place in in_view if place != pick]
 
-    def _after(self, state: _State, move: Move) -> _State | None:
-        """The state that a move leads to; None if it collapses or cannot be carried out."""
-        if self._left <= 0:
+    def _apply(self, state: _State, move: Move) -> _State | None:
+        """Return the state after a move; None if it collapses or cannot be carried out."""
+        if self._remaining_budget <= 0:
             raise _OutOfBudgetError
-        self._left -= 1
+        self._remaining_budget -= 1
         rng = np.random.default_rng()
-        rng.bit_generator.state = dict(state.rng)
+        rng.bit_generator.state = dict(state.rng_state)
         command = resolve_placement(move, state.observation, self._config, rng)
         if command is None:
             return None
         outcome = self._executor.execute(state.scene, command, rng)
-        self._doubts += outcome.result is MoveResult.INCONCLUSIVE
+        self._num_inconclusive += outcome.result is MoveResult.INCONCLUSIVE
         if outcome.result is not MoveResult.PLACED:
             return None
-        return self._state(outcome.scene, state.known, rng.bit_generator.state)
+        return self._make_state(outcome.scene, state.known, rng.bit_generator.state)
