@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from conftest import DEFAULT_CELL, resting, scene_of
+from test_floors import FLOORS
 
 from drake_clutter import ClutterConfig, run_episode
 from drake_clutter.agents.explorers import random_explorer
@@ -71,3 +72,10 @@ def test_planning_failures() -> None:
     lines = section("explanation/motion_planning.md", "## Failure reasons").splitlines()
     reasons = [line.split("|")[1].strip() for line in lines if line.startswith("| ")][1:]
     assert reasons == [reason.value for reason in PlanningFailureReason]
+
+
+def test_layers() -> None:
+    rows = section("explanation/architecture.md", "# Architecture").splitlines()
+    cells = [row.split("|")[1:3] for row in rows if re.match(r"\| \d", row)]
+    layers = {int(number): {*re.findall(r"`(\w+)`", names)} for number, names in cells}
+    assert layers == FLOORS

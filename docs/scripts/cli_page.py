@@ -19,7 +19,7 @@ def page() -> str:
     context = group.make_context(PROGRAM, [], resilient_parsing=True)
     commands = list(_commands(group, context, PROGRAM))
     overview = [
-        [f"[`{name}`](#{_anchor(name)})", _cell(command.help or "")]
+        [f"[`{name}`](#{_anchor(name)})", _cell((command.help or "").split("\n\n")[0])]
         for name, command, _ in commands
     ]
     return (

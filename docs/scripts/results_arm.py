@@ -14,6 +14,8 @@ RUNS = (
 """Results files of random moves, with trajectory optimizer and simulation time step."""
 GRASPS = {"JointHold": "weld (locked joint)", "HexapodHold": "compliant (hexapod)"}
 """Grasp constraints by their names in results files of version 0.1."""
+OUTCOMES = {"carried out": "executed"}
+"""Names of outcomes by those in results files of version 0.1."""
 PARTS = {
     "inverse kinematics of a pose, eight branches": "inverse kinematics of a pose, all branches",
     "forward kinematics of a pose": "forward kinematics",
@@ -76,7 +78,10 @@ def _moves() -> str:
                 f" / {1000 * run['place_error_m']['p99']:.1f}"
             ),
         ),
-        ("least clearance [mm]", lambda run: number(1000 * run["least_clearance_m"], 1)),
+        (
+            "smallest distance to obstacles [mm]",
+            lambda run: number(1000 * run["least_clearance_m"], 1),
+        ),
     ]
     body = [[name, *(cell(run) for _, run in runs)] for name, cell in lines]
     text += table(["", *(label for label, _ in runs)], body)
@@ -84,7 +89,10 @@ def _moves() -> str:
     text += "\n### Outcomes\n\nNumber of moves by outcome.\n\n"
     return text + table(
         ["outcome", *(label for label, _ in runs)],
-        [[reason, *(str(run["results"].get(reason, 0)) for _, run in runs)] for reason in reasons],
+        [
+            [OUTCOMES.get(reason, reason), *(str(run["results"].get(reason, 0)) for _, run in runs)]
+            for reason in reasons
+        ],
     )
 
 
