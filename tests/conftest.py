@@ -1,4 +1,7 @@
-"""Objects and scenes that the tests share; what is costly to make is made once for the whole run."""
+"""Objects and scenes that the tests share.
+
+Expensive fixtures are created once for the whole run.
+"""
 
 import gc
 import importlib.util
@@ -60,7 +63,10 @@ def resting(
     floor: float = 0.0,
     name: str = "",
 ) -> SceneObject:
-    """An object of a shipped class in a resting pose, centred over xy (m), its lowest point at height `floor` (m)."""
+    """Return an object of a shipped class in a resting pose.
+
+    Its bounding box is centered over xy [m], and its lowest point is at height `floor` [m].
+    """
     object_class = CLASSES[class_name]
     R_TO = resting_rotation(object_class, orientation)
     lowest = float((object_class.corners @ R_TO.T)[:, 2].min())
@@ -90,7 +96,10 @@ def scene_of(*objects: SceneObject, side: float = 0.70) -> Scene:
 
 
 def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "ycb7") -> Scene:
-    """What RG derives, laid out: a graph of `fewest` to `most` nodes, the seed's first for which there is room."""
+    """Return a laid-out scene of a graph derived by RG.
+
+    The graph has `fewest` to `most` nodes; graphs that do not fit on the support are skipped.
+    """
     generator = rng(seed)
     while True:
         budget = NodeBudget(int(generator.integers(fewest, most + 1)))
@@ -156,7 +165,10 @@ def pytest_runtest_makereport(
 
 @pytest.fixture(scope="module", autouse=True)
 def _collected_here() -> Iterator[None]:
-    """Renderers that a module's tests leave behind are collected in this thread: in another one they abort the process."""
+    """Collect a module's renderers in this thread.
+
+    Collected in another thread, they abort the process.
+    """
     yield
     gc.collect()
 
@@ -174,8 +186,8 @@ def judge(config: ClutterConfig) -> DrakeJudge:
 
 
 @pytest.fixture(scope="session")
-def fast(config: ClutterConfig) -> StaticStabilityJudge:
-    """One fast judge for all tests, for the same reason."""
+def static_judge(config: ClutterConfig) -> StaticStabilityJudge:
+    """One static judge for all tests, to share its caches."""
     return StaticStabilityJudge(config)
 
 

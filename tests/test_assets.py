@@ -1,4 +1,4 @@
-"""What is built from the catalog: that Drake reads it, its mass and inertia, its contact, its picture."""
+"""Built assets: Drake reads them; mass and inertia, contact properties, textures."""
 
 import base64
 import json
@@ -32,7 +32,7 @@ EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
 
 
 def plant_of(model: str, package: Path) -> tuple[MultibodyPlant, list[ProximityProperties]]:
-    """A plant of one model or station, read strictly, and the contact properties of all its collision geometries."""
+    """Return a plant of one model, parsed strictly, and all its collision geometries."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.002)
     parser = Parser(plant)
     parser.SetStrictParsing()
@@ -149,7 +149,7 @@ def test_the_committed_assets_are_what_the_code_builds(tmp_path: Path) -> None:
 
 
 def test_labels_differ() -> None:
-    """By the mean colour of what lies uppermost when a package lies down; sRGB, 0 to 255."""
+    """By the mean color of what lies uppermost when a package lies down; sRGB, 0 to 255."""
     means = {}
     for name, entry in CLASSES.items():
         texture = draw_texture(entry)
@@ -184,7 +184,7 @@ def built_example(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_example_is_in_pieces_that_cover_it(built_example: Path) -> None:
+def test_convex_pieces_cover_the_example(built_example: Path) -> None:
     mug = load_catalog(built_example).classes["mug"]
     assert 5 <= len(mug.convex_pieces) <= 40
     assert np.ptp(mug.corners, axis=0) == pytest.approx(mug.size, rel=1e-3)
@@ -217,7 +217,7 @@ def test_example_loads_in_drake(built_example: Path) -> None:
 def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) -> None:
     user_class(tmp_path, "{shape: mesh, mesh: block.stl, mass_g: 120}")
     block = trimesh.creation.box((0.05, 0.06, 0.07))
-    block.apply_translation((1, 2, 3))  # the frame moves to its centre
+    block.apply_translation((1, 2, 3))  # the frame moves to its center
     block.export(tmp_path / "block.stl")
     build_assets(tmp_path)
     (corners,) = load_catalog(tmp_path).classes["block"].convex_pieces
@@ -254,7 +254,7 @@ def test_bad_label(tmp_path: Path, label: str, complaint: str) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["catalog.yaml"]
 
 
-def test_builds_only_what_is_asked_and_known(tmp_path: Path) -> None:
+def test_builds_only_the_named_classes(tmp_path: Path) -> None:
     box = "{shape: box, size_mm: [20, 30, 40], mass_g: 50, source: 'ends in -->'}"
     (tmp_path / "catalog.yaml").write_text(f"classes:\n  one: {box}\n  two: {box}\n")
     assert build_assets(tmp_path, ["two"]) == [tmp_path / "two"]

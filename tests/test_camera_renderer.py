@@ -1,4 +1,4 @@
-"""What the camera renders, and the visible share, against what geometry says; nothing depends on earlier renderings."""
+"""Rendered images and visible fractions against geometry, and independence of history."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,17 @@ CROWDED = scene_of(
         for y in (-0.2, 0.0, 0.2)
     ),
     resting("cracker_box", xy=(0.1, 0.1), floor=0.028, name="cover"),
-    # Not at a round place: where an edge meets the floor right in the middle of pixels, either may win.
+    # The position is not round: where an edge meets the floor at the centers of pixels, the result
+    # is ambiguous.
     resting("cracker_box", UPRIGHT, (-0.3013, 0.1007), name="wall"),
 )
 
 
 def same(one: RenderedImages, other: RenderedImages) -> bool:
-    """Equal labels; colour and depth equal bit for bit on the objects (along the tray's seams a pixel may go either way)."""
+    """Assert equal labels, and bitwise equal color and depth on the objects.
+
+    At the seams of the tray, a pixel may differ.
+    """
     seen = one.label >= 0
     return bool(
         np.array_equal(one.label, other.label)
@@ -59,7 +63,7 @@ def test_hidden_is_below_the_threshold_in_order() -> None:
 
 
 def test_half_covered(camera: CameraRenderer) -> None:
-    """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
+    """The upper box ends below the camera's axis, so it hides exactly what lies to its right."""
     shares = camera.visible_fractions(
         scene_of(BELOW, resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"))
     )
@@ -75,7 +79,7 @@ def test_half_covered(camera: CameraRenderer) -> None:
         ("gelatin_box", 0.085, 0.073, 0.028),
     ],
 )
-def test_a_smaller_box_in_the_middle_hides_what_its_top_covers(
+def test_a_smaller_box_in_the_center_hides_what_its_top_covers(
     name: str, length: float, width: float, height: float, camera: CameraRenderer
 ) -> None:
     """Both rectangles as the pinhole sees them: scaled by 1 / distance."""
@@ -84,11 +88,11 @@ def test_a_smaller_box_in_the_middle_hides_what_its_top_covers(
     assert shares == {"below": pytest.approx(1 - covered, abs=0.02), "above": 1.0}
 
 
-def test_what_nothing_covers_is_seen_in_full(camera: CameraRenderer) -> None:
+def test_unoccluded_objects_are_fully_visible(camera: CameraRenderer) -> None:
     assert set(camera.visible_fractions(SCATTERED).values()) == {1.0}
 
 
-def test_shares_are_those_of_each_object_rendered_alone(camera: CameraRenderer) -> None:
+def test_fractions_refer_to_each_object_rendered_alone(camera: CameraRenderer) -> None:
     """Objects that are far apart in the image share a rendering: it must not show."""
     label = camera.render_label(CROWDED)
     expected = {}
@@ -115,7 +119,7 @@ def test_an_object_out_of_the_frame_is_not_hidden(camera: CameraRenderer) -> Non
         ([resting("cracker_box", UPRIGHT)], 0.230),
     ],
 )
-def test_depth_in_the_middle_is_the_distance_to_the_top(
+def test_depth_in_the_center_is_the_distance_to_the_top(
     objects: list[SceneObject], top: float, camera: CameraRenderer
 ) -> None:
     corner = resting("large_marker", xy=(0.3, 0.3), name="marker")
@@ -173,7 +177,10 @@ def test_project_is_not_shifted(camera: CameraRenderer) -> None:
 
 
 def test_project_by_hand(camera: CameraRenderer) -> None:
-    """x to the right, y up in the image; a point at half the altitude is twice as far from the middle, half a pixel off."""
+    """In the image, x points to the right and y up.
+
+    A point at half the altitude is twice as far from the center, shifted by half a pixel.
+    """
     f = camera.camera.focal_length
     points = camera.camera.project(
         np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.0, 0.16, 0.0], [0.16, 0.16, 0.8]])
@@ -185,7 +192,7 @@ def test_project_by_hand(camera: CameraRenderer) -> None:
 
 
 def test_images_do_not_depend_on_what_was_rendered_before(config_camera: Camera) -> None:
-    """Scene A, then one that needs a larger pool, then A again; a camera that has seen only A; one that began with the other."""
+    """Images do not depend on earlier scenes or on the size of the pool of bodies."""
     camera = CameraRenderer(config_camera)
     first = camera.render(SCATTERED)
     crowded = camera.render(CROWDED)
@@ -211,7 +218,7 @@ def test_the_order_of_objects_changes_labels_alone(camera: CameraRenderer) -> No
 
 
 def test_another_tray_is_drawn(camera: CameraRenderer) -> None:
-    """The floor ends at the rim, 25 mm high: the depth along a row through the tray tells its side."""
+    """The depth along a row shows the side of the tray, whose rim is 25 mm high."""
     for side in (0.50, 0.70):
         depth = camera.render(scene_of(resting("large_marker", name="m"), side=side)).depth[200]
         floor = np.flatnonzero(np.abs(depth - 1.60) < 0.001)
@@ -220,7 +227,7 @@ def test_another_tray_is_drawn(camera: CameraRenderer) -> None:
 
 
 def test_a_picture_from_elsewhere(camera: CameraRenderer) -> None:
-    """From the overhead camera's own place the pictures are its own; from lower down everything is nearer."""
+    """From the camera's own pose the images are equal; from lower down, depths are smaller."""
     down = (0.0, 1.0, 0.0, 0.0)  # half a turn about x
     assert same(camera.render(SCATTERED, Pose((0.0, 0.0, 1.60), down)), camera.render(SCATTERED))
     near = camera.render(SCATTERED, Pose((0.0, 0.0, 1.00), down))

@@ -1,4 +1,4 @@
-"""The canonical form of graphs: alike for what looks alike; and the orientations that it goes by."""
+"""The canonical form of graphs and the symmetries of orientations."""
 
 from collections import Counter
 
@@ -60,7 +60,7 @@ def test_a_boxs_ten_orientations_differ(class_name: str) -> None:
     assert len(forms) == 10
 
 
-def test_canonical_form_tells_structures_apart() -> None:
+def test_canonical_form_distinguishes_structures() -> None:
     two, pair = "insert_gelatin_box", "insert_meta_gelatin_box_1"
     one_flat = single("gelatin_box", "flat_0")
     forms = [

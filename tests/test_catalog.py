@@ -28,7 +28,8 @@ def test_shipped_sets() -> None:
     ycb7, pantry14 = catalog.object_set("ycb7"), catalog.object_set("pantry14")
     assert pantry14[:7] == ycb7
     assert {entry.name for entry in pantry14} == set(catalog.classes)
-    # 3 structure rules, a single per class, a rule per pair, 10 orientations: the paper's 30 and 49.
+    # 3 structural rules, one insertion for each class and pair, 10 orientations: 30 and 49, as in
+    # the paper.
     assert [
         13 + sum(1 + len(entry.pairs) for entry in entries) for entries in (ycb7, pantry14)
     ] == [30, 49]
@@ -119,8 +120,8 @@ def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
         ),
         (f"brick: {{{BOX}, pairs: [lying, lying]}}", r"classes\.brick\.pairs: .*once"),
         (
-            f"brick: {{{BOX}, colour: red}}",
-            r"classes\.brick\.colour: is unknown; allowed are shape, size_mm",
+            f"brick: {{{BOX}, color: red}}",
+            r"classes\.brick\.color: is unknown; allowed are shape, size_mm",
         ),
         (f"Brick: {{{BOX}}}", r"classes\.Brick: 'Brick'; allowed is a name of lower-case letters"),
         (f"tray: {{{BOX}}}", r"classes\.tray: 'tray'; allowed is a name of .* none of .*tray"),
@@ -207,10 +208,11 @@ def test_mesh_without_assets(tmp_path: Path) -> None:
 
 
 def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
-    """A mass that the catalog changes is refused until the model is built anew; then it is simulated."""
+    """A changed mass is refused until the model is built again; then it is simulated."""
 
     def block(mass_g: int) -> ObjectClass:
-        text = f"classes:\n  block: {{shape: box, size_mm: [50, 60, 70], mass_g: {mass_g}, source: made up}}\n"
+        block = f"{{shape: box, size_mm: [50, 60, 70], mass_g: {mass_g}, source: made up}}"
+        text = f"classes:\n  block: {block}\n"
         load_catalog.cache_clear()  # a process reads a folder once
         read_sdf_text.cache_clear()
         return load_catalog(user_catalog(tmp_path, text)).classes["block"]

@@ -43,7 +43,10 @@ def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
 
 
 def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
-    text = "camera: {altitude: 2, width: 320, hidden_below: 0.2}\nlayout: {tray_side: 0.5, stack_gap: 0.02}\n"
+    text = (
+        "camera: {altitude: 2, width: 320, hidden_below: 0.2}\n"
+        "layout: {tray_side: 0.5, stack_gap: 0.02}\n"
+    )
     config = load_config(config_file(tmp_path, text))
     camera = Camera.overhead(2.0, width=320, visibility_threshold=0.2)
     cell = DEFAULT_CELL.model_copy(update={"support": tray(0.5), "cameras": {"overhead": camera}})
@@ -53,7 +56,10 @@ def test_a_file_of_version_0_1_names_parts_of_the_cell(tmp_path: Path) -> None:
 
 
 def test_fields_under_their_earlier_names(tmp_path: Path) -> None:
-    text = "{rest_drift: 0.1, calm_speed: 0.2, calm_displacement: 0.3, calm_tilt_deg: 0.4, calm_samples: 5}"
+    text = (
+        "{rest_drift: 0.1, calm_speed: 0.2, calm_displacement: 0.3, calm_tilt_deg: 0.4, "
+        "calm_samples: 5}"
+    )
     path = config_file(tmp_path, f"settle: {text}\nlayout: {{placement_tries: 7}}\n")
     config = load_config(path, ["settle.still_displacement=0.6"])
     assert config.settle == SettleConfig(
@@ -101,7 +107,8 @@ def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> Non
 
 def test_two_cameras_are_read_back(tmp_path: Path) -> None:
     config = world_with(
-        "cell.cameras={side: {pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}}, top: {pose: {}}}"
+        "cell.cameras={side: {pose: {translation: [0, -1, 1], rpy_deg: [-135, 0, 0]}}, "
+        "top: {pose: {}}}"
     )
     assert list(config.cell.cameras) == ["side", "top"]
     assert load_config(config_file(tmp_path, config_yaml(config))) == config
@@ -164,7 +171,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 
 def test_the_focal_length_is_that_of_the_field_of_view() -> None:
-    """At 45 degrees half the height of the image lies one focal length times tan(22.5 deg) from its middle."""
+    """At 45 degrees, half the image height is one focal length times tan(22.5 deg)."""
     assert Camera.overhead(1.6, height=480, fov_y_deg=90.0).focal_length == pytest.approx(240.0)
     assert Camera.overhead(1.6, height=480, fov_y_deg=45.0).focal_length == pytest.approx(
         240.0 * (1 + 2**0.5)

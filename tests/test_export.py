@@ -44,7 +44,7 @@ BULLET = 1e-5
 
 @pytest.fixture(scope="module")
 def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
-    """The example's mesh class, with its origin away from its centre of mass."""
+    """The example's mesh class, with its origin away from its center of mass."""
     folder = tmp_path_factory.mktemp("user") / "custom_class"
     folder.mkdir()
     for name in ("catalog.yaml", "mug.stl"):
@@ -55,7 +55,7 @@ def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
 
 @pytest.fixture(scope="module")
 def scene(mug: ObjectClass) -> Scene:
-    """A box that lies on a can (its pitch is a right angle), a can of the same class, a lying marker, a turned mug."""
+    """Return a box on a can (its pitch is a right angle), another can, a marker and a mug."""
     can = resting("tomato_soup_can", Orientation.UPRIGHT_0, (0.1, 0.1))
     box = resting("sugar_box", xy=(0.1, 0.1), floor=can.top_height)
     tilted = Pose.from_rotation(

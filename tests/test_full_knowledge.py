@@ -211,7 +211,7 @@ def test_no_more_moves_than_the_budget_are_tried() -> None:
 
 
 def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
-    """Because of a box that leans 3 mm beside it, the fast judge cannot tell whether the cover can go; Drake can."""
+    """Because of a box that leans 3 mm beside it, the static judge cannot tell whether the cover can go; Drake can."""
     R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix()
     leaning = SceneObject(
         "leaning", CLASSES["gelatin_box"], Pose.from_rotation(R_TO, (0.1335, 0.0, 0.0372))
@@ -226,7 +226,7 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
         pytest.fail("one move does not find everything", pytrace=False)
     solution = SEARCH.solve(scene)
     if (solution.solvability, solution.moves_evaluated) != (Solvability.UNDECIDED, 0):
-        pytest.fail("the fast judge could tell", pytrace=False)
+        pytest.fail("the static judge could tell", pytrace=False)
     assert solution.lower_bound <= 1
 
 

@@ -1,4 +1,4 @@
-"""Penetration against cases computed by hand, against Drake, and against points; groups of objects that may touch."""
+"""Penetration depth against closed forms, Drake and sampled points; touching groups."""
 
 import math
 
@@ -59,7 +59,7 @@ def test_a_box_inside_another_is_as_deep_as_its_way_out() -> None:
 
 @pytest.mark.parametrize("depth", [0.002, 0.0005, -0.0005])
 def test_edge_on_edge(depth: float) -> None:
-    """Two boxes on their edges, crossed: the lower one's edge along x, the upper one's along y, the middles over each other."""
+    """Two crossed boxes on their edges: the edges are along x and y, the centers aligned."""
     half = math.sqrt(0.5) / 2
     lower = turned(
         "cracker_box", "x", 45, (0, 0, 0)
@@ -73,7 +73,10 @@ def test_edge_on_edge(depth: float) -> None:
 
 @pytest.mark.parametrize("gap", [0.001, -0.001])
 def test_a_gap_that_the_axis_aligned_boxes_do_not_see(gap: float) -> None:
-    """Two boxes turned by 45 degrees, face to face: their axis-aligned boxes overlap far, they are 1 mm apart."""
+    """Two boxes rotated by 45 degrees, face to face, 1 mm apart.
+
+    Their axis-aligned bounding boxes overlap.
+    """
     away = (0.060 + gap) * math.sqrt(0.5)
     first, second = (
         turned("cracker_box", "z", 45, (0, 0, 0)),
@@ -85,7 +88,7 @@ def test_a_gap_that_the_axis_aligned_boxes_do_not_see(gap: float) -> None:
 
 @pytest.mark.parametrize("depth", [0.003, 0.0, -0.002])
 def test_a_corner_against_a_face(depth: float) -> None:
-    """A box turned by 45 degrees about z points a corner, half its diagonal away, at another's face."""
+    """A box rotated by 45 degrees about z points a corner at the other's face."""
     reach = (0.038 + 0.089) / 2 * math.sqrt(0.5)
     first = turned("cracker_box", "z", 0, (0, 0, 0))
     second = turned("sugar_box", "z", 45, (0.030 + reach - depth, 0, 0))
@@ -170,7 +173,8 @@ def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
         assert bool(reported) == (depth > 0)
         if reported:
             overlapping += 1
-            # Drake's box-box query takes an edge-edge axis only if it is 5 % better than the best face: never less deep.
+            # Drake's box-box query prefers faces: it takes an edge-edge axis only if that is 5 %
+            # better.
             assert depth - 1e-9 <= reported[0] <= 1.05 * depth + 1e-9
         else:
             apart += 1
@@ -196,7 +200,10 @@ def test_moving_a_cylinder_out_by_the_depth_parts_it(names: tuple[str, str]) -> 
 
 
 def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
-    """Whether moving b by the distance (m) parts the two in one of 150 directions, nowhere more than 0.2 rad from the next."""
+    """Return whether a translation by the distance [m] separates the objects.
+
+    It tries 150 directions, which are at most 0.2 rad apart.
+    """
     index = np.arange(150)
     height, angle = 1 - (2 * index + 1) / 150, index * math.pi * (3 - math.sqrt(5))
     ring = np.sqrt(1 - height**2)
@@ -247,7 +254,7 @@ def names_of(groups: list[list[SceneObject]]) -> list[list[str]]:
 
 
 def test_touching_groups() -> None:
-    """A chain through neighbours within the margin is one group; order is the scene's."""
+    """A chain through neighbors within the margin is one group; order is the scene's."""
     chain = [
         resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=name)
         for name, x in (("a", 0.0), ("c", 0.1825), ("b", 0.091))

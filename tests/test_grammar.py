@@ -30,7 +30,7 @@ Edges = list[tuple[int, int, Orientation | str]]
 YCB = GRAMMARS["ycb7"]
 STRUCTURE = ("drop_object", "stack_object", "end")
 ORIENT = tuple(f"orient_{orientation.name.lower()}" for orientation in Orientation)
-# A stack of two, and a stack of a pair with one on top: the paper's example in the terms of its rule sheet.
+# A stack of two objects, and a stack of a pair with one object on top: the example of the paper.
 EXAMPLE = (
     *(
         "drop_object",
@@ -103,7 +103,10 @@ def test_the_rules_are_those_of_the_sheet(objects: str, count: int, metas: dict[
 
 
 def edges_by_kind(rule: ProductionRule) -> Counter[tuple[str, str, Orientation | str]]:
-    """The edges of G_R as (parent's kind, child's kind, edge's kind); a node that keeps its kind is given by its name."""
+    """Return the edges of G_R as (parent's kind, child's kind, edge's kind).
+
+    A node that keeps its kind is given by its name.
+    """
     kinds = {name: name if kind == KEEP else kind for name, kind in rule.right_nodes.items()}
     return Counter(
         (kinds[parent], kinds[child], kind) for (parent, child), kind in rule.right_edges.items()
@@ -227,7 +230,7 @@ def test_an_insertion_waits_for_a_closed_top_and_a_terminal_parent() -> None:
 
 
 def test_the_first_match_is_breadth_first_with_siblings_in_order() -> None:
-    """Of a slot at depth two of the first stack and one at depth one of the second, the second stack's comes first."""
+    """A slot at depth one of the second stack is matched before one at depth two of the first."""
     begun = ("drop_object", "stack_object", "end", "insert_sugar_box", "drop_object", "end")
     graph = YCB.replay([*begun, "insert_cracker_box"])
     assert [graph.kind(child) for child in graph.children(0)] == ["sugar_box", "cracker_box"]
@@ -273,7 +276,10 @@ def seeded_uniform(seed: int) -> Choose:
 
 
 def preferring(*prefixes: str) -> Callable[[int], Choose]:
-    """Uniform among the feasible rules of the first kind that has any; rules of no kind named come last."""
+    """Choose uniformly among the feasible rules of the first kind that has any.
+
+    Rules of kinds that are not named come last.
+    """
 
     def make(seed: int) -> Choose:
         generator = rng(seed)
@@ -345,7 +351,7 @@ def test_both_object_sets_use_every_rule() -> None:
 
 
 def matches_by_networkx(graph: ClutterGraph, rule: ProductionRule) -> bool:
-    """Whether G_L is monomorphic to a subgraph, by a library that shares nothing with the grammar's matching."""
+    """Return whether G_L is monomorphic to a subgraph, by an independent library."""
     pattern = nx.DiGraph()
     for name, kinds in rule.left.nodes.items():
         pattern.add_node(name, kinds=kinds)
@@ -361,7 +367,10 @@ def matches_by_networkx(graph: ClutterGraph, rule: ProductionRule) -> bool:
 
 @pytest.mark.parametrize("objects", sorted(GRAMMARS))
 def test_feasible_rules_are_those_that_match_and_fit(objects: str) -> None:
-    """The state's size and open slots decide the budget's part, recomputed here from the rule's result."""
+    """The budget's part of feasibility follows from size and open slots.
+
+    It is recomputed here from the result of the rule.
+    """
     grammar = GRAMMARS[objects]
     compared = Counter[bool]()
     for seed in range(6):
@@ -387,9 +396,10 @@ def test_feasible_rules_are_those_that_match_and_fit(objects: str) -> None:
 @pytest.mark.parametrize("nodes", [3, 4, 5, 6, 7])
 @pytest.mark.parametrize("exact", [True, False])
 def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> None:
-    """Every state of a small grammar: a rule is feasible if and only if some continuation ends terminal, and as large as asked.
+    """A rule is feasible if and only if a continuation reaches a terminal graph of the size.
 
-    One class with one pair; one orientation stands for the ten, which match alike.
+    All states of a small grammar: one class with one pair, and one of the ten orientations, which
+    all match alike.
     """
     grammar = SceneGrammar([CLASSES["gelatin_box"]])
     rules = [

@@ -1,4 +1,4 @@
-"""From graphs to poses: nothing penetrates, everything rests on what carries it, gaps and caps hold."""
+"""Layouts: no penetration, supported objects, gaps and limits."""
 
 from collections import Counter
 
@@ -34,7 +34,7 @@ def laid_out(derivation: Derivation, config: ClutterConfig | None = None, seed: 
 
 
 def random_layout(index: int) -> Scene | LayoutFailure:
-    """The layout of a random graph of 3 to 25 nodes, of either object set, under a seed of its own."""
+    """Return the layout of a random graph of 3 to 25 nodes of either object set."""
     generator = item_rng(2022, index)
     grammar = GRAMMARS["ycb7" if index % 2 else "pantry14"]
     derivation = grammar.derive(
@@ -44,7 +44,10 @@ def random_layout(index: int) -> Scene | LayoutFailure:
 
 
 def carriers(graph: ClutterGraph, node: int) -> list[int]:
-    """The objects that carry a node: its parent, or the two of a pair; empty for what stands on the tray."""
+    """Return the objects that carry a node: its parent, or both of a pair.
+
+    It is empty for objects on the tray.
+    """
     (parent, *_) = graph.nx.predecessors(node)
     if parent == ClutterGraph.TRAY_NODE:
         return []
@@ -134,7 +137,7 @@ def test_random_scenes_keep_every_promise() -> None:
 
 
 def test_a_stack_by_hand() -> None:
-    """Soup can 101 mm, cracker box flat 60 mm, marker 18 mm: the heights add up, the centres lie above each other."""
+    """The heights of can (101 mm), box (60 mm) and marker (18 mm) add up; centers are aligned."""
     scene = laid_out(
         derived(
             *("drop_object", "stack_object", "stack_object", "end"),

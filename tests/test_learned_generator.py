@@ -121,9 +121,9 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
     ("name", "objects", "hidden"), [("sg-star", "ycb7", 8.0), ("sg-14", "pantry14", 7.0)]
 )
 def test_shipped_agents_hide_objects_in_stable_stacks(
-    name: str, objects: str, hidden: float, fast: StaticStabilityJudge
+    name: str, objects: str, hidden: float, static_judge: StaticStabilityJudge
 ) -> None:
-    """As the fast judge sees it; docs/results has what Drake says of many more."""
+    """As the static judge sees it; docs/results has what Drake says of many more."""
     agent, grammar, generator = (
         make_generation_agent(name, ClutterConfig()),
         GRAMMARS[objects],
@@ -136,7 +136,7 @@ def test_shipped_agents_hide_objects_in_stable_stacks(
         scene = lay_out(derivation, grammar.classes, ClutterConfig(), generator)
         if isinstance(scene, LayoutFailure):
             continue
-        verdict = fast.judge(scene, generator)
+        verdict = static_judge.judge(scene, generator)
         if isinstance(verdict, Verdict) and verdict.stable:
             counts.append(len(verdict.hidden))
     assert len(counts) >= 11

@@ -10,7 +10,7 @@ from drake_clutter.stability.nnls import nnls
 
 
 def optimal(A: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
-    """Karush, Kuhn and Tucker: no coordinate could grow, and none that is not 0 could shrink, to any use."""
+    """Assert the Karush-Kuhn-Tucker conditions of non-negative least squares."""
     gradient = A.T @ (b - A @ x)
     return bool((x >= 0).all() and gradient.max() < 1e-8 and np.abs(gradient * x).max() < 1e-8)
 
@@ -20,7 +20,10 @@ def optimal(A: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float6
 )
 @pytest.mark.parametrize("within_reach", [True, False])
 def test_nnls(kind: str, within_reach: bool) -> None:
-    """As good as SciPy's, where that one's answer has not grown so large (of a low rank, beyond 1e13) that it means nothing."""
+    """The residual is as small as SciPy's.
+
+    Cases in which SciPy's solution exceeds 1e13 (of low rank) are skipped.
+    """
     generator = rng(0)
     compared = 0
     for _ in range(150):

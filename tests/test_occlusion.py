@@ -1,4 +1,4 @@
-"""Space that must be taken for full: shadows of what is known, and what is seen but known by no name."""
+"""Occlusion volumes below and behind known objects, and over unidentified points."""
 
 import math
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def test_a_block_is_the_least_upright_one() -> None:
     assert math.sin(long_axis - turn) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_nothing_is_unseen_where_all_is_known() -> None:
+def test_no_boxes_where_all_objects_are_known() -> None:
     assert occluded_boxes([], seen([]), EMPTY) == (), "the rim belongs to the empty cell"
     assert occluded_boxes([LOWER], seen([LOWER]), EMPTY) == ()
 
@@ -93,7 +93,7 @@ def highest(plan: PickPlacePlan) -> float:
     return float(ToolKinematics(DEFAULT_CELL).pose(q)[:, 2, 3].max())
 
 
-def test_plans_keep_clear_of_what_is_unseen() -> None:
+def test_plans_avoid_occluded_boxes() -> None:
     planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
     place = Pose((0.2, -0.2, LOWER.X_TO.translation[2] + 0.001), LOWER.X_TO.quaternion)
     between = OccludedBox((0.1, -0.1, 0.08), (0.05, 0.05, 0.16), 0.0)

@@ -1,4 +1,4 @@
-"""A user's own convex meshes under the fast judge, its rays and Drake."""
+"""A user's own convex meshes under the static judge, its rays and Drake."""
 
 import math
 from itertools import product
@@ -39,7 +39,10 @@ ASKEW = Rotation.from_euler("zyx", (40, 40, 40), degrees=True).as_matrix()
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
-    """A hexagonal prism, a frustum, a wedge that is high at -x, a box askew in its frame, and a bracket, not convex."""
+    """Return a hexagonal prism, a frustum, a wedge, an oblique box, and a bracket.
+
+    The wedge is high at -x. The bracket is not convex.
+    """
     folder = tmp_path_factory.mktemp("user") / "own"
     folder.mkdir()
     wedge = [
@@ -96,7 +99,7 @@ def as_made(
         ("prism", 0.105, 10.0, True),
         ("prism", 0.125, 10.0, False),
         ("frustum", 0.123, 0.0, False),
-        # A wedge's centre of mass is a third of the way from its high end: 20 mm off its middle.
+        # A wedge's center of mass is a third of the way from its high end: 20 mm off its middle.
         ("wedge", 0.123, 0.0, True),
         ("wedge", 0.107, 180.0, False),
     ],
@@ -107,12 +110,12 @@ def test_own_meshes_near_the_edge_of_a_box(
     degrees: float,
     stable: bool,
     own: dict[str, ObjectClass],
-    fast: StaticStabilityJudge,
+    static_judge: StaticStabilityJudge,
     judge: DrakeJudge,
 ) -> None:
     """The edge is at 115 mm."""
     scene = scene_of(BELOW, as_made(own[class_name], (x, 0.0), 0.060, degrees))
-    mine, drakes = fast.judge(scene, rng(1)), judge.judge(scene, rng(1))
+    mine, drakes = static_judge.judge(scene, rng(1)), judge.judge(scene, rng(1))
     assert isinstance(mine, Verdict)
     assert mine.stable is drakes.stable is stable
     assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
@@ -123,7 +126,7 @@ def test_a_box_on_a_frustums_small_top(
     x: float,
     stable: bool,
     own: dict[str, ObjectClass],
-    fast: StaticStabilityJudge,
+    static_judge: StaticStabilityJudge,
     judge: DrakeJudge,
 ) -> None:
     """Its top is a square of 42 mm on its corner; its outline would carry the box at 30 mm."""
@@ -131,34 +134,43 @@ def test_a_box_on_a_frustums_small_top(
         as_made(own["frustum"], (0.0, 0.0), 0.0),
         resting("gelatin_box", xy=(x, 0.0), floor=0.060, name="box"),
     )
-    mine = fast.judge(scene, rng(1))
+    mine = static_judge.judge(scene, rng(1))
     assert isinstance(mine, Verdict)
     assert mine.stable is judge.judge(scene, rng(1)).stable is stable
 
 
-def test_margins_of_own_meshes(own: dict[str, ObjectClass], fast: StaticStabilityJudge) -> None:
-    """From the centre of mass to the nearest side: of a hexagon, its inner radius; of the wedge, 40 mm from its high end."""
+def test_margins_of_own_meshes(
+    own: dict[str, ObjectClass], static_judge: StaticStabilityJudge
+) -> None:
+    """The margin is the distance from the center of mass to the nearest side.
+
+    Of a hexagon, it is the inner radius; of the wedge, it is 40 mm from the high end.
+    """
     for class_name, margin in (
         ("prism", 0.050 * math.cos(math.pi / 6)),
         ("frustum", 0.060 * math.cos(math.pi / 4)),
         ("wedge", 0.03),
     ):
-        found = fast.stability_margins(scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0)))
+        found = static_judge.stability_margins(
+            scene_of(as_made(own[class_name], (0.1, 0.0), 0.0, 20.0))
+        )
         assert not isinstance(found, InconclusiveVerdict)
         assert found["own"] == pytest.approx(margin, abs=1.01 * STEP)
-    over = fast.stability_margins(scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060)))
+    over = static_judge.stability_margins(
+        scene_of(BELOW, as_made(own["wedge"], (0.123, 0.0), 0.060))
+    )
     assert not isinstance(over, InconclusiveVerdict)
     assert over["own"] == pytest.approx(0.115 - (0.123 - 0.020), abs=1.01 * STEP)
 
 
 def test_a_mesh_stands_on_a_face_askew_in_its_frame(
-    own: dict[str, ObjectClass], fast: StaticStabilityJudge
+    own: dict[str, ObjectClass], static_judge: StaticStabilityJudge
 ) -> None:
     """On each of its six faces."""
     for turn in ("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270):
         R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
         lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
-        margins = fast.stability_margins(
+        margins = static_judge.stability_margins(
             scene_of(
                 SceneObject("own", own["askew"], Pose.from_rotation(R_TO, (0.0, 0.0, -lowest)))
             )
@@ -167,8 +179,10 @@ def test_a_mesh_stands_on_a_face_askew_in_its_frame(
         assert margins["own"] >= 0.025 - 1.01 * STEP, turn
 
 
-def test_nothing_stands_on_a_slope(own: dict[str, ObjectClass], fast: StaticStabilityJudge) -> None:
-    found = fast.find_instability(
+def test_nothing_stands_on_a_slope(
+    own: dict[str, ObjectClass], static_judge: StaticStabilityJudge
+) -> None:
+    found = static_judge.find_instability(
         scene_of(
             as_made(own["wedge"], (0.0, 0.0), 0.0), resting("gelatin_box", floor=0.080, name="box")
         )
@@ -200,11 +214,11 @@ def test_what_is_not_convex_is_left_to_drake(
 ) -> None:
     scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
     answer = InconclusiveVerdict(InconclusiveReason.NOT_CONVEX, "bracket")
-    fast = StaticStabilityJudge(config)
+    static_judge = StaticStabilityJudge(config)
     assert (
-        fast.find_instability(scene)
-        == fast.find_supports(scene)
-        == fast.judge(scene, rng())
+        static_judge.find_instability(scene)
+        == static_judge.find_supports(scene)
+        == static_judge.judge(scene, rng())
         == answer
     )
     verdict = HybridJudge(config).judge(scene, rng(4))

@@ -1,4 +1,4 @@
-"""Where a picked object lands: free, far from the middle, on its support; from the picture alone."""
+"""Placements are free, far from the center, supported, and found in the image alone."""
 
 from collections.abc import Sequence
 
@@ -43,7 +43,7 @@ def placed_at(observation: Observation, move: Move, generator: np.random.Generat
 
 
 def carried_by(scene: Scene, name: str) -> set[str]:
-    """The objects that the picked one carries, which fall when it goes: all that lie over it, higher up."""
+    """Return the objects above the picked one, which fall when it is removed."""
     start = scene[name]
     return {
         o.name
@@ -66,11 +66,14 @@ def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = (
 
 
 def test_on_an_empty_tray_the_object_goes_to_the_edge(detector: LabelDetector) -> None:
-    """175 mm x 89 mm on 700 mm: 10 mm of clearance stay to the rim, up to a cell; the longer way out is taken."""
+    """A box of 175 mm x 89 mm on 700 mm keeps 10 mm from the rim, up to a cell.
+
+    It is placed along y, where its center can be farther out.
+    """
     box = resting("sugar_box", name="box")
     X_TO = placement(detector, scene_of(box), "box")
     assert X_TO is not None
-    furthest = 0.350 - 0.010 - 0.089 / 2  # of the centre, along y
+    furthest = 0.350 - 0.010 - 0.089 / 2  # of the center, along y
     assert furthest - 1.5 * CELL_SIZE <= abs(X_TO.p[1]) <= furthest
     assert abs(X_TO.p[0]) <= 0.350 - 0.010 - 0.175 / 2
     assert X_TO.rotation == pytest.approx(box.X_TO.rotation)
@@ -107,7 +110,7 @@ def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) -> None:
-    """Free of what is seen and of what is hidden, inside the tray, and with the centre of mass over the support."""
+    """A placement is free of visible and hidden objects, and its center of mass is supported."""
     scene = random_scene(seed)
     observation = seen(detector, scene)
     generator = rng(seed)
@@ -131,7 +134,7 @@ def test_places_in_random_scenes_are_free(seed: int, detector: LabelDetector) ->
 
 
 def inside_outline(o: SceneObject, xy: NDArray[np.float64]) -> bool:
-    """Whether a point lies over an object: its height there is that of a box or cylinder turned any way."""
+    """Return whether a point is over an object of any orientation."""
     heights = np.linspace(o.bounds_T[0][2], o.bounds_T[1][2], 60)
     points = np.column_stack([np.full(60, xy[0]), np.full(60, xy[1]), heights])
     p_O = (points - o.X_TO.p) @ o.X_TO.rotation
@@ -147,7 +150,8 @@ def test_no_room_on_the_tray(detector: LabelDetector) -> None:
     """The only place that would hold the box is where it stands, which nobody can see."""
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     assert placement(detector, scene, "box") is None
-    # Beside it 50 mm are left: enough for the marker of 18 mm with 10 mm of clearance on either side.
+    # 50 mm are left beside it: enough for the marker of 18 mm with 10 mm of clearance on either
+    # side.
     with_marker = scene_of(
         resting("cracker_box", name="box"),
         resting("large_marker", floor=0.060, name="m"),
@@ -162,7 +166,7 @@ BELOW = resting("cracker_box", xy=(0.05, 0.05), name="below")
 
 
 @pytest.mark.parametrize("name", ["gelatin_box", "sugar_box", "tomato_soup_can", "large_marker"])
-def test_on_a_free_top_the_object_goes_to_its_middle(name: str, detector: LabelDetector) -> None:
+def test_on_a_free_top_the_object_goes_to_its_center(name: str, detector: LabelDetector) -> None:
     scene = scene_of(BELOW, resting(name, xy=(-0.2, -0.2), name="picked"))
     X_TO = placement(detector, scene, "picked", "below")
     assert X_TO is not None
@@ -174,7 +178,7 @@ def test_on_a_free_top_the_object_goes_to_its_middle(name: str, detector: LabelD
 
 
 def test_beside_what_stands_on_the_top(detector: LabelDetector) -> None:
-    """A can stands in the middle of the top: its radius, 10 mm of clearance and half of 85 mm away there is room."""
+    """A placement on a top keeps the clearance from a can in its center."""
     scene = scene_of(
         *(BELOW, resting("tomato_soup_can", xy=(0.05, 0.05), floor=0.060, name="can")),
         resting("gelatin_box", xy=(-0.2, -0.2), name="picked"),
@@ -199,7 +203,7 @@ def test_no_room_on_an_occupied_top(detector: LabelDetector) -> None:
 
 
 def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
-    """A strip of 150 mm by 300 mm is free, too narrow for a pasta box of 262 mm by 72 mm as it lies."""
+    """A free strip of 150 mm x 300 mm is too narrow for a pasta box of 262 mm x 72 mm."""
     walls = [
         resting("cracker_box", xy=(-0.07, -0.015), name="one wall"),
         resting("lasagna_box", xy=(-0.07, 0.12), name="another"),

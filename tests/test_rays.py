@@ -1,4 +1,4 @@
-"""The ray caster against the rendered camera, against geometry, and against itself without what is in the way."""
+"""The ray caster against rendered images and geometry, and with fewer objects."""
 
 import math
 from collections.abc import Mapping
@@ -43,7 +43,10 @@ def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
 
 
 def tumbled(seed: int, spread: float = 0.22) -> Scene:
-    """Two of each shape in the air over the tray, turned any way; some may cut each other, which a ray does not mind."""
+    """Return two objects of each shape in the air, in any orientation.
+
+    They may intersect, which does not matter to rays.
+    """
     generator = rng(seed)
     turns = Rotation.random(2 * len(ALL_SHAPES), rng=generator).as_matrix()
     objects = []
@@ -80,7 +83,7 @@ SCENES: Mapping[str, Scene] = {
 def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
     scene: Scene, detector: LabelDetector
 ) -> None:
-    """Of an object of a hundred pixels and more, one at its outline may go either way by rounding: 0.003 is a third of it."""
+    """Visible fractions agree to 0.003, a third of a pixel of objects of a hundred pixels."""
     look, rendered = detector.perceive(scene), detector.renderer.render_label(scene)
     observation, shares = RAYS.observe(scene)
     assert shares == RAYS.visible_fractions(scene.objects)
@@ -103,8 +106,12 @@ def test_the_same_rays_meet_the_same_objects_as_in_the_rendered_picture(
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=list(SCENES))
 def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> None:
-    """In 32 bit a depth of 1.6 m is known to 0.12 um, and its inverse to as much: 1 um. On a face that is seen at a grazing angle
-    the depth changes by centimetres from pixel to pixel, and the engine knows a pixel's middle only to a fraction: 0.1 mm."""
+    """Depths agree within the precision of 32-bit floats.
+
+    A depth of 1.6 m is exact to 0.12 um, and its inverse gives 1 um. On a face that is seen at a
+    grazing angle, the depth changes by centimeters from pixel to pixel, so the precision of the
+    pixel's center gives 0.1 mm.
+    """
     look = detector.perceive(scene)
     observation, _ = RAYS.observe(scene)
     rendered, cast = detector.renderer.render_label(scene), labels(scene)
@@ -130,8 +137,10 @@ def test_depth_is_the_rendered_depth(scene: Scene, detector: LabelDetector) -> N
     ids=["wide", "narrow"],
 )
 def test_another_camera(config: Camera) -> None:
-    """The narrow one sees 0.38 m of the tray by 0.56 m: objects are cut off by the frame, and a share is one of the pixels in it.
-    Fewer pixels: one is up to a hundredth of an object."""
+    """A narrow camera sees 0.38 m x 0.56 m of the tray and cuts objects off.
+
+    The fraction refers to the pixels within the image.
+    """
     scene = tumbled(2)
     camera, caster = CameraRenderer(config), RayCaster(config)
     assert caster.visible_fractions(scene.objects) == pytest.approx(
@@ -163,8 +172,10 @@ def test_another_camera(config: Camera) -> None:
 def test_a_box_from_straight_above_covers_its_top(
     name: str, length: float, width: float, height: float, orientation: Orientation
 ) -> None:
-    """Only its top is seen, as large as the pinhole makes it. Pixels at its outline count or not: less than half its length in
-    pixels is right."""
+    """The visible top is as large as the pinhole model says.
+
+    Pixels at its outline may count or not: less than half its length in pixels.
+    """
     scene = scene_of(resting(name, orientation, name="box"))
     scale = CAMERA.focal_length / (CAMERA.X_TC.translation()[2] - height)
     pixels = int((labels(scene) == 0).sum())
@@ -180,7 +191,8 @@ def test_a_box_in_a_corner_shows_its_sides() -> None:
         CAMERA.project(np.array([[x, y, z] for x in (0.12, 0.28) for y in (0.12, 0.18)]))
         for z in (0.0, 0.23)
     )
-    # The top is nearer and seems larger, away from the middle: of the bottom, the corner beyond the top's is inside.
+    # The top is nearer and appears larger: of the bottom, the corner beyond the top's corner is
+    # inside.
     outline = np.array([low[0], low[1], high[1], high[3], high[2], low[2]])
     following = np.roll(outline, -1, axis=0)
     area = abs((outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum()) / 2
@@ -189,7 +201,7 @@ def test_a_box_in_a_corner_shows_its_sides() -> None:
 
 
 def test_every_ray_meets_an_object_once() -> None:
-    """No ray is lost or counted twice where two faces meet: the rays that a convex object meets fill every row without a gap."""
+    """No ray is lost or counted twice at edges: the rays of a convex object fill every row."""
     for seed in range(3):
         for o in tumbled(seed).objects:
             mask = labels(scene_of(o)) == 0
@@ -262,13 +274,13 @@ def test_out_of_the_frame_nothing_is_hidden() -> None:
 
 
 def test_only_what_a_ray_meets_is_detected() -> None:
-    """As `LabelDetector` has it, from which an explorer that is to carry out a plan knows what is in view."""
+    """The observation equals that of `LabelDetector`, from which policies know what is in view."""
     assert [d.name for d in LabelDetector(CAMERA).perceive(FAR).observation.detections] == ["near"]
     assert [d.name for d in RAYS.observe(FAR)[0].detections] == ["near"]
 
 
 def test_half_covered() -> None:
-    """The upper box's side stands right under the camera's axis: it hides exactly what lies to its right."""
+    """The upper box ends below the camera's axis, so it hides exactly what lies to its right."""
     objects = [
         resting("cracker_box", name="below"),
         resting("cracker_box", xy=(0.115, 0.0), floor=0.060, name="above"),
@@ -295,8 +307,11 @@ HEAP = scene_of(
     [(HEAP, "hidden"), (HEAP, "one"), (tumbled(0, 0.08), "sugar_box 1")],
     ids=["0", "1", "2"],
 )
-def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> None:
-    """Without a set of others, the object is met by the rays before which there are none but these; by all subsets of five."""
+def test_occluder_sets_are_the_rays_that_removed_subsets_uncover(scene: Scene, name: str) -> None:
+    """Removing a set of objects uncovers exactly the rays occluded by its subsets.
+
+    All subsets of five objects are tried.
+    """
     cover = RAYS.occluder_sets(scene, name)
     total = sum(cover.values())
     assert total == int((labels(scene_of(scene[name])) == 0).sum())
@@ -318,7 +333,7 @@ def test_cover_is_what_becomes_free_when_subsets_go(scene: Scene, name: str) -> 
     assert min(free) < max(free)
 
 
-def test_cover_of_a_lone_cover() -> None:
+def test_occluder_set_of_a_single_occluder() -> None:
     scene = scene_of(
         resting("gelatin_box", name="box"), resting("cracker_box", floor=0.028, name="cover")
     )
@@ -328,8 +343,8 @@ def test_cover_of_a_lone_cover() -> None:
     assert set(RAYS.occluder_sets(scene, "cover")) == {frozenset()}
 
 
-def test_cover_takes_64_objects_at_most() -> None:
-    """They lie on each other like cards; the lowest is covered by all, each of which has its own bit."""
+def test_occluder_sets_take_64_objects_at_most() -> None:
+    """Objects lie on each other like cards; the lowest is covered by all, one bit for each."""
     cards = [resting("gelatin_box", floor=0.005 * k, name=f"{k}") for k in range(65)]
     cover = RAYS.occluder_sets(scene_of(*cards[:64]), "0")
     assert max(cover, key=lambda before: cover[before]) == frozenset(str(k) for k in range(1, 64))

@@ -57,7 +57,7 @@ def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
                 held.settled_scene(number, held.grammar, WORLD)
 
 
-def test_laid_anew_it_is_the_same_scene_elsewhere() -> None:
+def test_relayout_moves_the_stacks_only() -> None:
     grammar, first = GRAMMARS["ycb7"], SCENES[0]
     derivation = Derivation(grammar.replay(first.derivation), first.derivation)
     scenes = [relayout(derivation, grammar, WORLD, rng(seed)) for seed in (1, 1, 2)]

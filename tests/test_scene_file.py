@@ -247,9 +247,9 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     (("objects", 1, "name"), "tray", "objects[1].name: 'tray'; allowed is any name but tray"),
     (("objects", 1, "name"), SCENE.names[0], f"objects[1].name: '{SCENE.names[0]}' is used twice"),
     (
-        ("objects", 1, "colour"),
+        ("objects", 1, "color"),
         "red",
-        "objects[1].colour: is unknown; allowed are name, class, X_TO, node",
+        "objects[1].color: is unknown; allowed are name, class, X_TO, node",
     ),
     (("objects", 1, "node"), "1", "objects[1].node: '1'; allowed is a whole number"),
     (("objects", 1, "node"), True, "objects[1].node: True; allowed is a whole number"),
@@ -284,7 +284,7 @@ REFUSED: list[tuple[Path_, Any, str]] = [
     ((*NODE, "kind"), "teapot", "kind: 'teapot'; allowed is a structure node, or the class"),
     ((*NODE, "kind"), "tray", "allowed is exactly one tray"),
     ((*NODE, "id"), 0, "allowed is an id that no other node has"),
-    ((*NODE, "colour"), 1, "colour: is unknown; allowed are id, kind"),
+    ((*NODE, "color"), 1, "color: is unknown; allowed are id, kind"),
     (("graph", "edges"), [], "allowed is an acyclic graph in which the tray leads to every node"),
     (
         (*EDGE, "kind"),
@@ -368,7 +368,7 @@ def test_a_broken_instability_is_named(
 
 
 def test_objects_that_overlap_are_refused_and_a_touch_is_not(tmp_path: Path) -> None:
-    """1 mm is allowed, as settled objects press on each other and hand-written poses are rounded."""
+    """A penetration of 1 mm is allowed, for settled objects and rounded poses."""
     for gap, allowed in ((0.0, True), (-0.0009, True), (-0.0011, False), (-0.020, False)):
         scene = scene_of(
             resting("sugar_box", name="below"),
@@ -482,7 +482,8 @@ def test_a_verdict_that_contradicts_itself_is_refused(verdict: str, tmp_path: Pa
 @pytest.mark.parametrize(
     "graph",
     [
-        "{nodes: [{id: 0, kind: tray}, {id: 1, kind: open_slot}], edges: [{parent: 0, child: 1, kind: primitive}]}",
+        "{nodes: [{id: 0, kind: tray}, {id: 1, kind: open_slot}], "
+        "edges: [{parent: 0, child: 1, kind: primitive}]}",
         "{nodes: [{id: 0, kind: tray}, {id: 1, kind: end}, {id: 2, kind: end}], "
         "edges: [{parent: 0, child: 1, kind: primitive}, {parent: 1, child: 2, kind: primitive}]}",
     ],

@@ -1,4 +1,4 @@
-"""Scene files and configs with anything anywhere: they load, or are refused by an error that names them."""
+"""Fuzzed scene files and configs load, or are refused with an error that names them."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Settling and judging small scenes whose outcome is known from statics; determinism; when the simulation ends."""
+"""Settling and judging small scenes with known outcomes; determinism; early stops."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.simulation.settle import SettleResult, settle
 
 UPRIGHT = Orientation.UPRIGHT_0
-# Cracker boxes lie 230 mm along x, 60 mm high; a sugar box is 175 mm long, so it overhangs by half when shifted by 115 mm.
+# Cracker boxes are 230 mm long (x) and 60 mm high; a sugar box is 175 mm long, so half of it
+# overhangs when it is shifted by 115 mm.
 BELOW = resting("cracker_box", name="below")
 STANDING_PAIR = [
     resting("sugar_box", UPRIGHT, (0.0, y), name=name)
@@ -141,7 +142,7 @@ def test_an_object_on_its_own_settles_alike_wherever_it_stands(config: ClutterCo
         assert offsets[xy] == pytest.approx(offsets[places[0]], abs=1e-12)
 
 
-def test_every_object_on_its_own_is_told_by_its_own_name(judge: DrakeJudge) -> None:
+def test_single_objects_keep_their_names(judge: DrakeJudge) -> None:
     """The second falls just as the first did, whose result is kept."""
     for name in ("one", "two"):
         verdict = judge.judge(scene_of(resting("gelatin_box", floor=0.15, name=name)), rng())
@@ -173,7 +174,7 @@ def moved_aside(objects: Sequence[SceneObject], y: float, prefix: str) -> list[S
         (STABLE["a marker that lies"], FALLING["a marker falls through the gap of a pair"][0]),
     ],
 )
-def test_apart_or_together_the_verdict_is_the_same(
+def test_groups_settled_separately_give_the_same_verdict(
     first: list[SceneObject], second: list[SceneObject], config: ClutterConfig, judge: DrakeJudge
 ) -> None:
     objects = [*moved_aside(first, -0.2, "first "), *moved_aside(second, 0.2, "second ")]
@@ -202,7 +203,7 @@ def test_the_first_stack_that_falls_decides(judge: DrakeJudge) -> None:
 
 
 def test_not_at_rest() -> None:
-    """A box in free fall for 0.1 s moves at 1 m/s; with limits that wide, it has not fallen over: it is still moving."""
+    """A box in free fall with very wide limits has not fallen over: it is still moving."""
     config = SettleConfig(max_time=0.1, max_displacement=1.0)
     result = settle(
         [
@@ -252,7 +253,7 @@ def check_motion(result: SettleResult, start: list[SceneObject]) -> None:
     assert result.motion[-1].poses == result.poses
 
 
-def test_motion_is_recorded_and_a_fall_followed_if_asked() -> None:
+def test_motion_and_collapse_are_simulated_on_demand() -> None:
     falling = FALLING["overhang of more than half"][0]
     config = SettleConfig(time_step=0.005)
     stopped = settle(falling, TRAY, config, record=True)

@@ -29,7 +29,7 @@ def executor(config: ClutterConfig) -> SettleExecutor:
     return SettleExecutor(config)
 
 
-def carried_out(
+def execute_move(
     executor: SettleExecutor, detector: LabelDetector, scene: Scene, move: Move, seed: int = 0
 ) -> Outcome:
     return executed(executor, scene, detector.perceive(scene).observation, move, rng(seed))
@@ -40,7 +40,7 @@ def how_far(before: Scene, after: Scene, name: str) -> float:
 
 
 def test_the_top_object_goes_to_the_tray(executor: SettleExecutor, detector: LabelDetector) -> None:
-    outcome = carried_out(executor, detector, STACKS, Move("above"))
+    outcome = execute_move(executor, detector, STACKS, Move("above"))
     assert (outcome.result, outcome.instability) == (MoveResult.PLACED, None)
     after = outcome.scene
     assert after.names == STACKS.names
@@ -57,7 +57,7 @@ def test_the_top_object_goes_to_the_tray(executor: SettleExecutor, detector: Lab
 
 
 def test_onto_another_object(executor: SettleExecutor, detector: LabelDetector) -> None:
-    outcome = carried_out(executor, detector, STACKS, Move("on the can", "above"))
+    outcome = execute_move(executor, detector, STACKS, Move("on the can", "above"))
     assert outcome.result is MoveResult.PLACED
     after = outcome.scene
     assert after["on the can"].X_TO.p == pytest.approx([0.0, 0.0, 0.060 + 0.038 + 0.014], abs=0.01)
@@ -76,16 +76,16 @@ def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecut
     assert outcome.scene["on the can"].X_TO.p[2] == pytest.approx(start.p[2], abs=0.001)
 
 
-def test_a_neighbour_is_no_support(executor: SettleExecutor) -> None:
+def test_a_neighbor_is_no_support(executor: SettleExecutor) -> None:
     """What is let go too high beside something close falls onto what is below all the same."""
-    picked, neighbour = (
+    picked, neighbor = (
         resting("gelatin_box", floor=0.101, name="picked"),
         resting("cracker_box", Orientation.UPRIGHT_0),
     )
     gap = TOUCHING_MARGIN - 0.001
-    beside = neighbour.bounds_T[1][0] + gap - picked.bounds_T[0][0]
+    beside = neighbor.bounds_T[1][0] + gap - picked.bounds_T[0][0]
     scene = scene_of(
-        neighbour,
+        neighbor,
         resting("tomato_soup_can", xy=(beside, 0.0)),
         replace(picked, X_TO=picked.X_TO.translated((beside, 0.0, 0.0))),
     )
@@ -121,7 +121,7 @@ def test_a_move_without_a_free_spot_changes_nothing(
     executor: SettleExecutor, detector: LabelDetector
 ) -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
-    outcome = carried_out(executor, detector, scene, Move("box"))
+    outcome = execute_move(executor, detector, scene, Move("box"))
     assert (outcome.result, outcome.instability, outcome.motion) == (
         MoveResult.NO_FREE_PLACEMENT,
         None,
@@ -133,8 +133,8 @@ def test_a_move_without_a_free_spot_changes_nothing(
 def test_a_pile_that_does_not_hold_collapses(
     executor: SettleExecutor, detector: LabelDetector
 ) -> None:
-    """A box let go on a single lying marker rolls off: the picked object, too, has to stay where it was let go."""
-    outcome = carried_out(executor, detector, STACKS, Move("on the can", "marker"))
+    """A box released on a single lying marker rolls off, so the picked object collapses, too."""
+    outcome = execute_move(executor, detector, STACKS, Move("on the can", "marker"))
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
     assert outcome.instability.object in ("on the can", "marker")
@@ -143,16 +143,18 @@ def test_a_pile_that_does_not_hold_collapses(
 def test_the_same_rng_gives_the_same_outcome(
     executor: SettleExecutor, detector: LabelDetector
 ) -> None:
-    one, other = (carried_out(executor, detector, STACKS, Move("marker"), seed=7) for _ in range(2))
+    one, other = (
+        execute_move(executor, detector, STACKS, Move("marker"), seed=7) for _ in range(2)
+    )
     assert one == other
-    assert carried_out(executor, detector, STACKS, Move("marker"), seed=8).scene != one.scene
+    assert execute_move(executor, detector, STACKS, Move("marker"), seed=8).scene != one.scene
 
 
 @pytest.mark.parametrize("move", [Move("above"), Move("below")], ids=str)
 def test_the_motion_shows_the_whole_scene(
     move: Move, executor: SettleExecutor, detector: LabelDetector
 ) -> None:
-    outcome = carried_out(executor, detector, STACKS, move)
+    outcome = execute_move(executor, detector, STACKS, move)
     times = [frame.time for frame in outcome.motion]
     assert times[0] == 0.0
     assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / 40), abs=0.003)
@@ -166,5 +168,5 @@ def test_what_is_not_in_view_cannot_be_moved(
     move: Move, executor: SettleExecutor, detector: LabelDetector
 ) -> None:
     with pytest.raises(KeyError, match="'ghost' is not in view"):
-        carried_out(executor, detector, STACKS, move)
+        execute_move(executor, detector, STACKS, move)
     assert move.place in (TRAY, "ghost")

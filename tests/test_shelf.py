@@ -54,13 +54,13 @@ def test_the_geometry_of_the_shelf(shelf: ClutterConfig) -> None:
 
 def test_both_judges_agree_on_generated_scenes(shelf: ClutterConfig) -> None:
     generate = SceneGenerator(GenerationJob("random", "ycb7", None, nodes=10, seed=0, config=shelf))
-    judge, fast = DrakeJudge(shelf), StaticStabilityJudge(shelf)
+    judge, static_judge = DrakeJudge(shelf), StaticStabilityJudge(shelf)
     stable = []
     for number in range(4):
         scene = generate(number).scene
         assert isinstance(scene, Scene)
         assert inside(scene, shelf)
-        verdict, other = judge.judge(scene, rng(number)), fast.judge(scene, rng(number))
+        verdict, other = judge.judge(scene, rng(number)), static_judge.judge(scene, rng(number))
         assert isinstance(verdict, Verdict)
         assert isinstance(other, Verdict)
         assert (verdict.stable, verdict.hidden) == (other.stable, other.hidden)

@@ -1,4 +1,4 @@
-"""Every file in the repository that was written by the program, or an earlier version, still loads."""
+"""Files in the repository that this or an earlier version wrote still load."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Moves without simulating: what stays and what falls, the same places as Drake's, and when Drake is asked."""
+"""Static moves: what stays, what falls, agreement with Drake, and the hybrid executor."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def seen(scene: Scene) -> Observation:
     return JUDGE.ray_caster.observe(scene)[0]
 
 
-def carried_out(
+def execute_move(
     scene: Scene, move: Move, seed: int = 0, executor: MoveExecutor = EXECUTOR
 ) -> Outcome:
     return executed(executor, scene, seen(scene), move, rng(seed))
@@ -67,8 +67,8 @@ def lowest(o: SceneObject) -> float:
     ids=str,
 )
 def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None:
-    """At rest, not at the height where it is let go; within the random offset of its place; nothing else moves."""
-    outcome = carried_out(STACKS, move)
+    """The object rests within the random offset of its placement; no other object moves."""
+    outcome = execute_move(STACKS, move)
     assert (outcome.result, outcome.instability, outcome.inconclusive, outcome.motion) == (
         MoveResult.PLACED,
         None,
@@ -94,11 +94,11 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
 
 def test_the_same_rng_gives_the_same_outcome() -> None:
     """Whatever was carried out before."""
-    one = carried_out(STACKS, Move("marker"), 7)
-    carried_out(STACKS, Move("above"), 1)
-    assert carried_out(STACKS, Move("marker"), 7) == one
-    assert carried_out(STACKS, Move("marker"), 7, StaticExecutor(CONFIG)) == one
-    assert carried_out(STACKS, Move("marker"), 8).scene != one.scene
+    one = execute_move(STACKS, Move("marker"), 7)
+    execute_move(STACKS, Move("above"), 1)
+    assert execute_move(STACKS, Move("marker"), 7) == one
+    assert execute_move(STACKS, Move("marker"), 7, StaticExecutor(CONFIG)) == one
+    assert execute_move(STACKS, Move("marker"), 8).scene != one.scene
 
 
 # --- Collapsed ---
@@ -134,8 +134,8 @@ OUTSIDE_ONLY = scene_of(
     ],
 )
 def test_what_loses_its_support_falls(scene: Scene, move: Move, falls: str) -> None:
-    """Where to is not followed: the picked object is at its place, the others are where they were."""
-    outcome = carried_out(scene, move)
+    """Falls are not followed: the picked object is at its placement, the others unmoved."""
+    outcome = execute_move(scene, move)
     assert (outcome.result, outcome.inconclusive) == (MoveResult.COLLAPSED, None)
     assert outcome.instability == Instability(InstabilityReason.UNSUPPORTED, falls)
     assert outcome.scene[falls].X_TO == scene[falls].X_TO
@@ -146,7 +146,7 @@ def test_what_loses_its_support_falls(scene: Scene, move: Move, falls: str) -> N
 @pytest.mark.parametrize("pick", ["on the can", "above"])
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_stays_on_a_lying_marker(pick: str, seed: int) -> None:
-    outcome = carried_out(STACKS, Move(pick, "marker"), seed)
+    outcome = execute_move(STACKS, Move(pick, "marker"), seed)
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
     assert outcome.instability.object == pick
@@ -155,14 +155,14 @@ def test_nothing_stays_on_a_lying_marker(pick: str, seed: int) -> None:
 
 def test_where_nothing_balances() -> None:
     assert JUDGE.find_instability(OUTSIDE_ONLY) is None
-    outcome = carried_out(OUTSIDE_ONLY, Move("heavy", "over"))
+    outcome = execute_move(OUTSIDE_ONLY, Move("heavy", "over"))
     assert outcome.result is MoveResult.COLLAPSED
     assert outcome.instability is not None
     assert outcome.instability.reason is InstabilityReason.UNBALANCED
     assert outcome.scene["heavy"].X_TO.p[0] > 0.115
     # Without the can the middle of the top is free, which is 15 mm inside the edge.
     assert (
-        carried_out(scene_of(*OVERHANG, HEAVY), Move("heavy", "over")).result is MoveResult.PLACED
+        execute_move(scene_of(*OVERHANG, HEAVY), Move("heavy", "over")).result is MoveResult.PLACED
     )
 
 
@@ -171,7 +171,7 @@ def test_where_nothing_balances() -> None:
 
 def test_no_free_spot_changes_nothing() -> None:
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
-    outcome = carried_out(scene, Move("box"))
+    outcome = execute_move(scene, Move("box"))
     assert (outcome.result, outcome.instability, outcome.inconclusive) == (
         MoveResult.NO_FREE_PLACEMENT,
         None,
@@ -223,7 +223,7 @@ def test_what_it_cannot_judge_is_a_result(
     scene: Scene, move: Move, answer: InconclusiveVerdict
 ) -> None:
     """Also that something rests, before the move, which it would let fall."""
-    outcome = carried_out(scene, move)
+    outcome = execute_move(scene, move)
     assert (outcome.result, outcome.inconclusive, outcome.instability) == (
         MoveResult.INCONCLUSIVE,
         answer,
@@ -237,9 +237,9 @@ def test_what_it_cannot_judge_is_a_result(
     [Move("above"), Move("marker", "above"), Move("below"), Move("on the can", "marker")],
     ids=str,
 )
-def test_what_a_move_does_not_touch_need_not_be_judged(move: Move) -> None:
+def test_objects_that_a_move_does_not_touch_are_not_judged(move: Move) -> None:
     """The same as without the box that leans, wherever the picked one goes."""
-    outcome, without = carried_out(LEANS, move), carried_out(STACKS, move)
+    outcome, without = execute_move(LEANS, move), execute_move(STACKS, move)
     assert (outcome.result, outcome.instability) == (without.result, without.instability)
     assert outcome.result is not MoveResult.INCONCLUSIVE
     assert outcome.scene["leaning"] == LEANS["leaning"]
@@ -255,7 +255,7 @@ def test_only_what_is_in_view_can_be_moved(move: Move, executor: MoveExecutor) -
     """The can is hidden."""
     name = move.pick if move.pick != "marker" else move.place
     with pytest.raises(KeyError, match=f"'{name}' is not in view"):
-        carried_out(STACKS, move, executor=executor)
+        execute_move(STACKS, move, executor=executor)
 
 
 # --- And Drake ---
@@ -273,8 +273,10 @@ def test_only_what_is_in_view_can_be_moved(move: Move, executor: MoveExecutor) -
 def test_drake_lets_it_go_at_the_same_place(
     move: Move, result: MoveResult, detector: LabelDetector
 ) -> None:
-    """From the ray caster's observation as from the rendered one. A box then creeps by less than 0.1 mm; a fall goes on in Drake,
-    whose motion begins where the object was let go, 1 mm higher."""
+    """Observations of ray caster and renderer give equal results.
+
+    In Drake, a box then creeps by less than 0.1 mm, and a fall goes on.
+    """
     rendered, cast = detector.perceive(STACKS).observation, seen(STACKS)
     mine = executed(EXECUTOR, STACKS, rendered, move, rng(3))
     same = executed(EXECUTOR, STACKS, cast, move, rng(3))
@@ -296,7 +298,7 @@ def test_drake_lets_it_go_at_the_same_place(
         assert mine.instability.object == drakes.instability.object
 
 
-def test_drake_is_asked_about_what_cannot_be_judged() -> None:
+def test_inconclusive_moves_are_settled_in_drake() -> None:
     """It draws what it would have drawn, had it been asked first."""
     generator, other = rng(5), rng(5)
     outcome = executed(HybridExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), generator)
@@ -310,7 +312,7 @@ def test_drake_is_asked_about_what_cannot_be_judged() -> None:
 @pytest.mark.parametrize(
     "move", [Move("above"), Move("below"), Move("on the can", "marker")], ids=str
 )
-def test_drake_is_not_asked_about_the_rest(move: Move) -> None:
+def test_conclusive_moves_are_not_settled_in_drake(move: Move) -> None:
     """Not even about a collapse, of which it would show the motion."""
     generator, other = rng(5), rng(5)
     outcome = executed(HybridExecutor(CONFIG), STACKS, seen(STACKS), move, generator)
@@ -345,7 +347,7 @@ HELD_DOWN = scene_of(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_moves_ever_take_what_can_never_be_moved(seed: int) -> None:
-    """Played at random, with loads put down on everything: whoever picks one of them makes the scene collapse."""
+    """In random play with loads on everything, picking an immovable object always collapses."""
     assert JUDGE.immovable_objects(HELD_DOWN) == frozenset(FIXED)
     scene, generator = HELD_DOWN, rng(seed)
     moved, tried = 0, 0

@@ -1,4 +1,4 @@
-"""The fast judge against statics done by hand, what it cannot judge, and against Drake."""
+"""The static judge against closed-form statics and Drake; inconclusive scenes."""
 
 from dataclasses import replace
 
@@ -29,12 +29,12 @@ STEP = 0.0001
 """m, to which `margins` knows them."""
 
 
-FAST = StaticStabilityJudge(ClutterConfig())
-"""As the fixture `fast`, for hypothesis, which warns of fixtures that it does not make anew."""
+STATIC_JUDGE = StaticStabilityJudge(ClutterConfig())
+"""The fixture `static_judge` for hypothesis, which warns of function-scoped fixtures."""
 
 
 def stands(*objects: SceneObject) -> bool:
-    found = FAST.find_instability(scene_of(*objects))
+    found = STATIC_JUDGE.find_instability(scene_of(*objects))
     assert not isinstance(found, InconclusiveVerdict), str(found)
     return found is None
 
@@ -54,9 +54,12 @@ def reason_of(
 )
 @pytest.mark.parametrize(("axis", "half"), [(0, 0.115), (1, 0.080)], ids=["along", "across"])
 def test_the_tipping_point(class_name: str, axis: int, half: float) -> None:
-    """What is uniform tips when its middle is beyond the edge; the judge wants the margin more. To 1 mm, and then to 0.1 mm."""
-    for millimetres in [*range(-6, 7), *np.arange(-2.4, -1.7, 0.1)]:
-        offset = half + millimetres / 1000
+    """A uniform object tips when its center is beyond the edge, less the margin.
+
+    Checked to 1 mm, then to 0.1 mm.
+    """
+    for millimeters in [*range(-6, 7), *np.arange(-2.4, -1.7, 0.1)]:
+        offset = half + millimeters / 1000
         for sign in (-1, 1):
             xy = [0.0, 0.0]
             xy[axis] = sign * offset
@@ -69,7 +72,7 @@ def test_the_margin_grows_with_the_offsets() -> None:
     """3 mm instead of 1 mm: a box that is 4 mm inside the edge may be pushed over it."""
     scene = scene_of(BELOW, resting("sugar_box", xy=(0.111, 0.0), floor=0.060, name="above"))
     wide = world_with("settle.jitter=0.003")
-    assert FAST.find_instability(scene) is None
+    assert STATIC_JUDGE.find_instability(scene) is None
     fallen = Instability(InstabilityReason.UNBALANCED, "above")
     assert (
         StaticStabilityJudge(wide).find_instability(scene)
@@ -187,7 +190,7 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
 
 @pytest.mark.parametrize(("objects", "reason"), TABLE.values(), ids=list(TABLE))
 def test_known_statics(objects: list[SceneObject], reason: InstabilityReason | None) -> None:
-    assert reason_of(FAST.find_instability(scene_of(*objects))) is reason
+    assert reason_of(STATIC_JUDGE.find_instability(scene_of(*objects))) is reason
 
 
 @pytest.mark.parametrize(("objects", "reason"), TABLE.values(), ids=list(TABLE))
@@ -207,7 +210,7 @@ def test_numerical_noise_is_no_matter(
                 ),
             )
         )
-    assert reason_of(FAST.find_instability(scene_of(*noisy))) is reason
+    assert reason_of(STATIC_JUDGE.find_instability(scene_of(*noisy))) is reason
 
 
 def test_the_verdict_names_what_falls_in_the_first_stack_that_does() -> None:
@@ -216,16 +219,16 @@ def test_the_verdict_names_what_falls_in_the_first_stack_that_does() -> None:
         resting("cracker_box", xy=(0.0, 0.2), name="foot"),
         resting("gelatin_box", xy=(0.0, 0.29), floor=0.060, name="b"),
     ]
-    assert FAST.find_instability(scene_of(*falling, *other)) == Instability(
+    assert STATIC_JUDGE.find_instability(scene_of(*falling, *other)) == Instability(
         InstabilityReason.UNBALANCED, "first"
     )
-    assert FAST.find_instability(scene_of(*other, *falling)) == Instability(
+    assert STATIC_JUDGE.find_instability(scene_of(*other, *falling)) == Instability(
         InstabilityReason.UNBALANCED, "b"
     )
 
 
 ARCH = scene_of(
-    # Tall boxes whose middles are 3 mm beyond their feet, kept apart by a box on both their inner edges.
+    # Tall boxes whose centers are 3 mm beyond their feet, kept apart by a box on both inner edges.
     *(
         resting("cracker_box", Orientation.FLAT_90, (s * 0.213, 0.0), name=f"foot {s}")
         for s in (-1, 1)
@@ -239,8 +242,12 @@ ARCH = scene_of(
 
 
 def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -> None:
-    """About the edge of its foot a leg is pulled inwards by its weight, 4 N at 3 mm + 2 mm, and by half the bridge, 2 N at up to
-    20 mm: 0.06 Nm. The bridge pushes it out at 230 mm with up to 0.3 x 2 N: 0.14 Nm. Without friction nothing does."""
+    """The arch stands only with friction.
+
+    About the edge of its foot, a leg is pulled inwards by its weight (4 N at 3 mm + 2 mm) and by
+    half the bridge (2 N at up to 20 mm): 0.06 Nm. The bridge pushes it outwards at 230 mm with up
+    to 0.3 x 2 N: 0.14 Nm.
+    """
     assert StaticStabilityJudge(config).find_instability(ARCH) is None
     assert judge.judge(ARCH, rng()).stable
     for friction in (0.0, 0.1):  # 0.05 Nm do not suffice either
@@ -248,7 +255,7 @@ def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -
             reason_of(StaticStabilityJudge(config, friction=friction).find_instability(ARCH))
             is InstabilityReason.UNBALANCED
         )
-    margins = FAST.stability_margins(ARCH)  # under vertical forces
+    margins = STATIC_JUDGE.stability_margins(ARCH)  # under vertical forces
     assert not isinstance(margins, InconclusiveVerdict)
     assert max(margins.values()) < 0
 
@@ -328,22 +335,24 @@ def test_what_it_cannot_judge(
     scene = scene_of(*objects)
     answer = InconclusiveVerdict(reason, "it")
     assert (
-        FAST.find_supports(scene)
-        == FAST.stability_margins(scene)
-        == FAST.immovable_objects(scene)
+        STATIC_JUDGE.find_supports(scene)
+        == STATIC_JUDGE.stability_margins(scene)
+        == STATIC_JUDGE.immovable_objects(scene)
         == answer
     )
-    losing = FAST.objects_losing_support(scene, "it")
+    losing = STATIC_JUDGE.objects_losing_support(scene, "it")
     if reason is InconclusiveReason.UNSUPPORTED:
         assert losing in (
             answer,
             InconclusiveVerdict(InconclusiveReason.FLOATING, "it"),
         )  # of its group alone, to which the other is not
-        assert FAST.find_instability(scene) == Instability(InstabilityReason.UNSUPPORTED, "it")
+        assert STATIC_JUDGE.find_instability(scene) == Instability(
+            InstabilityReason.UNSUPPORTED, "it"
+        )
         return
     assert losing == answer
     generator, untouched = rng(), rng()
-    assert FAST.find_instability(scene) == FAST.judge(scene, generator) == answer
+    assert STATIC_JUDGE.find_instability(scene) == STATIC_JUDGE.judge(scene, generator) == answer
     assert (
         generator.random() == untouched.random()
     )  # so that Drake draws the same offsets when it is asked instead
@@ -352,8 +361,11 @@ def test_what_it_cannot_judge(
 
 @pytest.mark.parametrize("degrees", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("class_name", ["sugar_box", "tomato_soup_can", "large_marker"])
-def test_what_hardly_leans_is_judged(class_name: str, degrees: float) -> None:
-    assert FAST.find_instability(scene_of(leaning(resting(class_name, name="it"), degrees))) is None
+def test_a_slight_lean_is_judged(class_name: str, degrees: float) -> None:
+    assert (
+        STATIC_JUDGE.find_instability(scene_of(leaning(resting(class_name, name="it"), degrees)))
+        is None
+    )
 
 
 # --- The whole verdict, and Drake's ---
@@ -377,12 +389,15 @@ PARTLY = scene_of(
     [HIDING, PARTLY, *(scene_of(*objects) for objects in STABLE.values())],
     ids=["hiding", "partly", *STABLE],
 )
-def test_stable_scenes_look_as_drake_says(
-    scene: Scene, config: ClutterConfig, fast: StaticStabilityJudge, judge: DrakeJudge
+def test_stable_scenes_agree_with_drake(
+    scene: Scene, config: ClutterConfig, static_judge: StaticStabilityJudge, judge: DrakeJudge
 ) -> None:
-    """The same offsets are drawn; then a marker, and what lies on markers, rolls by what still counts as rest. What Drake has
-    settled, the fast judge takes for settled."""
-    mine, drakes = fast.judge(scene, rng(3)), judge.judge(scene, rng(3))
+    """The static verdict agrees with Drake's for equal random offsets.
+
+    In Drake, a marker and objects on markers may roll within the limits. A scene that Drake has
+    settled is stable for the static judge.
+    """
+    mine, drakes = static_judge.judge(scene, rng(3)), judge.judge(scene, rng(3))
     assert isinstance(mine, Verdict)
     assert mine.stable
     assert drakes.stable
@@ -395,14 +410,17 @@ def test_stable_scenes_look_as_drake_says(
             < config.settle.max_rest_displacement
         )
         assert np.hypot(*(mine.settled[name].p - scene[name].X_TO.p)[:2]) <= 0.001
-    assert fast.find_instability(scene.with_poses(drakes.settled)) is None
+    assert static_judge.find_instability(scene.with_poses(drakes.settled)) is None
 
 
 @pytest.mark.parametrize(("objects", "reason", "name"), FALLING.values(), ids=list(FALLING))
 def test_what_falls_in_drake(
-    objects: list[SceneObject], reason: InstabilityReason, name: str, fast: StaticStabilityJudge
+    objects: list[SceneObject],
+    reason: InstabilityReason,
+    name: str,
+    static_judge: StaticStabilityJudge,
 ) -> None:
-    verdict = fast.judge(scene_of(*objects), rng())
+    verdict = static_judge.judge(scene_of(*objects), rng())
     if isinstance(verdict, InconclusiveVerdict):
         assert verdict.reason in (InconclusiveReason.FLOATING, InconclusiveReason.OUTSIDE_TRAY)
         assert verdict.object == name
@@ -417,11 +435,11 @@ def test_what_falls_in_drake(
 
 
 def test_the_same_rng_gives_the_same_verdict(
-    config: ClutterConfig, fast: StaticStabilityJudge
+    config: ClutterConfig, static_judge: StaticStabilityJudge
 ) -> None:
-    verdict = fast.judge(HIDING, rng(5))
+    verdict = static_judge.judge(HIDING, rng(5))
     assert StaticStabilityJudge(config).judge(HIDING, rng(5)) == verdict
-    other = fast.judge(HIDING, rng(6))
+    other = static_judge.judge(HIDING, rng(6))
     assert isinstance(other, Verdict)
     assert isinstance(verdict, Verdict)
     assert other.settled != verdict.settled
@@ -436,14 +454,14 @@ def test_the_threshold_of_hidden_is_the_configs(config: ClutterConfig) -> None:
 
 
 @pytest.mark.parametrize("name", ["a box on its shelf above nothing", "a stack beside the tray"])
-def test_what_the_fast_judge_cannot_judge_drake_does(
+def test_inconclusive_scenes_are_judged_in_drake(
     name: str, config: ClutterConfig, judge: DrakeJudge
 ) -> None:
     scene = scene_of(*FALLING[name][0])
     assert HybridJudge(config).judge(scene, rng(2)) == judge.judge(scene, rng(2))
 
 
-def test_what_the_fast_judge_can_judge_drake_is_not_asked(
-    config: ClutterConfig, fast: StaticStabilityJudge
+def test_conclusive_scenes_are_not_judged_in_drake(
+    config: ClutterConfig, static_judge: StaticStabilityJudge
 ) -> None:
-    assert HybridJudge(config).judge(HIDING, rng(2)) == fast.judge(HIDING, rng(2))
+    assert HybridJudge(config).judge(HIDING, rng(2)) == static_judge.judge(HIDING, rng(2))

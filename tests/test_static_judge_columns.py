@@ -1,4 +1,4 @@
-"""The fast judge on random columns: against a formula, and against itself where nothing may matter."""
+"""The static judge on random columns, against a formula and its own symmetries."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW
-from test_static_judge import FAST, MARGIN, STEP, UPRIGHT, reason_of, stands
+from test_static_judge import MARGIN, STATIC_JUDGE, STEP, UPRIGHT, reason_of, stands
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -30,9 +30,9 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 # --- Columns, for which there is a formula ---
 
 BOXES = ["cracker_box", "sugar_box", "pudding_box", "gelatin_box", "granola_box"]
-MILLIMETRE = 0.001013
+MILLIMETER = 0.001013
 """m. Sizes are round, so that no outline begins just where another one ends."""
-OFFSETS = st.integers(-60, 60).map(lambda k: k * MILLIMETRE)
+OFFSETS = st.integers(-60, 60).map(lambda k: k * MILLIMETER)
 LAYERS = st.lists(
     st.tuples(st.sampled_from(BOXES), st.sampled_from(list(Orientation)), OFFSETS, OFFSETS),
     min_size=2,
@@ -65,7 +65,10 @@ def how_far_inside(box: SceneObject, p_T: NDArray[np.float64]) -> float:
 
 
 def column_margins(objects: Sequence[SceneObject]) -> list[float]:
-    """m, for each object: how far the centre of mass of all from it upwards is inside the outlines that meet below it."""
+    """Return for each object the margin of the center of mass of the column above it [m].
+
+    It is measured in the outlines that meet below the object.
+    """
     masses = np.array([o.object_class.mass for o in objects])
     middles = np.array([o.X_TO.p for o in objects])
     found = []
@@ -85,18 +88,21 @@ def column_margins(objects: Sequence[SceneObject]) -> list[float]:
     [("cracker_box", Orientation.FLAT_0, 0.0, 0.0), ("sugar_box", Orientation.FLAT_0, 0.1125, 0.0)]
 )
 @settings(max_examples=100)
-def test_a_column_stands_while_every_centre_of_mass_is_inside(layers: Layers) -> None:
-    """And the margins are how far inside it is, in steps of 0.1 mm; where another contact fails, nothing helps."""
+def test_a_column_stands_while_every_center_of_mass_is_inside(layers: Layers) -> None:
+    """Margins are the distances to the edge, in steps of 0.1 mm.
+
+    If another contact of the column fails, the margin is the smallest value.
+    """
     objects = column(layers)
     scene = scene_of(*objects)
-    margins = FAST.stability_margins(scene)
+    margins = STATIC_JUDGE.stability_margins(scene)
     assume(
         not isinstance(margins, InconclusiveVerdict)
     )  # out of the tray, or beside what should carry it
     assert not isinstance(margins, InconclusiveVerdict)
     expected = column_margins(objects)
     assume(all(abs(e) > STEP for e in expected) and abs(min(expected) - MARGIN) > 1e-5)
-    found = FAST.find_instability(scene)
+    found = STATIC_JUDGE.find_instability(scene)
     assert reason_of(found) is (None if min(expected) > MARGIN else InstabilityReason.UNBALANCED)
     for k, o in enumerate(objects):
         hopeless = any(other < 0 for other in expected[:k] + expected[k + 1 :])
@@ -107,13 +113,13 @@ def test_a_column_stands_while_every_centre_of_mass_is_inside(layers: Layers) ->
 @given(LAYERS, st.integers(0, 3))
 @settings(max_examples=60)
 def test_losing_support_is_what_the_rest_cannot_do_without(layers: Layers, which: int) -> None:
-    """Of a column that stands, what is left without an object stands exactly if nothing loses its support."""
+    """The rest of a stable column stands exactly if no object loses its support."""
     objects = column(layers)
     scene = scene_of(*objects)
-    assume(FAST.find_instability(scene) is None)
+    assume(STATIC_JUDGE.find_instability(scene) is None)
     taken = objects[which % len(objects)].name
     rest = [o for o in objects if o.name != taken]
-    losing = FAST.objects_losing_support(scene, taken)
+    losing = STATIC_JUDGE.objects_losing_support(scene, taken)
     above = tuple(o.name for o in objects[objects.index(scene[taken]) + 1 :])
     assert not isinstance(losing, InconclusiveVerdict)
     assert set(above) <= set(losing)
@@ -134,7 +140,10 @@ FEET = [
 
 
 def on_feet(feet: Sequence[tuple[float, float]], top: SceneObject, margin: float) -> bool:
-    """Whether the middle of a box lies in the hull of what is left of its contacts: by a linear programme."""
+    """Return whether a box's center is in the hull of its shrunk contacts.
+
+    Computed by a linear program.
+    """
     low, high = top.bounds_T[0][:2] + margin, top.bounds_T[1][:2] - margin
     corners = []
     for foot in feet:
@@ -157,14 +166,17 @@ def on_feet(feet: Sequence[tuple[float, float]], top: SceneObject, margin: float
     st.tuples(OFFSETS, OFFSETS),
 )
 @settings(max_examples=100)
-def test_a_box_on_feet_stands_while_its_middle_is_between_them(
+def test_a_box_on_feet_stands_while_its_center_is_between_them(
     feet: list[tuple[float, float]], orientation: Orientation, xy: tuple[float, float]
 ) -> None:
-    """Statically indeterminate from two feet on. The feet are alike at top and bottom: they carry what is put on them."""
+    """Boxes on several feet, a statically indeterminate problem.
+
+    Top and bottom of the feet are alike: they carry what is put on them.
+    """
     top = resting("cereal_box_large", orientation, xy, 0.175, "top")
     expected = on_feet(feet, top, MARGIN)
     assume(on_feet(feet, top, MARGIN - 1e-5) == expected == on_feet(feet, top, MARGIN + 1e-5))
-    found = FAST.find_instability(
+    found = STATIC_JUDGE.find_instability(
         scene_of(*(resting("sugar_box", UPRIGHT, foot, name=f"{foot}") for foot in feet), top)
     )
     assume(reason_of(found) is not InconclusiveReason.FLOATING)
@@ -202,16 +214,16 @@ def turned(scene: Scene, quarters: int) -> Scene:
 def test_the_place_on_the_tray_is_no_matter(layers: Layers, x: int, y: int) -> None:
     scene = scene_of(*column(layers), side=2.0)
     assert reason_of(
-        FAST.find_instability(shifted(scene, x * MILLIMETRE, y * MILLIMETRE))
-    ) is reason_of(FAST.find_instability(scene))
+        STATIC_JUDGE.find_instability(shifted(scene, x * MILLIMETER, y * MILLIMETER))
+    ) is reason_of(STATIC_JUDGE.find_instability(scene))
 
 
 @given(ANYTHING, st.integers(1, 3))
 @settings(max_examples=60)
 def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
     scene = scene_of(*column(layers), side=2.0)
-    assert reason_of(FAST.find_instability(turned(scene, quarters))) is reason_of(
-        FAST.find_instability(scene)
+    assert reason_of(STATIC_JUDGE.find_instability(turned(scene, quarters))) is reason_of(
+        STATIC_JUDGE.find_instability(scene)
     )
 
 
@@ -220,20 +232,22 @@ def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
 def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) -> None:
     """Unless two objects cannot be judged, of which the first is named."""
     scene = scene_of(*column(layers), side=2.0)
-    supports = FAST.find_supports(scene)
+    supports = STATIC_JUDGE.find_supports(scene)
     assume(not isinstance(supports, InconclusiveVerdict))
     objects = list(scene.objects)
     shuffle.shuffle(objects)
     other = replace(scene, objects=tuple(objects))
-    assert reason_of(FAST.find_instability(other)) is reason_of(FAST.find_instability(scene))
-    assert FAST.find_supports(other) == supports
-    assert FAST.stability_margins(other) == pytest.approx(
-        FAST.stability_margins(scene), abs=1.01 * STEP
+    assert reason_of(STATIC_JUDGE.find_instability(other)) is reason_of(
+        STATIC_JUDGE.find_instability(scene)
+    )
+    assert STATIC_JUDGE.find_supports(other) == supports
+    assert STATIC_JUDGE.stability_margins(other) == pytest.approx(
+        STATIC_JUDGE.stability_margins(scene), abs=1.01 * STEP
     )
     for name in scene.names:
         one, same = (
-            FAST.objects_losing_support(scene, name),
-            FAST.objects_losing_support(other, name),
+            STATIC_JUDGE.objects_losing_support(scene, name),
+            STATIC_JUDGE.objects_losing_support(other, name),
         )
         assert not isinstance(one, InconclusiveVerdict)
         assert not isinstance(same, InconclusiveVerdict)
@@ -249,13 +263,13 @@ def test_a_stack_far_away_is_no_matter(layers: Layers) -> None:
         resting("sugar_box", xy=(0.8, 0.8), floor=0.060, name="far"),
     ]
     for objects in ((*scene.objects, *far), (*far, *scene.objects)):
-        assert FAST.find_instability(replace(scene, objects=objects)) == FAST.find_instability(
-            scene
-        )
+        assert STATIC_JUDGE.find_instability(
+            replace(scene, objects=objects)
+        ) == STATIC_JUDGE.find_instability(scene)
 
 
-def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
-    """The same verdicts, bit for bit, as those of a judge that has seen nothing, over scenes that come back, changed a little."""
+def test_verdicts_do_not_depend_on_earlier_ones(config: ClutterConfig) -> None:
+    """Cached verdicts equal those of a new judge, bit for bit, in slowly changing scenes."""
     used = StaticStabilityJudge(config)
     scenes = [random_scene(seed, 4, 17) for seed in range(12)]
     generator = rng(7)
@@ -278,7 +292,7 @@ def test_what_was_judged_before_is_no_matter(config: ClutterConfig) -> None:
     assert kinds >= {True, False}
 
 
-def test_which_of_two_twins_falls_does_not_depend_on_what_was_judged_before(
+def test_the_first_of_two_identical_objects_falls_whatever_was_judged_before(
     config: ClutterConfig,
 ) -> None:
     used = StaticStabilityJudge(config)
@@ -299,7 +313,7 @@ def test_a_force_that_ends_at_zero_ends_no_search() -> None:
     ]
     layers.append(("sugar_box", 0.001013, 0.001013))
     scene = scene_of(*column([(name, Orientation.FLAT_0, x, y) for name, x, y in layers]))
-    assert reason_of(FAST.find_instability(scene)) is InstabilityReason.UNBALANCED
+    assert reason_of(STATIC_JUDGE.find_instability(scene)) is InstabilityReason.UNBALANCED
 
 
 def test_any_number_of_orientations(config: ClutterConfig) -> None:

@@ -1,4 +1,4 @@
-"""What the fast judge says step by step: margins, supports, what falls when something goes, what can never be moved."""
+"""Margins, supports, objects losing support, and immovable objects."""
 
 import math
 from pathlib import Path
@@ -9,7 +9,7 @@ from conftest import CLASSES, random_scene, resting, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
-from test_static_judge import ARCH, FAST, MARGIN, TABLE, TOO_FAR, UPRIGHT
+from test_static_judge import ARCH, MARGIN, STATIC_JUDGE, TABLE, TOO_FAR, UPRIGHT
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
@@ -52,7 +52,7 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
     ],
 )
 def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, float]) -> None:
-    found = FAST.stability_margins(scene_of(*objects))
+    found = STATIC_JUDGE.stability_margins(scene_of(*objects))
     assert not isinstance(found, InconclusiveVerdict)
     assert {name: 1000 * margin for name, margin in found.items()} == pytest.approx(
         margins, abs=0.11
@@ -60,7 +60,7 @@ def test_margins_in_millimetres(objects: list[SceneObject], margins: dict[str, f
 
 
 def test_what_rolls_has_no_margin() -> None:
-    margins = FAST.stability_margins(scene_of(*TABLE["a box on a marker"][0]))
+    margins = STATIC_JUDGE.stability_margins(scene_of(*TABLE["a box on a marker"][0]))
     assert not isinstance(margins, InconclusiveVerdict)
     assert min(margins.values()) < MARGIN
 
@@ -96,24 +96,26 @@ TWO_STACKS = scene_of(
     ids=["two stacks", "bridge", "counterweight", "pair of markers"],
 )
 def test_losing_support(scene: Scene, losing: dict[str, tuple[str, ...]]) -> None:
-    assert FAST.find_instability(scene) is None
-    assert {name: FAST.objects_losing_support(scene, name) for name in scene.names} == losing
+    assert STATIC_JUDGE.find_instability(scene) is None
+    assert {
+        name: STATIC_JUDGE.objects_losing_support(scene, name) for name in scene.names
+    } == losing
 
 
 def test_losing_support_is_in_the_scenes_order_and_of_one_stack() -> None:
-    """Taking the lowest of five: all fall, also those that only lie on what falls; the stack beside it stays."""
+    """Removing the lowest of five objects makes all fall; the stack beside them stays."""
     tower = [resting("gelatin_box", floor=0.028 * k, name=f"{k}") for k in range(5)]
     scene = scene_of(*tower[::-1], resting("cracker_box", xy=(0.2, 0.2), name="beside"))
-    assert FAST.objects_losing_support(scene, "0") == ("4", "3", "2", "1")
-    assert FAST.objects_losing_support(scene, "3") == ("4",)
-    assert FAST.objects_losing_support(scene, "beside") == ()
+    assert STATIC_JUDGE.objects_losing_support(scene, "0") == ("4", "3", "2", "1")
+    assert STATIC_JUDGE.objects_losing_support(scene, "3") == ("4",)
+    assert STATIC_JUDGE.objects_losing_support(scene, "beside") == ()
 
 
 def test_only_an_object_of_the_scene_can_be_taken() -> None:
     with pytest.raises(KeyError, match="'ghost' is not in the scene; it holds a, b, c, d, e"):
-        FAST.objects_losing_support(TWO_STACKS, "ghost")
+        STATIC_JUDGE.objects_losing_support(TWO_STACKS, "ghost")
     with pytest.raises(KeyError, match="'tray'"):
-        FAST.objects_losing_support(TWO_STACKS, TRAY)
+        STATIC_JUDGE.objects_losing_support(TWO_STACKS, TRAY)
 
 
 @pytest.mark.parametrize(
@@ -143,12 +145,15 @@ def test_only_an_object_of_the_scene_can_be_taken() -> None:
     ids=["two stacks", "bridge", "side by side", "a small step"],
 )
 def test_supports(scene: Scene, supports: dict[str, set[str]]) -> None:
-    assert FAST.find_supports(scene) == {name: frozenset(below) for name, below in supports.items()}
+    assert STATIC_JUDGE.find_supports(scene) == {
+        name: frozenset(below) for name, below in supports.items()
+    }
 
 
 # --- What can never be moved ---
 
-# A box on a foot, 32 mm too far out, under a larger one that holds it down and leaves free only what is beyond the foot.
+# A box on a foot, 32 mm too far out, under a larger one that holds it down and leaves only the part
+# beyond the foot free.
 HELD_DOWN = scene_of(
     resting("sugar_box", UPRIGHT, (-0.0445, 0.0), name="foot"),
     resting("cracker_box", xy=(0.032, 0.0), floor=0.175, name="held"),
@@ -158,37 +163,43 @@ HELD_DOWN = scene_of(
 
 def test_what_only_its_load_holds_down_is_fixed() -> None:
     """Whatever is pressed onto the box beyond its load makes it fall sooner: nothing can begin."""
-    assert FAST.find_instability(HELD_DOWN) is None
-    assert FAST.immovable_objects(HELD_DOWN) == frozenset({"foot", "held", "weight"})
-    assert FAST.immovable_objects(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
+    assert STATIC_JUDGE.find_instability(HELD_DOWN) is None
+    assert STATIC_JUDGE.immovable_objects(HELD_DOWN) == frozenset({"foot", "held", "weight"})
+    assert STATIC_JUDGE.immovable_objects(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
     beside = scene_of(*HELD_DOWN.objects, resting("gelatin_box", xy=(-0.25, -0.25), name="beside"))
     on_top = scene_of(
         *HELD_DOWN.objects, resting("gelatin_box", xy=(-0.060, 0.0), floor=0.300, name="on top")
     )
     for scene in (beside, on_top):
-        assert FAST.find_instability(scene) is None
-        assert FAST.immovable_objects(scene) == frozenset({"foot", "held", "weight"})
+        assert STATIC_JUDGE.find_instability(scene) is None
+        assert STATIC_JUDGE.immovable_objects(scene) == frozenset({"foot", "held", "weight"})
 
 
 def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
-    """A weight of 140 mm leaves strips of a box of 160 mm free over the foot: something may press there when it goes."""
+    """A weight of 140 mm leaves strips of a box of 160 mm free over the foot.
+
+    Objects may press there when the weight is removed.
+    """
     narrower = scene_of(
         *HELD_DOWN.objects[:2], resting("granola_box", xy=(-0.060, 0.0), floor=0.235, name="weight")
     )
-    assert FAST.find_instability(narrower) is None
-    assert FAST.objects_losing_support(narrower, "weight") == ("held",)
-    assert FAST.immovable_objects(narrower) == frozenset()
+    assert STATIC_JUDGE.find_instability(narrower) is None
+    assert STATIC_JUDGE.objects_losing_support(narrower, "weight") == ("held",)
+    assert STATIC_JUDGE.immovable_objects(narrower) == frozenset()
 
 
 def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
-    """A class without assets, which the fast judge does not need."""
+    """A class without assets, which the static judge does not need."""
     return ObjectClass(
         name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere")
     )
 
 
 def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64]) -> Scene:
-    """Two boxes, each with its middle beyond a foot of 20 mm x 90 mm, and over the gap between them what holds them down."""
+    """Return two boxes with centers beyond their feet, held down by a load over the gap.
+
+    The feet are 20 mm x 90 mm.
+    """
     foot = SceneObject(
         "foot", block("foot", Shape.BOX, (0.09, 0.02, 0.10), 0.2), Pose((0.0, 0.0, 0.05))
     )
@@ -204,19 +215,22 @@ def a_pair_on_a_narrow_foot(class_of_load: ObjectClass, R_TO: NDArray[np.float64
 
 
 def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
-    """A heavy roll over the gap covers what is free over the foot, and when one of the pair goes, nothing keeps it up: what can
-    be put on it presses on its top, over the gap. On a flat load something could be put down first, over the other half."""
+    """A heavy roll over the gap makes the boxes immovable, a flat load does not.
+
+    The roll covers the free parts over the feet, and objects on it press over the gap. On a flat
+    load, an object can first be put on the other half.
+    """
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     rolled = a_pair_on_a_narrow_foot(
         block("roll", Shape.CYLINDER, (0.018, 0.018, 0.12), 3.0), lying
     )
-    assert FAST.find_instability(rolled) is None
-    assert FAST.immovable_objects(rolled) == frozenset(rolled.names)
+    assert STATIC_JUDGE.find_instability(rolled) is None
+    assert STATIC_JUDGE.immovable_objects(rolled) == frozenset(rolled.names)
     flat = a_pair_on_a_narrow_foot(block("bar", Shape.BOX, (0.12, 0.018, 0.018), 3.0), np.eye(3))
-    assert FAST.find_instability(flat) is None
-    assert FAST.immovable_objects(flat) == frozenset()
+    assert STATIC_JUDGE.find_instability(flat) is None
+    assert STATIC_JUDGE.immovable_objects(flat) == frozenset()
     assert all(
-        FAST.objects_losing_support(flat, name) for name in flat.names
+        STATIC_JUDGE.objects_losing_support(flat, name) for name in flat.names
     )  # though as it is, nothing can be taken
 
 
@@ -224,30 +238,30 @@ def test_a_pair_that_its_load_holds_down_is_fixed() -> None:
     "scene", [TWO_STACKS, BRIDGE, ARCH, *(scene_of(*objects) for objects in STABLE.values())]
 )
 def test_ordinary_stacks_have_nothing_fixed(scene: Scene) -> None:
-    assert FAST.immovable_objects(scene) == frozenset()
+    assert STATIC_JUDGE.immovable_objects(scene) == frozenset()
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_what_can_be_taken_off_a_random_scene_is_not_fixed(seed: int) -> None:
     scene = random_scene(seed, 4, 17)
-    fixed = FAST.immovable_objects(scene)
+    fixed = STATIC_JUDGE.immovable_objects(scene)
     if isinstance(fixed, InconclusiveVerdict):
-        assert FAST.find_supports(scene) == fixed
+        assert STATIC_JUDGE.find_supports(scene) == fixed
         return
-    loose = {name for name in scene.names if FAST.objects_losing_support(scene, name) == ()}
-    if FAST.find_instability(scene) is None:
+    loose = {name for name in scene.names if STATIC_JUDGE.objects_losing_support(scene, name) == ()}
+    if STATIC_JUDGE.find_instability(scene) is None:
         assert loose
         assert loose.isdisjoint(fixed)
 
 
-def test_a_tower_comes_apart_from_the_top() -> None:
+def test_a_tower_is_disassembled_from_the_top() -> None:
     tower = [resting("cracker_box", floor=k * 0.060, name=f"box{k}") for k in range(4)]
-    assert FAST.is_disassemblable(scene_of(*tower)) is True
-    assert FAST.is_disassemblable(scene_of()) is True
+    assert STATIC_JUDGE.is_disassemblable(scene_of(*tower)) is True
+    assert STATIC_JUDGE.is_disassemblable(scene_of()) is True
 
 
-def test_what_holds_each_other_down_does_not_come_apart() -> None:
-    """Two sugar boxes side by side on a can, 12.5 mm too far out to stay by themselves: two cracker boxes keep them down."""
+def test_objects_that_hold_each_other_down_are_not_disassemblable() -> None:
+    """Return two sugar boxes on a can, 12.5 mm too far out, held down by two cracker boxes."""
     can = resting("tomato_soup_can", name="can")
     leaning = [
         resting("sugar_box", xy=(0.0, side * 0.0455), floor=0.101, name=f"sugar{side}")
@@ -257,15 +271,16 @@ def test_what_holds_each_other_down_does_not_come_apart() -> None:
         resting("cracker_box", floor=0.101 + 0.038 + k * 0.060, name=f"load{k}") for k in (0, 1)
     ]
     held = scene_of(can, *leaning, *load)
-    assert FAST.find_instability(held) is None
-    assert FAST.is_disassemblable(held) is False
-    assert FAST.find_instability(scene_of(can, *leaning)) is not None
+    assert STATIC_JUDGE.find_instability(held) is None
+    assert STATIC_JUDGE.is_disassemblable(held) is False
+    assert STATIC_JUDGE.find_instability(scene_of(can, *leaning)) is not None
     beside = resting("cracker_box", xy=(0.22, 0.22), name="beside")
-    assert FAST.is_disassemblable(scene_of(*held.objects, beside)) is False
-    assert FAST.is_disassemblable(scene_of(beside)) is True
+    assert STATIC_JUDGE.is_disassemblable(scene_of(*held.objects, beside)) is False
+    assert STATIC_JUDGE.is_disassemblable(scene_of(beside)) is True
 
 
-def test_beyond_the_model_it_does_not_say_whether_it_comes_apart() -> None:
+def test_disassembly_of_scenes_beyond_the_model_is_inconclusive() -> None:
     assert isinstance(
-        FAST.is_disassemblable(scene_of(resting("cracker_box", floor=0.1))), InconclusiveVerdict
+        STATIC_JUDGE.is_disassemblable(scene_of(resting("cracker_box", floor=0.1))),
+        InconclusiveVerdict,
     )

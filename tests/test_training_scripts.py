@@ -178,7 +178,7 @@ def test_a_set_of_scenes(with_poses: bool, tmp_path: Path) -> None:
 def test_a_set_to_learn_from_holds_no_graph_that_falls_in_drake(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The fast judge calls this one stable; Drake has the last word."""
+    """The static judge calls this one stable; Drake has the last word."""
     script = training_script("generate_scene_dataset")
     judge = script.GraphJudge(GenerationJob("random", "ycb7", None, 10, 1, ClutterConfig()))
     index = next(k for k in range(20) if judge(k).get("hidden"))
