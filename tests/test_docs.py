@@ -100,8 +100,9 @@ PARSED = {
     "evaluate_explorers",
     "evaluate_generators",
     "judge_agreement",
+    "random_generator_calibration",
 }
-"""Scripts that take minutes for the smallest case: only their options are looked up."""
+"""Scripts without a case of a few seconds: only their options are looked up."""
 
 
 @dataclass(frozen=True)
