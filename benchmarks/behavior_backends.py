@@ -268,8 +268,12 @@ def _move_line(transition: Transition) -> Line:
 
 def _recorded_detail(detail: str) -> str:
     """Return the detail of an outcome as the recorded hashes have it."""
-    placed = re.fullmatch(r"placed with an error of (.*)", detail)
-    return f"{placed[1]} from where it was to be" if placed else detail
+    if placed := re.fullmatch(r"placed with an error of (.*)", detail):
+        return f"{placed[1]} from where it was to be"
+    if moved := re.fullmatch(r"(placed|came off the cup) with a horizontal error of (.*)", detail):
+        result = "put down" if moved[1] == "placed" else moved[1]
+        return f"{result}, {moved[2]} from where it was to be"
+    return detail
 
 
 def _pose_numbers(poses: Iterable[Pose]) -> list[float]:

@@ -243,6 +243,6 @@ class ClosedLoop:
         came_off = not grasp.has_held or grasp.lost_object
         outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._world.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
-        detail = "came off the cup" if came_off else "put down"
-        detail += f", {1000 * error:.1f} mm from where it was to be"
+        result = "came off the cup" if came_off else "placed"
+        detail = f"{result} with a horizontal error of {1000 * error:.1f} mm"
         return picked, replace(outcome, detail=detail)
