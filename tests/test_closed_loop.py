@@ -280,9 +280,18 @@ def test_the_last_allowed_move_can_reveal_all_objects(config: ClutterConfig) -> 
     assert task.termination is TerminationReason.ALL_FOUND
 
 
+SCENARIO = """
+generator: sg-star
+agent: student
+perception: labels
+objects: ycb7
+max_moves: 20
+world: {cell: {gripper: {cup_diameter: 0.015}, cameras: {overhead: {depth_noise: false}}}}
+"""
+
+
 def test_scenario_files_and_invalid_scenarios(config: ClutterConfig, tmp_path: Path) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "closed_loop.md").read_text()
-    (tmp_path / "scenario.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
+    (tmp_path / "scenario.yaml").write_text(SCENARIO)
     scenario = load_config_as(
         Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config
     )
