@@ -129,6 +129,21 @@ def test_configuration_page_has_types_defaults_and_ranges() -> None:
     assert rows_of(text, "`ik`")[0][3] == "`ur`, `numerical`"
 
 
+def test_every_field_of_a_config_is_described() -> None:
+    classes = {
+        cls
+        for *_, root in configuration_page.ROOTS
+        for cls in configuration_page.config_classes(root)
+    }
+    missing = {
+        f"{cls.__name__}.{field.name}"
+        for cls in classes
+        for field in configuration_page.config_fields(cls)
+        if not field.meaning
+    }
+    assert missing == set()
+
+
 def test_environments_page_describes_both_observation_spaces() -> None:
     text = environments_page.page()
     assert "<!--" not in text

@@ -76,33 +76,33 @@ def page() -> str:
     for title, introduction, root in ROOTS:
         text += f"\n## {title}\n\n"
         text += f"{introduction}\n\n" if introduction else ""
-        for cls in _classes(root):
+        for cls in config_classes(root):
             if cls not in documented:
                 documented.add(cls)
                 text += _section(cls)
     return text
 
 
-def _classes(root: type) -> Iterator[type]:
-    """Yield a config class and the config classes of its fields, each once, outer ones first."""
+def config_classes(root: type) -> Iterator[type]:
+    """Yield a config class and those of its fields, each once, outer ones first."""
     found = [root]
     for cls in found:
         found += [
             part
             for field in _field_infos(cls).values()
-            for part in _config_classes(field.annotation)
+            for part in _classes_in_type(field.annotation)
             if part not in found
         ]
     yield from found
 
 
-def _config_classes(annotation: Any) -> list[type]:
+def _classes_in_type(annotation: Any) -> list[type]:
     """Return the config classes in a type."""
     if isinstance(annotation, type) and (
         is_dataclass(annotation) or issubclass(annotation, BaseModel)
     ):
         return [annotation]
-    return [cls for part in get_args(annotation) for cls in _config_classes(part)]
+    return [cls for part in get_args(annotation) for cls in _classes_in_type(part)]
 
 
 def _field_infos(cls: type) -> Mapping[str, FieldInfo]:
@@ -156,7 +156,7 @@ def _type_text(annotation: Any) -> str:
         return f"list of {len(parts)} {_plural(kinds.pop())}" if len(kinds) == 1 else "list"
     if origin is dict:
         return f"mapping of names to {_type_text(parts[1])}"
-    if _config_classes(annotation):
+    if _classes_in_type(annotation):
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     names = {float: "number", int: "integer", bool: "boolean", str: "string", type(None): "null"}
     return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
