@@ -1,4 +1,5 @@
-"""Scripts that measure the accuracy and the speed of the simulation and planning code.
+"""Scripts that measure the accuracy and the speed of simulation and planning.
 
-Run them from a checkout, as `python -m benchmarks.NAME` or as `python benchmarks/NAME.py`.
+Run them from the folder of the checkout: `python -m benchmarks.NAME`, or, after an editable
+installation (`pip install --editable .`), also `python benchmarks/NAME.py`.
 """

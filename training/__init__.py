@@ -1,4 +1,5 @@
-"""Scripts that train, evaluate and document the shipped networks.
+"""Scripts that train and evaluate the shipped networks.
 
-Run them from a checkout, as `python -m training.NAME` or as `python training/NAME.py`.
+Run them from the folder of the checkout: `python -m training.NAME`, or, after an editable
+installation (`pip install --editable .`), also `python training/NAME.py`.
 """

@@ -1,0 +1,57 @@
+"""Evaluation of generators on a few small scenes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from drake_clutter.files import InputError
+from training import evaluate_generators as script
+
+
+def test_a_table_of_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(script, "TABLE", [script.GeneratorEvaluation("random", 9, 5)])
+    monkeypatch.setattr(script, "TEMPERATURES", [])
+    out = tmp_path / "table.json"
+    script.main(tmp_path / "scenes", seed=3, out=out, max_scenes=3)
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["count"] == row["row"]["count"] == 3
+    script.main(tmp_path / "scenes", seed=3, out=out)
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["row"] == {
+        "agent": "random",
+        "nodes": 9,
+        "count": 5,
+        "objects": "ycb7",
+        "temperature": None,
+    }
+    assert sum(row["fast_judge"].values()) == 5
+    drake_stable = sum(
+        number
+        for verdicts, number in row["fast_judge"].items()
+        if verdicts.endswith("drake stable")
+    )
+    assert drake_stable == round(5 * row["stability_rate"])
+    assert sum(row["stack_heights_5cm"]) == round(5 * row["mean_stacks"])
+    assert row["seed"] == 3
+    before = out.stat().st_mtime_ns
+    script.main(tmp_path / "scenes", seed=3, out=out)
+    assert out.stat().st_mtime_ns == before, "a complete row is not measured again"
+    with pytest.raises(InputError, match="holds results of another seed"):
+        script.main(tmp_path / "scenes", seed=4, out=out)
+
+
+def test_the_plot_of_the_temperature_effect(tmp_path: Path) -> None:
+    metrics = {
+        "hidden_mean": 5.0,
+        "hidden_ci95": (4.0, 6.0),
+        "stability_rate": 0.9,
+        "solvable_share": 0.8,
+        "distinct_share": 1.0,
+    }
+    metrics |= {"balanced_share": 0.5, "class_entropy": 2.0, "objects": "ycb7"}
+    script.draw_temperature_effect(
+        [{"temperature": 0.1} | metrics, {"temperature": 0.4} | metrics],
+        tmp_path / "temperature.png",
+    )
+    assert (tmp_path / "temperature.png").stat().st_size > 10_000
