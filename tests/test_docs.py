@@ -247,8 +247,8 @@ def run_command(
     match shlex.split(line, comments=True):
         case ["drake-clutter", command, *options]:
             run_drake_clutter(command, smaller(command, options), generated)
-        case ["python", script, *options] if script.startswith("examples/") and not (
-            Path(script).stem in ADDED
+        case ["python", script, *options] if (
+            script.startswith("examples/") and Path(script).stem not in ADDED
         ):
             text = Path(script).read_text(encoding="utf-8")
             assert [o for o in options if o.startswith("--") and f'"{o}"' not in text] == []
