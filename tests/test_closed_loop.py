@@ -301,7 +301,7 @@ def test_scenario_files_and_invalid_scenarios(config: ClutterConfig, tmp_path: P
         5.0,
         0.015,
     )
-    with pytest.raises(InputError, match="agent: full-knowledge knows more than the camera shows"):
+    with pytest.raises(InputError, match="agent: full-knowledge uses the true state"):
         make_policy("full-knowledge", config)
     with pytest.raises(InputError, match=r"none\.yaml: cannot be read"):
         scenario_scene(Scenario(scene=str(tmp_path / "none.yaml")))

@@ -50,7 +50,7 @@ class SegmentView(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _cast_rays_at_box(h, e, ray, step, first, stride, depths):  # type: ignore[no-untyped-def]
-    """See `cast_ray_row`.
+    """Cast a row of rays at a box; see `cast_ray_row`.
 
     Conditional expressions instead of branches let the compiler vectorize over rays.
     """
@@ -72,7 +72,7 @@ def _cast_rays_at_box(h, e, ray, step, first, stride, depths):  # type: ignore[n
 
 @njit(cache=True, error_model="numpy")
 def _cast_rays_at_cylinder(h, e, ray, step, first, stride, depths):  # type: ignore[no-untyped-def]
-    """See `cast_ray_row` and `_cast_rays_at_box`."""
+    """Cast a row of rays at a cylinder; see `cast_ray_row` and `_cast_rays_at_box`."""
     c = e[0] * e[0] + e[1] * e[1] - h[0] * h[0]
     for k in range(len(depths)):
         u = first + k * stride

@@ -107,4 +107,4 @@ def make_policy(name: str, config: ClutterConfig) -> Policy:
         if isinstance(factory, LearnedExplorerFactory) and not factory.privileged:
             return factory()
     allowed = f"a student, or one of {', '.join(BASELINE_POLICIES)}"
-    raise InputError(f"agent: {name} knows more than the camera shows; allowed is {allowed}")
+    raise InputError(f"agent: {name} uses the true state of the scene; allowed is {allowed}")
