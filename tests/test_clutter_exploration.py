@@ -1,4 +1,4 @@
-"""The exploration environment, and learning in it."""
+"""The exploration environment, and the trainings and agents of exploration."""
 
 import json
 import subprocess
@@ -50,7 +50,7 @@ def entry(seed: int) -> SceneRecord:
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Scenes by RG that hide seven, three and two objects, and stand."""
+    """Three stable scenes of the random generator that hide seven, three and two objects."""
     path = tmp_path_factory.mktemp("scenes") / "few.json"
     save_scene_dataset(
         path, {"objects": "ycb7"}, [entry(seed) for seed in (22, 10, 19)], DEFAULT_CELL
@@ -63,21 +63,23 @@ def scenes(file: Path) -> SceneDataset:
     return load_scene_dataset(file, CATALOG)
 
 
-def random_move(observation: dict[str, np.ndarray], draw: np.random.Generator) -> tuple[int, int]:
+def random_move(
+    observation: dict[str, np.ndarray], generator: np.random.Generator
+) -> tuple[int, int]:
     moves = np.argwhere(observation["action_mask"])
-    x, y = moves[draw.integers(len(moves))].tolist()
+    x, y = moves[generator.integers(len(moves))].tolist()
     return x, y
 
 
-def test_it_is_a_gymnasium_environment(file: Path) -> None:
+def test_the_environment_passes_gymnasium_s_checks(file: Path) -> None:
     environment = gymnasium.make(
         "drake_clutter.tasks:ClutterExploration-v0", scenes=file, max_moves=4
     )
     check_env(environment.unwrapped, skip_render_check=True)
 
 
-def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) -> None:
-    """One object is put on the tray again and again."""
+def test_observations_stay_in_their_space_in_long_episodes(file: Path) -> None:
+    """One object is placed on the tray again and again."""
     environment = gymnasium.make(
         "drake_clutter.tasks:ClutterExploration-v0", scenes=str(file), max_moves=40
     ).unwrapped
@@ -96,8 +98,10 @@ def test_its_observations_stay_in_their_space_however_long_it_takes(file: Path) 
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -> None:
-    environment, draw = (
+def test_observations_rewards_and_termination_of_random_episodes(
+    privileged: bool, scenes: SceneDataset
+) -> None:
+    environment, generator = (
         ClutterExploration(scenes, privileged=privileged, max_moves=6),
         np.random.default_rng(0),
     )
@@ -120,20 +124,20 @@ def test_an_episode_of_the_environment(privileged: bool, scenes: SceneDataset) -
                 else tuple(sorted(environment.task.detected))
             )
             assert (known if privileged else tuple(sorted(known))) == shown
-            observation, reward, over, out_of_moves, info = environment.step(
-                random_move(observation, draw)
+            observation, reward, terminated, truncated, info = environment.step(
+                random_move(observation, generator)
             )
             total += float(reward)
             assert environment.objects[: len(known)] == known
             known = environment.objects
-            assert (over or out_of_moves) == ("termination" in info)
+            assert (terminated or truncated) == ("termination" in info)
         ends.add(environment.task.termination)
         collapsed = environment.task.termination is TerminationReason.COLLAPSED
         assert total == len(environment.task.found) - collapsed
     assert len(ends) > 1
 
 
-def test_what_may_not_be_named_changes_nothing(scenes: SceneDataset) -> None:
+def test_masked_moves_change_nothing(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, privileged=True)
     observation, _ = environment.reset(options={"scene": 0})
     hidden = next(
@@ -143,26 +147,26 @@ def test_what_may_not_be_named_changes_nothing(scenes: SceneDataset) -> None:
         k for k in range(1, len(environment.objects) + 1) if observation["action_mask"][k].any()
     )
     for move in ((0, seen), (seen, seen), (hidden, 0), (seen, hidden), (seen, 24), (24, 0)):
-        again, reward, over, out_of_moves, _ = environment.step(move)
-        assert (reward, over, out_of_moves) == (0.0, False, False)
+        again, reward, terminated, truncated, _ = environment.step(move)
+        assert (reward, terminated, truncated) == (0.0, False, False)
         assert all(np.array_equal(again[name], observation[name]) for name in observation)
     assert environment.task.transitions == []
 
 
-def test_an_agent_that_looks_at_no_mask_comes_to_an_end(scenes: SceneDataset) -> None:
+def test_masked_moves_count_as_moves(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, max_moves=3)
     observation, _ = environment.reset(seed=0)
     for number in range(1, 4):
-        *_, over, out_of_moves, info = environment.step(
+        *_, terminated, truncated, info = environment.step(
             (0, 0) if number < 3 else random_move(observation, np.random.default_rng(1))
         )
-        assert (over, out_of_moves) == (False, number == 3)
+        assert (terminated, truncated) == (False, number == 3)
     assert info["termination"] is TerminationReason.OUT_OF_MOVES
     assert len(environment.task.transitions) == 1
 
 
 @pytest.mark.parametrize("fidelity", FIDELITIES)
-def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
+def test_every_fidelity_executes_a_move(scenes: SceneDataset, fidelity: str) -> None:
     environment = ClutterExploration(
         scenes, fidelity=make_backend_factory(fidelity, ClutterConfig())
     )
@@ -177,7 +181,7 @@ def test_a_move_at_every_fidelity(scenes: SceneDataset, fidelity: str) -> None:
     assert after["global_features"].tolist() == [pytest.approx(1 / 20)]
 
 
-def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDataset) -> None:
+def test_a_reset_samples_a_new_layout_or_uses_a_given_scene(scenes: SceneDataset) -> None:
     environment = ClutterExploration(replace(scenes, scenes=(scenes.scenes[1],)))
     starts: list[dict[str, Pose]] = []
     for options in (None, None, {"scene": 0}, {"scene": 0}):
@@ -191,7 +195,7 @@ def test_new_places_at_every_reset_and_frozen_ones_on_demand(scenes: SceneDatase
     ]
 
 
-def test_too_many_objects_are_refused(scenes: SceneDataset) -> None:
+def test_scenes_with_too_many_objects_are_rejected(scenes: SceneDataset) -> None:
     with pytest.raises(InputError, match="none stands and hides something, with at most 2 objects"):
         ClutterExploration(scenes, max_objects=2).reset(seed=0)
     with pytest.raises(InputError, match="max_objects: 2; this scene has 11"):
@@ -200,7 +204,7 @@ def test_too_many_objects_are_refused(scenes: SceneDataset) -> None:
         ClutterExploration(scenes).reset(options={"scene": 3})
 
 
-def test_the_environment_needs_no_arm() -> None:
+def test_the_environment_does_not_import_the_arm() -> None:
     code = "import sys, drake_clutter.tasks.clutter_exploration; print(*sys.modules)"
     command = [sys.executable, "-c", code]
     loaded = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
@@ -212,8 +216,8 @@ def test_the_environment_needs_no_arm() -> None:
 # --- Learning ---
 
 
-def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneDataset) -> None:
-    """Of four episodes, all moves of two are called good, and all of the others bad."""
+def test_ppo_increases_the_probability_of_rewarded_moves(scenes: SceneDataset) -> None:
+    """All moves of two of four episodes are rewarded, and all of the others are penalized."""
     environment = ClutterExploration(scenes, privileged=True, max_moves=4)
     learner = PPOLearner(
         environment, PPOConfig(width=8, learning_rate=0.01), 0, torch.device("cpu")
@@ -225,7 +229,10 @@ def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneDataset) -> None:
         episode.policy_extras = [(chance, 0.0) for chance, _ in episode.policy_extras]
 
     def lead() -> float:
-        good, bad = likelihood(learner.network, played[:2]), likelihood(learner.network, played[2:])
+        good, bad = (
+            mean_log_prob(learner.network, played[:2]),
+            mean_log_prob(learner.network, played[2:]),
+        )
         return good - bad
 
     before = lead()
@@ -234,7 +241,7 @@ def test_a_teacher_learns_what_has_been_worth_it(scenes: SceneDataset) -> None:
 
 
 @pytest.mark.parametrize("dagger", [False, True])
-def test_a_clone_does_more_and_more_what_its_teacher_would(
+def test_behavior_cloning_increases_the_probability_of_the_teacher_s_moves(
     dagger: bool, scenes: SceneDataset
 ) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
@@ -261,12 +268,15 @@ def test_a_clone_does_more_and_more_what_its_teacher_would(
             for move, note in zip(episode.actions, episode.policy_extras, strict=True)
         ]
         assert any(differs) == student_plays
-        wanted = [replace(episode, actions=episode.policy_extras) for episode in played]
-        assert likelihood(learner.network, wanted) > likelihood(fresh.network, wanted) + 0.5
+        expert_rollouts = [replace(episode, actions=episode.policy_extras) for episode in played]
+        assert (
+            mean_log_prob(learner.network, expert_rollouts)
+            > mean_log_prob(fresh.network, expert_rollouts) + 0.5
+        )
 
 
-def likelihood(network: ExplorerNetwork, played: Sequence[Rollout]) -> float:
-    """The mean log-probability of the moves."""
+def mean_log_prob(network: ExplorerNetwork, played: Sequence[Rollout]) -> float:
+    """Return the mean log-probability of the moves."""
     with torch.no_grad():
         found = network(
             collate_graphs(
@@ -279,7 +289,7 @@ def likelihood(network: ExplorerNetwork, played: Sequence[Rollout]) -> float:
         )
 
 
-def test_episodes_are_the_same_for_the_same_seed(scenes: SceneDataset) -> None:
+def test_rollouts_depend_only_on_the_seed(scenes: SceneDataset) -> None:
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(0)
     network = ExplorerNetwork(len(environment.node_kind_ids), 8)
@@ -296,27 +306,27 @@ def test_episodes_are_the_same_for_the_same_seed(scenes: SceneDataset) -> None:
     assert (
         [e.rewards for e in one] == [e.rewards for e in other] != [e.rewards for e in played(7, 6)]
     )
-    told = episode_metrics(one)
-    assert told["success"] == sum(e.termination is TerminationReason.ALL_FOUND for e in one) / 7
-    assert told["score"] == pytest.approx(np.mean([sum(e.rewards) for e in one]))
+    metrics = episode_metrics(one)
+    assert metrics["success"] == sum(e.termination is TerminationReason.ALL_FOUND for e in one) / 7
+    assert metrics["score"] == pytest.approx(np.mean([sum(e.rewards) for e in one]))
 
 
-def test_the_advantage_is_the_weighted_sum_of_what_comes() -> None:
-    values, rewards, discount, trace = [1.0, -0.5, 2.0], [0.0, 3.0, -1.0], 0.9, 0.8
+def test_gae_is_the_discounted_sum_of_temporal_difference_errors() -> None:
+    values, rewards, gamma, gae_lambda = [1.0, -0.5, 2.0], [0.0, 3.0, -1.0], 0.9, 0.8
     episode = Rollout(
         actions=[np.zeros(2, int)] * 3,
         rewards=rewards,
         policy_extras=[(0.0, value) for value in values],
     )
-    errors = [rewards[k] + discount * (*values, 0.0)[k + 1] - values[k] for k in range(3)]
+    errors = [rewards[k] + gamma * (*values, 0.0)[k + 1] - values[k] for k in range(3)]
     expected = [
-        sum((discount * trace) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)
+        sum((gamma * gae_lambda) ** (j - k) * errors[j] for j in range(k, 3)) for k in range(3)
     ]
-    assert compute_gae(episode, discount, trace) == pytest.approx(expected, abs=1e-6)
+    assert compute_gae(episode, gamma, gae_lambda) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneDataset) -> None:
-    """The same object, by its node in either graph."""
+def test_the_teacher_s_actions_refer_to_nodes_of_the_student_s_graph(scenes: SceneDataset) -> None:
+    """An object has different nodes in the two graphs."""
     environment = ClutterExploration(scenes, max_moves=5)
     torch.manual_seed(1)
     teacher = ExplorerNetwork(len(environment.node_kind_ids), 8)
@@ -326,12 +336,17 @@ def test_the_teacher_is_asked_in_the_student_s_words(scenes: SceneDataset) -> No
     for seed in range(5):
         environment.reset(seed=seed)
         ((x, y),) = cloning.expert_actions([environment]).tolist()
-        told = ClutterExploration(scenes, privileged=True, max_moves=5)
-        told.reset_to_scene(environment.task.scene)
-        ((a, b),) = make_policy_fn(teacher, None)([told], [told.observe()])[0].tolist()
+        privileged_environment = ClutterExploration(scenes, privileged=True, max_moves=5)
+        privileged_environment.reset_to_scene(environment.task.scene)
+        ((a, b),) = make_policy_fn(teacher, None)(
+            [privileged_environment], [privileged_environment.observe()]
+        )[0].tolist()
         named = [
             TRAY if node == 0 else names[node - 1]
-            for names, node in ((told.objects, a), (told.objects, b))
+            for names, node in (
+                (privileged_environment.objects, a),
+                (privileged_environment.objects, b),
+            )
         ]
         assert [environment.objects[x - 1], TRAY if y == 0 else environment.objects[y - 1]] == named
 
@@ -355,7 +370,7 @@ STUDENT_SETTINGS += ["evaluate_every=1", "evaluation_episodes=4"]
 
 
 @pytest.mark.parametrize("script", ["train_explorer_ppo", "train_explorer_dagger"])
-def test_a_script_is_killed_and_ends_with_the_same_weights(
+def test_an_interrupted_training_ends_with_the_same_weights(
     script: str, file: Path, tmp_path: Path
 ) -> None:
     settings = [
@@ -363,12 +378,12 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(
         *(TEACHER_SETTINGS if script == "train_explorer_ppo" else STUDENT_SETTINGS),
     ]
     if script == "train_explorer_dagger":
-        numbers = ClutterExploration(file).node_kind_ids
+        node_kind_ids = ClutterExploration(file).node_kind_ids
         torch.manual_seed(3)
         save_checkpoint(
             tmp_path / "t.safetensors",
-            ExplorerNetwork(len(numbers), 8),
-            {"kind": TEACHER, "network": explorer_metadata(numbers, 8)},
+            ExplorerNetwork(len(node_kind_ids), 8),
+            {"kind": TEACHER, "network": explorer_metadata(node_kind_ids, 8)},
         )
         settings += [f"teacher={tmp_path / 't.safetensors'}"]
     options = [argument for setting in settings for argument in ("--set", setting)]
@@ -413,12 +428,14 @@ def test_a_script_is_killed_and_ends_with_the_same_weights(
     assert (set(decision.considered) == everything) == (script == "train_explorer_ppo")
 
 
-def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Path) -> None:
-    """With no rate of learning it stays as it was; a teacher is no student."""
-    numbers, begun = ClutterExploration(file).node_kind_ids, tmp_path / "s.safetensors"
+def test_ppo_starts_from_a_cloned_student(file: Path, tmp_path: Path) -> None:
+    """At a learning rate of 0 the weights are unchanged; a teacher is rejected as a student."""
+    node_kind_ids, begun = ClutterExploration(file).node_kind_ids, tmp_path / "s.safetensors"
     torch.manual_seed(3)
-    cloned = ExplorerNetwork(len(numbers), 8)
-    save_checkpoint(begun, cloned, {"kind": STUDENT, "network": explorer_metadata(numbers, 8)})
+    cloned = ExplorerNetwork(len(node_kind_ids), 8)
+    save_checkpoint(
+        begun, cloned, {"kind": STUDENT, "network": explorer_metadata(node_kind_ids, 8)}
+    )
     settings = [
         f"scenes={file}",
         f"warm_start={begun}",
@@ -442,22 +459,23 @@ def test_a_student_goes_on_learning_where_it_was_cloned(file: Path, tmp_path: Pa
         train.main(tmp_path / "wide", settings=[*settings, "privileged=false", "learning.width=16"])
 
 
-def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
+def test_invalid_agents_are_rejected(file: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--agent nobody; allowed are random, .*full-knowledge"):
         make_policy_factory("nobody", ClutterConfig())
     path = tmp_path / "s.safetensors"
-    numbers = ClutterExploration(file).node_kind_ids
-    about = {"kind": STUDENT, "network": explorer_metadata(numbers, 8)}
-    save_checkpoint(path, ExplorerNetwork(len(numbers), 8), about | {"kind": "generator"})
+    node_kind_ids = ClutterExploration(file).node_kind_ids
+    about = {"kind": STUDENT, "network": explorer_metadata(node_kind_ids, 8)}
+    save_checkpoint(path, ExplorerNetwork(len(node_kind_ids), 8), about | {"kind": "generator"})
     with pytest.raises(
         InputError,
-        match=r"s\.safetensors: is a checkpoint of a generator; allowed is one of a teacher or student",
+        match=r"s\.safetensors: is a checkpoint of a generator; "
+        r"allowed is one of a teacher or student",
     ):
         make_policy_factory(str(path), ClutterConfig())
     save_checkpoint(
         path,
-        ExplorerNetwork(len(numbers), 8),
-        about | {"network": {**explorer_metadata(numbers, 8), "features": []}},
+        ExplorerNetwork(len(node_kind_ids), 8),
+        about | {"network": {**explorer_metadata(node_kind_ids, 8), "features": []}},
     )
     with pytest.raises(InputError, match="was trained on other features"):
         make_policy_factory(str(path), ClutterConfig())
@@ -473,8 +491,8 @@ def test_explorers_that_cannot_be_made(file: Path, tmp_path: Path) -> None:
         run_episode(environment.backend, agent, max_moves=1)
 
 
-def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig) -> None:
-    """Among 39 objects the tray is soon full."""
+def test_a_learned_explorer_discards_moves_without_a_free_placement(config: ClutterConfig) -> None:
+    """With 39 objects the tray is soon full."""
     scenes = ROOT / "training/scenes/sg_star_40.json"
     environment = ClutterExploration(scenes, config=config, max_moves=20, max_objects=39)
     explorers = make_policy_factory("student", config)
@@ -486,8 +504,8 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
         def checked(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
             decision = agent(belief, observation, rng)  # noqa: B023, called in this round
             move = decision.move
-            likelihood = sum(decision.pick_probabilities.values())
-            assert likelihood in (0, pytest.approx(1)), "as the network had it, with room or not"
+            mean_log_prob = sum(decision.pick_probabilities.values())
+            assert mean_log_prob in (0, pytest.approx(1)), "as the network had it, with room or not"
             legal = legal_moves(observation)
             room = {m for m in legal if find_free_placements(observation, m, config.exploration)}
             if move is None:
@@ -502,7 +520,7 @@ def test_a_learned_explorer_looks_for_room_before_it_moves(config: ClutterConfig
     assert on_the_tray == {True, False}
 
 
-def test_full_knowledge_finds_everything(scenes: SceneDataset, config: ClutterConfig) -> None:
+def test_the_oracle_finds_all_objects(scenes: SceneDataset, config: ClutterConfig) -> None:
     environment = ClutterExploration(scenes, max_moves=20)
     environment.reset(options={"scene": 1})
     policy = make_policy_factory("full-knowledge", config)(environment.backend)
@@ -512,7 +530,7 @@ def test_full_knowledge_finds_everything(scenes: SceneDataset, config: ClutterCo
     assert task.transitions[-1].newly_found
 
 
-def test_without_a_config_it_is_played_in_the_scenes_own_cell(tmp_path: Path) -> None:
+def test_the_default_work_cell_is_that_of_the_scenes(tmp_path: Path) -> None:
     camera = "cameras.overhead.pose={translation: [0.0, 0.3, 1.5], rpy_deg: [170, 0, 0]}"
     save_scene_dataset(
         tmp_path / "tilted.json",

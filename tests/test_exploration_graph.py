@@ -1,4 +1,4 @@
-"""The graph that explorers see, and the network that looks at it."""
+"""The graph observation of explorers, and their network."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ from drake_clutter.tasks.exploration_graph import (
     build_exploration_graph,
 )
 
-NUMBERS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
+NODE_KIND_IDS = {name: number for number, name in enumerate((TRAY, *CLASSES), start=1)}
 RAYS = RayCaster(ClutterConfig().cell.camera)
 # A marker below a cracker box, which carries a can; a pudding box close by, another one far away.
 SCENE = scene_of(
@@ -42,7 +42,7 @@ def graph_of(
     scene: Scene, tried: Sequence[Move] = (), failed: Sequence[Move] = (), nodes: int = 0
 ) -> ExplorationObservation:
     return build_exploration_graph(
-        scene.objects, RAYS.observe(scene)[0], tried, NUMBERS, failed, nodes
+        scene.objects, RAYS.observe(scene)[0], tried, NODE_KIND_IDS, failed, nodes
     )
 
 
@@ -51,13 +51,13 @@ def feature(graph: ExplorationObservation, node: int, name: str) -> float:
 
 
 def edges(graph: ExplorationObservation, names: tuple[str, ...]) -> dict[tuple[str, str], str]:
-    """Kinds by lower and upper."""
+    """Return the kinds of edges by lower and upper node."""
     named = (TRAY, *names)
     joined = zip(graph["edge_links"].tolist(), graph["edge_kind"].tolist(), strict=True)
     return {(named[a], named[b]): EDGE_KINDS[kind - 1] for (a, b), kind in joined if kind}
 
 
-def test_how_objects_lie_to_each_other() -> None:
+def test_edge_kinds() -> None:
     found = edges(graph_of(SCENE), SCENE.names)
     assert len(found) == 5 + 10
     assert found["large_marker", "cracker_box"] == "supports"
@@ -76,11 +76,11 @@ def test_how_objects_lie_to_each_other() -> None:
     }
 
 
-def test_what_is_known_of_each_object() -> None:
+def test_node_features() -> None:
     graph = graph_of(SCENE, (Move("far"), Move("far"), Move("close")), nodes=9)
     assert graph["node_kind"].tolist() == [
-        NUMBERS[TRAY],
-        *(NUMBERS[o.object_class.name] for o in SCENE.objects),
+        NODE_KIND_IDS[TRAY],
+        *(NODE_KIND_IDS[o.object_class.name] for o in SCENE.objects),
         0,
         0,
         0,
@@ -101,8 +101,8 @@ def test_what_is_known_of_each_object() -> None:
     assert graph["global_features"] == pytest.approx([3 / 20])
 
 
-def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
-    """After settling, what should be 0 is a little off, either way."""
+def test_the_sign_of_the_quaternion_does_not_depend_on_a_small_tilt() -> None:
+    """After settling, components that should be 0 are slightly positive or negative."""
     tilted = []
     for tilt in (-1e-4, 0.0, 1e-4):
         turned = {}
@@ -114,7 +114,7 @@ def test_the_quaternion_s_sign_does_not_depend_on_a_little_tilt() -> None:
     assert tilted[2] == pytest.approx(tilted[1], abs=0.01)
 
 
-def test_what_has_failed_is_not_tried_again() -> None:
+def test_invalid_moves_are_masked() -> None:
     onto_all = [Move("far", name) for name in (TRAY, "cracker_box", "tomato_soup_can", "close")]
     graph = graph_of(SCENE, failed=[Move("close"), *onto_all])
     free = graph_of(SCENE)["action_mask"]
@@ -122,40 +122,40 @@ def test_what_has_failed_is_not_tried_again() -> None:
     free[4, 0], free[5] = 0, 0
     assert np.array_equal(graph["action_mask"], free)
     torch.manual_seed(0)
-    moves, _, _, picks = sample_actions(
-        ExplorerNetwork(len(NUMBERS)), collate_graphs([graph] * 500), rng()
+    moves, _, _, pick_probs = sample_actions(
+        ExplorerNetwork(len(NODE_KIND_IDS)), collate_graphs([graph] * 500), rng()
     )
-    assert picks[0, 5] == 0
+    assert pick_probs[0, 5] == 0
     assert (free[moves[:, 0], moves[:, 1]] == 1).all()
 
 
-def test_something_must_carry_a_box_that_floats() -> None:
-    """K_t lacks the marker, which has never been in view: the box above it lies 18 mm over the tray."""
+def test_the_support_gap_shows_an_unknown_support() -> None:
+    """K_t lacks the marker, which was never in view, so its box is 18 mm above the tray."""
     observation = RAYS.observe(SCENE)[0]
     known = Belief().update(observation).objects
     assert [o.name for o in known] == ["cracker_box", "tomato_soup_can", "close", "far"]
-    graph = build_exploration_graph(known, observation, (), NUMBERS)
+    graph = build_exploration_graph(known, observation, (), NODE_KIND_IDS)
     heights = [feature(graph, k, "support_gap") for k in range(1, 5)]
     assert heights == pytest.approx([(0.018 - 0.006) / 0.35, 0, 0, 0], abs=1e-6)
 
 
-def test_what_was_seen_stays_known_where_it_was_seen_last() -> None:
+def test_objects_out_of_view_keep_their_last_pose() -> None:
     covered = SCENE.with_poses({"large_marker": resting("large_marker", xy=(0.0, 0.3)).X_TO})
     belief = Belief().update(RAYS.observe(covered)[0]).update(RAYS.observe(SCENE)[0])
     known = belief.objects
     assert known[0].name == "large_marker"
     assert {o.name: o.X_TO for o in known}["large_marker"] == covered["large_marker"].X_TO
-    graph = build_exploration_graph(known, RAYS.observe(SCENE)[0], (), NUMBERS)
+    graph = build_exploration_graph(known, RAYS.observe(SCENE)[0], (), NODE_KIND_IDS)
     assert graph["action_mask"].any(axis=1).tolist() == [False, False, True, True, True, True]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
+def test_the_network_is_equivariant_to_the_order_of_the_objects(seed: int) -> None:
     scene = random_scene(seed)
     order = rng(seed).permutation(len(scene.objects))
     shuffled = Scene(tuple(scene.objects[k] for k in order), scene.support)
     torch.manual_seed(seed)
-    network = ExplorerNetwork(len(NUMBERS)).double()
+    network = ExplorerNetwork(len(NODE_KIND_IDS)).double()
     one, other = (network(collate_graphs([graph_of(s)])) for s in (scene, shuffled))
     assert torch.allclose(one.value, other.value)
     nodes = torch.from_numpy(np.concatenate([[0], order + 1]))
@@ -169,11 +169,11 @@ def test_the_order_of_the_objects_does_not_matter(seed: int) -> None:
     assert torch.allclose(places[0][:, nodes], places[1])
 
 
-def test_a_batch_is_each_graph_by_itself() -> None:
-    """Also beside larger ones, with padding."""
+def test_batched_graphs_give_the_same_output_as_single_graphs() -> None:
+    """Graphs that are smaller than the largest of the batch are padded."""
     graphs = [graph_of(random_scene(seed, 8, 25)) for seed in range(6)]
     torch.manual_seed(0)
-    network = ExplorerNetwork(len(NUMBERS)).double()
+    network = ExplorerNetwork(len(NODE_KIND_IDS)).double()
     together = network(collate_graphs(graphs))
     picked = together.pick_log_probs.argmax(dim=1)
     places = network.place_log_probs(together, picked)
@@ -187,15 +187,15 @@ def test_a_batch_is_each_graph_by_itself() -> None:
         assert (together.pick_log_probs[k, count:] == -torch.inf).all()
 
 
-def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
+def test_moves_are_sampled_with_their_probabilities() -> None:
     torch.manual_seed(1)
-    network, graph = ExplorerNetwork(len(NUMBERS)), graph_of(SCENE)
+    network, graph = ExplorerNetwork(len(NODE_KIND_IDS)), graph_of(SCENE)
     count = 4000
-    moves, chance, _, picks = sample_actions(network, collate_graphs([graph] * count), rng())
-    assert picks[0].sum() == pytest.approx(1, abs=1e-5)
+    moves, chance, _, pick_probs = sample_actions(network, collate_graphs([graph] * count), rng())
+    assert pick_probs[0].sum() == pytest.approx(1, abs=1e-5)
     assert (graph["action_mask"][moves[:, 0], moves[:, 1]] == 1).all()
-    drawn = np.bincount(moves[:, 0], minlength=len(picks[0])) / count
-    assert drawn == pytest.approx(picks[0], abs=4 * 0.5 / count**0.5)
+    frequencies = np.bincount(moves[:, 0], minlength=len(pick_probs[0])) / count
+    assert frequencies == pytest.approx(pick_probs[0], abs=4 * 0.5 / count**0.5)
     found = network(collate_graphs([graph] * 50))
     again = action_log_probs(
         found,
@@ -204,4 +204,4 @@ def test_moves_are_drawn_as_often_as_they_are_likely() -> None:
     )
     assert again.detach().numpy() == pytest.approx(chance[:50], abs=1e-5)
     (likeliest,) = sample_actions(network, collate_graphs([graph]), None)[0].tolist()
-    assert likeliest[0] == picks[0].argmax()
+    assert likeliest[0] == pick_probs[0].argmax()

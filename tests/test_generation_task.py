@@ -1,4 +1,4 @@
-"""The generation environment: what it shows, what it pays, when it ends."""
+"""The generation environment: observations, rewards and termination."""
 
 import gymnasium
 import networkx as nx
@@ -19,12 +19,12 @@ from drake_clutter.tasks.generation_task import (
 )
 
 
-def random_action(mask: np.ndarray, draw: np.random.Generator) -> int:
-    return int(draw.choice(np.flatnonzero(mask)))
+def random_action(mask: np.ndarray, generator: np.random.Generator) -> int:
+    return int(generator.choice(np.flatnonzero(mask)))
 
 
 def graph_of(observation: GenerationObservation, environment: ClutterGeneration) -> ClutterGraph:
-    """The graph that an observation describes."""
+    """Return the graph that an observation represents."""
     kinds, edge_kinds = environment.vocabulary.node_kinds, environment.vocabulary.edge_kinds
     nodes = {k: kinds[kind - 1] for k, kind in enumerate(observation["node_kind"].tolist()) if kind}
     edges = {
@@ -38,7 +38,7 @@ def graph_of(observation: GenerationObservation, environment: ClutterGeneration)
 
 
 def finished_stacks(graph: ClutterGraph) -> set[int]:
-    """The objects of the stacks of which every attribute is terminal."""
+    """Return the object nodes of the stacks whose attributes are all terminal."""
     found = set()
     for bottom in graph.stack_bases():
         members = set(bottom).union(*(nx.descendants(graph.nx, node) for node in bottom))
@@ -52,56 +52,56 @@ def finished_stacks(graph: ClutterGraph) -> set[int]:
     return found
 
 
-def test_gymnasium_approves() -> None:
+def test_the_environment_passes_gymnasium_s_checks() -> None:
     environment = gymnasium.make("drake_clutter.tasks:ClutterGeneration-v0")
     assert isinstance(environment.unwrapped, ClutterGeneration)
     check_env(environment.unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize("objects", ["ycb7", "pantry14"])
-def test_what_is_observed_is_the_graph(objects: str) -> None:
-    """With its finished stacks and where their objects stand."""
+def test_the_observation_represents_the_graph(objects: str) -> None:
+    """It includes the finished stacks and the positions of their objects."""
     grammar = GRAMMARS[objects]
-    environment, draw = (
+    environment, generator = (
         ClutterGeneration(list(grammar.classes.values()), GenerationTaskConfig(nodes=14)),
         rng(1),
     )
-    stacks_seen = 0
+    num_stacks = 0
     for episode in range(25):
         observation, info = environment.reset(seed=episode)
-        over = False
-        while not over:
+        terminated = False
+        while not terminated:
             graph = environment.partial.graph
-            shown = graph_of(observation, environment)
-            assert [shown.kind(k) for k in shown.nx] == graph.kinds()
-            assert dict(shown.nx.edges) == dict(graph.nx.edges)
+            observed = graph_of(observation, environment)
+            assert [observed.kind(k) for k in observed.nx] == graph.kinds()
+            assert dict(observed.nx.edges) == dict(graph.nx.edges)
             assert (info["action_mask"] == grammar.feasible_rules(graph, NodeBudget(14))).all()
             assert (observation["node_mask"] == (observation["node_kind"] > 0)).all()
             assert (observation["edge_mask"] == (observation["edge_kind"] > 0)).all()
             assert observation["remaining_nodes"] == pytest.approx((14 - len(graph)) / 25)
             simulated = set(np.flatnonzero(observation["node_flags"][:, 0]).tolist())
             assert simulated == finished_stacks(graph)
-            stacks_seen += bool(simulated)
+            num_stacks += bool(simulated)
             for node in range(14):
                 if node in simulated:
                     assert observation["position"][node, 2] > 0
                 else:
                     assert (observation["position"][node] == 0).all()
-            observation, _, over, truncated, info = environment.step(
-                random_action(info["action_mask"], draw)
+            observation, _, terminated, truncated, info = environment.step(
+                random_action(info["action_mask"], generator)
             )
             assert not truncated
-    assert stacks_seen > 50
+    assert num_stacks > 50
 
 
-def test_the_marks_show_what_a_rule_rewrites() -> None:
-    environment, draw = ClutterGeneration(task=GenerationTaskConfig(nodes=14)), rng(2)
+def test_the_flags_mark_the_nodes_that_rules_rewrite() -> None:
+    environment, generator = ClutterGeneration(task=GenerationTaskConfig(nodes=14)), rng(2)
     grammar, changed_kinds = environment.grammar, 0
     for episode in range(15):
         observation, info = environment.reset(seed=episode)
-        over = False
-        while not over:
-            action = random_action(info["action_mask"], draw)
+        terminated = False
+        while not terminated:
+            action = random_action(info["action_mask"], generator)
             rule, before = grammar.rules[action], environment.partial.graph.copy()
             marked = (
                 np.flatnonzero(
@@ -112,7 +112,7 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
                 if (rule.left.rewritten != "tray")
                 else np.array([0])
             )
-            observation, _, over, _, info = environment.step(action)
+            observation, _, terminated, _, info = environment.step(action)
             after = environment.partial.graph
             changed = {n for n in before.nx if before.kind(n) != after.kind(n)}
             changed |= {
@@ -130,18 +130,20 @@ def test_the_marks_show_what_a_rule_rewrites() -> None:
     assert changed_kinds > 200
 
 
-def test_rewards_sum_up_to_what_the_scene_is_worth() -> None:
+def test_rewards_sum_up_to_the_terminal_reward() -> None:
     task = GenerationTaskConfig(
         nodes=14, hidden_reward=0.5, balance_reward=0.25, instability_reward=-1.0
     )
-    environment, draw = ClutterGeneration(task=task), rng(3)
+    environment, generator = ClutterGeneration(task=task), rng(3)
     stable = unstable = 0
     balanced = set()
     for episode in range(120):
         _, info = environment.reset(seed=episode)
-        total, over = 0.0, False
-        while not over:
-            _, reward, over, _, info = environment.step(random_action(info["action_mask"], draw))
+        total, terminated = 0.0, False
+        while not terminated:
+            _, reward, terminated, _, info = environment.step(
+                random_action(info["action_mask"], generator)
+            )
             total += float(reward)
         if "scene" in info:
             stable += 1
@@ -167,9 +169,9 @@ def test_an_infeasible_rule_changes_nothing() -> None:
     environment = ClutterGeneration(task=GenerationTaskConfig(nodes=8))
     before, info = environment.reset(seed=0)
     infeasible = int(np.flatnonzero(info["action_mask"] == 0)[0])
-    after, reward, over, _, later = environment.step(infeasible)
+    after, reward, terminated, _, later = environment.step(infeasible)
     assert reward == 0
-    assert not over
+    assert not terminated
     assert all((before[name] == after[name]).all() for name in before)
     assert (later["action_mask"] == info["action_mask"]).all()
 
@@ -177,19 +179,19 @@ def test_an_infeasible_rule_changes_nothing() -> None:
 def derived(
     environment: ClutterGeneration, rules: list[str]
 ) -> tuple[float, bool, dict[str, object]]:
-    """Return, whether it is over, and the last info, of a derivation given by names."""
+    """Return the return, the termination and the last info of a derivation by rule names."""
     environment.reset(seed=0)
-    total, over = 0.0, False
+    total, terminated = 0.0, False
     info: dict[str, object] = {}
     for name in rules:
-        assert not over, f"over before {name}"
-        _, reward, over, _, info = environment.step(environment.grammar.rule_indices[name])
+        assert not terminated, f"terminated before {name}"
+        _, reward, terminated, _, info = environment.step(environment.grammar.rule_indices[name])
         total += float(reward)
-    return total, over, info
+    return total, terminated, info
 
 
-def test_a_tower_that_falls_ends_the_episode() -> None:
-    """A cracker box flat on a marker that lies."""
+def test_an_unstable_stack_ends_the_episode() -> None:
+    """A flat cracker box on a lying marker is not stable."""
     environment = ClutterGeneration(task=GenerationTaskConfig(nodes=10))
     rules = [
         "drop_object",
@@ -200,14 +202,14 @@ def test_a_tower_that_falls_ends_the_episode() -> None:
         "orient_flat_0",
         "orient_flat_0",
     ]
-    total, over, info = derived(environment, rules)
-    assert over
+    total, terminated, info = derived(environment, rules)
+    assert terminated
     assert total == -1.0
     assert info["failure"] is StackFailure.UNSTABLE
 
 
-def test_a_tower_that_is_too_high_ends_the_episode() -> None:
-    """Three cracker boxes on end are 0.69 m."""
+def test_a_stack_that_is_too_high_ends_the_episode() -> None:
+    """Three upright cracker boxes are 0.69 m high."""
     environment = ClutterGeneration(task=GenerationTaskConfig(nodes=10))
     rules = [
         "drop_object",
@@ -217,12 +219,12 @@ def test_a_tower_that_is_too_high_ends_the_episode() -> None:
         *["insert_cracker_box"] * 3,
         *["orient_upright_0"] * 3,
     ]
-    total, over, info = derived(environment, rules)
-    assert (total, over, info["failure"]) == (-1.0, True, StackFailure.TOO_HIGH)
+    total, terminated, info = derived(environment, rules)
+    assert (total, terminated, info["failure"]) == (-1.0, True, StackFailure.TOO_HIGH)
 
 
-def test_a_hidden_object_pays_at_once() -> None:
-    """A gelatin box under a cracker box, both flat; then another stack."""
+def test_a_hidden_object_is_rewarded_when_its_stack_is_finished() -> None:
+    """A flat gelatin box is hidden by a flat cracker box; another stack follows."""
     environment = ClutterGeneration(task=GenerationTaskConfig(nodes=7))
     rules = [
         "drop_object",
@@ -233,12 +235,12 @@ def test_a_hidden_object_pays_at_once() -> None:
         "orient_flat_0",
         "orient_flat_0",
     ]
-    total, over, _ = derived(environment, rules)
-    assert (total, over) == (0.5, False)
+    total, terminated, _ = derived(environment, rules)
+    assert (total, terminated) == (0.5, False)
 
 
-def test_a_graph_of_hundreds_of_nodes_is_observed() -> None:
-    environment, draw = ClutterGeneration(task=GenerationTaskConfig(nodes=300)), rng(0)
+def test_graphs_of_hundreds_of_nodes_are_observed() -> None:
+    environment, generator = ClutterGeneration(task=GenerationTaskConfig(nodes=300)), rng(0)
     observation, info = environment.reset(seed=0)
     structure = np.array(
         [
@@ -247,26 +249,26 @@ def test_a_graph_of_hundreds_of_nodes_is_observed() -> None:
         ]
     )
     while (mask := info["action_mask"].astype(bool) & structure).any():
-        observation, *_, info = environment.step(random_action(mask, draw))
+        observation, *_, info = environment.step(random_action(mask, generator))
     graph = graph_of(observation, environment)
     assert len(graph) > 290
     assert dict(graph.nx.edges) == dict(environment.partial.graph.nx.edges)
 
 
-def test_edges_fit() -> None:
-    """The most edges: as many pairs as possible."""
+def test_the_maximum_number_of_edges() -> None:
+    """A graph with as many pairs as possible has the most edges."""
     for nodes in range(3, 30):
-        grammar, draw, most = GRAMMARS["ycb7"], rng(nodes), 0
+        grammar, generator, most = GRAMMARS["ycb7"], rng(nodes), 0
         pairs = [k for k, rule in enumerate(grammar.rules) if rule.name.startswith("insert_meta")]
 
         def choose(
             _: object,
             mask: NDArray[np.bool_],
-            draw: np.random.Generator = draw,
+            generator: np.random.Generator = generator,
             pairs: list[int] = pairs,
         ) -> int:
             chosen = np.array(pairs)[mask[pairs]] if mask[pairs].any() else np.flatnonzero(mask)
-            return int(draw.choice(chosen))
+            return int(generator.choice(chosen))
 
         for _ in range(10):
             graph = grammar.derive(NodeBudget(nodes), choose).graph

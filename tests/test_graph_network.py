@@ -1,4 +1,4 @@
-"""The graph network: against one written with loops, in any order of nodes, alone and in a batch."""
+"""The graph network: a naive implementation as a reference, invariances and batches."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ ENVIRONMENT = ClutterGeneration()
 
 
 def observations(count: int, seed: int = 0) -> list[GenerationObservation]:
-    """Of random derivations, from the tray alone to finished graphs."""
+    """Yield observations of random derivations, from the tray alone to finished graphs."""
     draw, seen = rng(seed), list[GenerationObservation]()
     while len(seen) < count:
         observation, info = ENVIRONMENT.reset(seed=seed)
@@ -44,14 +44,14 @@ def network(seed: int = 0) -> RuleQNetwork:
 
 
 def fc(*weights_and_inputs: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
-    """One linear layer of all inputs side by side, then LeakyReLU."""
+    """Return LeakyReLU of one linear layer of the concatenated inputs."""
     weight = torch.cat([weight for weight, _ in weights_and_inputs], dim=1)
     value = weight @ torch.cat([entry for _, entry in weights_and_inputs]) + bias
     return torch.where(value > 0, value, 0.01 * value)
 
 
 def edges(observation: GenerationObservation) -> Iterator[tuple[int, int, int]]:
-    """Sender, receiver, and number of the kind, both ways."""
+    """Return sender, receiver and kind of all directed edges."""
     kinds = len(ENVIRONMENT.vocabulary.edge_kinds)
     for (parent, child), kind in zip(
         observation["edge_links"].tolist(), observation["edge_kind"].tolist(), strict=True
@@ -62,7 +62,7 @@ def edges(observation: GenerationObservation) -> Iterator[tuple[int, int, int]]:
 
 
 def by_loops(values: RuleQNetwork, observation: GenerationObservation) -> Tensor:
-    """What the network says of one graph, as the paper describes it: node by node and edge by edge."""
+    """Return the values of one graph, computed node by node and edge by edge."""
 
     def leaky(value: Tensor) -> Tensor:
         return torch.where(value > 0, value, 0.01 * value)
@@ -116,14 +116,14 @@ def by_loops(values: RuleQNetwork, observation: GenerationObservation) -> Tensor
     return torch.as_tensor(values.q_head(leaky(values.hidden_layer(torch.cat([glob, *marked])))))
 
 
-def test_the_same_as_with_loops() -> None:
+def test_the_network_agrees_with_a_naive_implementation() -> None:
     values, seen = network(), observations(30)
     together = values(collate(seen))
     for k, observation in enumerate(seen):
         torch.testing.assert_close(together[k], by_loops(values, observation), rtol=1e-9, atol=1e-9)
 
 
-def test_a_graph_does_not_feel_its_neighbours_in_the_batch() -> None:
+def test_graphs_of_a_batch_do_not_affect_each_other() -> None:
     values, seen = network(1), observations(20, seed=1)
     together = values(collate(seen))
     for k, observation in enumerate(seen):
@@ -132,7 +132,7 @@ def test_a_graph_does_not_feel_its_neighbours_in_the_batch() -> None:
         )
 
 
-def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
+def test_the_network_is_invariant_to_the_order_of_nodes_and_edges() -> None:
     values, draw = network(2), rng(2)
     for observation in observations(20, seed=2):
         nodes, linked = int(observation["node_mask"].sum()), int(observation["edge_mask"].sum())
@@ -149,8 +149,8 @@ def test_the_order_of_nodes_and_edges_does_not_matter() -> None:
         )
 
 
-def test_what_is_known_of_a_graph_matters() -> None:
-    """Every feature reaches the values."""
+def test_every_feature_affects_the_values() -> None:
+    """A change of any feature changes the values."""
     values, (observation,) = network(3), observations(1, seed=5)
     before = values(collate([observation]))
     for name in ("node_kind", "node_flags", "position", "edge_kind", "remaining_nodes"):
@@ -160,8 +160,8 @@ def test_what_is_known_of_a_graph_matters() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 5])
-def test_what_is_compiled_is_what_is_composed(width: int) -> None:
-    """With the gradients of all inputs and weights; nobody speaks to the seventh node."""
+def test_the_compiled_layers_agree_with_the_reference(width: int) -> None:
+    """Outputs and gradients of all inputs and weights agree; node 6 receives no message."""
     draw = torch.Generator().manual_seed(width)
     sender, receiver, kind = (torch.randint(0, most, (40,), generator=draw) for most in (12, 12, 4))
     receiver[receiver == 7] = 6
@@ -194,7 +194,7 @@ def test_what_is_compiled_is_what_is_composed(width: int) -> None:
         torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_lone_node_has_no_messages() -> None:
+def test_a_graph_of_one_node_has_no_messages() -> None:
     layers = MessagePassing(4, 3, layers=1)
     none, zero = torch.zeros(0, dtype=torch.long), torch.zeros(1, dtype=torch.long)
     node, glob = layers(

@@ -1,4 +1,4 @@
-"""A trained generator at work: from a checkpoint, with other objects, in the command's scenes."""
+"""Trained scene generators: checkpoints, other object sets and generation jobs."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -35,25 +35,27 @@ WIDTH = 8
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    """An untrained network for the seven objects."""
+    """Checkpoint of an untrained network for the seven YCB objects."""
     grammar = GRAMMARS["ycb7"]
     torch.manual_seed(0)
-    words = GraphVocabulary.from_grammar(grammar)
-    network = RuleQNetwork(len(words.node_kinds), len(words.edge_kinds), len(grammar.rules), WIDTH)
+    vocabulary = GraphVocabulary.from_grammar(grammar)
+    network = RuleQNetwork(
+        len(vocabulary.node_kinds), len(vocabulary.edge_kinds), len(grammar.rules), WIDTH
+    )
     config = {"task": asdict(GenerationTaskConfig()), "learning": asdict(SoftQConfig())}
     path = tmp_path / "untrained.safetensors"
-    about = {
+    metadata = {
         "kind": "generator",
         "network": rule_network_metadata(grammar, WIDTH),
         "temperature": 0.3,
         "config": config,
     }
-    save_checkpoint(path, network, about)
+    save_checkpoint(path, network, metadata)
     return path
 
 
 @pytest.mark.parametrize("nodes", [7, 12, 30])
-def test_it_derives_terminal_graphs_of_any_size(checkpoint: Path, nodes: int) -> None:
+def test_derived_graphs_are_terminal_and_of_the_given_size(checkpoint: Path, nodes: int) -> None:
     agent, grammar = LearnedGenerator(checkpoint, ClutterConfig()), GRAMMARS["ycb7"]
     derived = [agent.derive(grammar, NodeBudget(nodes), rng(seed)) for seed in (0, 0, 1)]
     assert all(
@@ -62,7 +64,7 @@ def test_it_derives_terminal_graphs_of_any_size(checkpoint: Path, nodes: int) ->
     assert derived[0].rules == derived[1].rules != derived[2].rules
 
 
-def test_a_low_temperature_leaves_nothing_to_chance(checkpoint: Path) -> None:
+def test_a_low_temperature_gives_a_deterministic_policy(checkpoint: Path) -> None:
     grammar = GRAMMARS["ycb7"]
     cold, hot = (
         LearnedGenerator(checkpoint, ClutterConfig(), temperature) for temperature in (1e-6, 10.0)
@@ -71,7 +73,7 @@ def test_a_low_temperature_leaves_nothing_to_chance(checkpoint: Path) -> None:
     assert len({hot.derive(grammar, NodeBudget(8), rng(seed)).rules for seed in range(5)}) == 5
 
 
-def test_the_generate_command_takes_a_checkpoint(checkpoint: Path) -> None:
+def test_a_generation_job_accepts_a_checkpoint(checkpoint: Path) -> None:
     job = GenerationJob(str(checkpoint), "ycb7", None, nodes=6, seed=1, config=ClutterConfig())
     first, again = SceneGenerator(job)(0), SceneGenerator(job)(0)
     assert first.scene.objects == again.scene.objects
@@ -79,16 +81,16 @@ def test_the_generate_command_takes_a_checkpoint(checkpoint: Path) -> None:
     assert len(first.scene.graph) == 6
 
 
-def test_what_it_was_not_trained_with_is_named(checkpoint: Path) -> None:
+def test_unknown_object_classes_are_rejected(checkpoint: Path) -> None:
     with pytest.raises(InputError, match="was not trained with"):
         LearnedGenerator(checkpoint, ClutterConfig()).derive(
             GRAMMARS["pantry14"], NodeBudget(6), rng()
         )
 
 
-def test_what_is_no_generator_is_refused(checkpoint: Path) -> None:
-    about = load_checkpoint(checkpoint).metadata
-    save_checkpoint(checkpoint, torch.nn.Linear(1, 1), about | {"kind": "explorer"})
+def test_other_checkpoints_are_rejected(checkpoint: Path) -> None:
+    metadata = load_checkpoint(checkpoint).metadata
+    save_checkpoint(checkpoint, torch.nn.Linear(1, 1), metadata | {"kind": "explorer"})
     with pytest.raises(InputError, match="another kind"):
         LearnedGenerator(checkpoint, ClutterConfig())
     checkpoint.write_bytes(b"broken")
@@ -96,8 +98,8 @@ def test_what_is_no_generator_is_refused(checkpoint: Path) -> None:
         LearnedGenerator(checkpoint, ClutterConfig())
 
 
-def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path) -> None:
-    """For graphs of the old objects, the values of the old rules are the same in the larger grammar."""
+def test_a_warm_start_with_more_objects_keeps_the_learned_values(checkpoint: Path) -> None:
+    """For graphs of the old objects, the values of the old rules are unchanged."""
     small, large = GRAMMARS["ycb7"], GRAMMARS["pantry14"]
     loaded = load_checkpoint(checkpoint)
     old, new = (load_rule_network(loaded, grammar) for grammar in (small, large))
@@ -106,14 +108,14 @@ def test_a_warm_start_with_more_objects_keeps_what_was_learned(checkpoint: Path)
         for g in (small, large)
     ]
     both = [large.rule_indices[rule.name] for rule in small.rules]
-    draw = rng(3)
+    generator = rng(3)
     for episode in range(5):
         (one, info), (other, _) = (environment.reset(seed=episode) for environment in environments)
-        over = False
-        while not over:
+        terminated = False
+        while not terminated:
             torch.testing.assert_close(new(collate([other]))[:, both], old(collate([one])))
-            action = int(draw.choice(np.flatnonzero(info["action_mask"])))
-            one, _, over, _, info = environments[0].step(action)
+            action = int(generator.choice(np.flatnonzero(info["action_mask"])))
+            one, _, terminated, _, info = environments[0].step(action)
             other, *_ = environments[1].step(both[action])
 
 

@@ -1,4 +1,4 @@
-"""Soft Q-learning: the policy and the value as defined, learning where the answer is known, going on after a kill."""
+"""Soft Q-learning: policy, values and targets, a small grammar, and resumed trainings."""
 
 import json
 import subprocess
@@ -62,30 +62,37 @@ def test_the_soft_value() -> None:
     )
 
 
-def test_aims_by_hand() -> None:
-    """Two segments of two steps, three actions, temperature 0.5; in the second one the episode ends with its first step."""
+def test_retrace_targets() -> None:
+    """Two sequences of two steps; the first step of the second one ends an episode."""
     values = torch.tensor([[[1.0, 2.0, 9.0], [0.5, 1.0, 0.0], [3.0, 1.0, 2.0]]] * 2)
     mask = torch.tensor([[[True, True, False], [True, True, True], [False, True, False]]] * 2)
     action = torch.tensor([[0, 2, 1]] * 2)
     reward = torch.tensor([[0.1, 0.2, 7.0]] * 2)
-    over = torch.tensor([[False, False, False], [True, False, False]])
+    terminated = torch.tensor([[False, False, False], [True, False, False]])
     v1 = 0.5 * np.log((np.exp(1.0) + np.exp(2.0) + np.exp(0.0)) / 3)
     second = 0.2 + 1.0  # the third state has one feasible action
     policy = float(np.exp((0.0 - v1) / 0.5)) / 3
-    for trace, chance, passed_on in (
+    for retrace_lambda, behavior_prob, passed_on in (
         (0.0, 0.3, 0.0),
         (0.5, policy / 2, 0.5),
         (1.0, policy, 1.0),
         (1.0, 4 * policy, 0.25),
     ):
         found = retrace_targets(
-            values, mask, action, torch.full((2, 3), chance), reward, over, 0.5, trace
+            values,
+            mask,
+            action,
+            torch.full((2, 3), behavior_prob),
+            reward,
+            terminated,
+            0.5,
+            retrace_lambda,
         )
         expected = [[0.1 + v1 + passed_on * (second - 0.0), second], [0.1, second]]
         torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
 
 
-def test_chances_are_those_of_the_choice() -> None:
+def test_action_probabilities_are_those_of_the_sampling() -> None:
     values, mask = (
         np.array([[0.3, 0.1, 0.7, 9.0]], np.float32),
         np.array([[True, True, True, False]]),
@@ -95,11 +102,11 @@ def test_chances_are_those_of_the_choice() -> None:
     assert given == pytest.approx(expected.tolist())
 
 
-def test_what_is_drawn_was_added_and_follows_each_other() -> None:
+def test_sampled_sequences_are_consecutive_steps_of_the_buffer() -> None:
     example, _ = small_environment().reset(seed=0)
     replay = ReplayBuffer(capacity=60, num_envs=4, observation=example, num_actions=5)
-    draw, seen = rng(0), set[int]()
-    assert replay.sample_sequences(3, 4, draw) is None
+    generator, seen = rng(0), set[int]()
+    assert replay.sample_sequences(3, 4, generator) is None
     for moment in range(40):  # the ring of 15 is filled more than twice
         step = {
             name: np.repeat(array[None], 4, axis=0)
@@ -116,20 +123,20 @@ def test_what_is_drawn_was_added_and_follows_each_other() -> None:
             terminated=numbers % 3 == 0,
         )
         if moment >= 5:
-            drawn = replay.sample_sequences(50, 4, draw)
-            assert drawn is not None
-            assert drawn["action_mask"].shape == (50, 5, 5)
-            assert (np.diff(drawn["action"], axis=1) == 10).all()
-            assert (drawn["action"] == drawn["reward"]).all()
-            assert drawn["action"].max() <= 10 * moment + 3
-            assert drawn["action"].min() >= 10 * max(0, moment - 14)
-            seen |= set(drawn["action"].ravel().tolist())
+            sequences = replay.sample_sequences(50, 4, generator)
+            assert sequences is not None
+            assert sequences["action_mask"].shape == (50, 5, 5)
+            assert (np.diff(sequences["action"], axis=1) == 10).all()
+            assert (sequences["action"] == sequences["reward"]).all()
+            assert sequences["action"].max() <= 10 * moment + 3
+            assert sequences["action"].min() >= 10 * max(0, moment - 14)
+            seen |= set(sequences["action"].ravel().tolist())
     assert seen <= {10 * moment + k for moment in range(40) for k in range(4)}
     assert len(seen) >= 150
 
 
 def test_a_small_grammar_is_learned() -> None:
-    """Graphs of five nodes hold at most three objects in a tower, of which two are hidden."""
+    """Graphs of five nodes have at most three objects in a stack, which hides two of them."""
     config = SoftQConfig(
         total_timesteps=8_000,
         num_envs=16,
@@ -169,26 +176,26 @@ def state_of(learner: SoftQLearner) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("at", [32, 200, 396])
-def test_a_saved_training_goes_on_as_if_nothing_had_been(at: int, tmp_path: Path) -> None:
-    """Before the first update, in the middle, and after the replay has been filled twice; with any number of threads."""
-    through = SoftQLearner(small_environment, SMALL, 3, CPU)
-    while through.step < at:
-        through.train_iteration()
-    through.save(tmp_path / "state.safetensors")
-    taken_up = SoftQLearner(small_environment, SMALL, 3, CPU, num_threads=1)
-    taken_up.load(tmp_path / "state.safetensors")
-    assert taken_up.step == at
+def test_a_resumed_training_continues_identically(at: int, tmp_path: Path) -> None:
+    """Before the first update, later, and after the buffer was filled twice."""
+    learner = SoftQLearner(small_environment, SMALL, 3, CPU)
+    while learner.step < at:
+        learner.train_iteration()
+    learner.save(tmp_path / "state.safetensors")
+    resumed = SoftQLearner(small_environment, SMALL, 3, CPU, num_threads=1)
+    resumed.load(tmp_path / "state.safetensors")
+    assert resumed.step == at
     for _ in range(15):
-        ended, ended_too = through.train_iteration(), taken_up.train_iteration()
+        ended, resumed_ended = learner.train_iteration(), resumed.train_iteration()
         assert [episode.episodic_return for episode in ended] == [
-            episode.episodic_return for episode in ended_too
+            episode.episodic_return for episode in resumed_ended
         ]
-    assert through.losses == taken_up.losses
-    for mine, other in zip(state_of(through), state_of(taken_up), strict=True):
+    assert learner.losses == resumed.losses
+    for mine, other in zip(state_of(learner), state_of(resumed), strict=True):
         assert torch.equal(mine, other)
 
 
-def test_the_seed_decides() -> None:
+def test_the_weights_depend_only_on_the_seed() -> None:
     def trained(seed: int) -> torch.Tensor:
         learner = SoftQLearner(small_environment, SMALL, seed, CPU)
         while learner.step < 160:
@@ -215,7 +222,7 @@ SETTINGS += [
 ]
 
 
-def test_the_script_is_killed_and_ends_with_the_same_weights(tmp_path: Path) -> None:
+def test_an_interrupted_training_ends_with_the_same_weights(tmp_path: Path) -> None:
     options = [argument for setting in SETTINGS for argument in ("--set", setting)]
     command = [sys.executable, str(SCRIPT), "--out", str(tmp_path / "killed"), *options]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -264,14 +271,14 @@ REFUSED += ["learning.buffer_size=35"]
 
 
 @pytest.mark.parametrize("setting", REFUSED)
-def test_what_no_training_can_do_is_refused(setting: str, tmp_path: Path) -> None:
-    """Before anything is written."""
+def test_invalid_settings_are_rejected(setting: str, tmp_path: Path) -> None:
+    """Nothing is written before the error."""
     with pytest.raises(InputError, match=setting.partition("=")[0]):
         training_script("train_generator").main(tmp_path / "out", settings=[*SETTINGS, setting])
     assert not (tmp_path / "out").exists()
 
 
-def test_a_warm_start_of_another_width_is_refused() -> None:
+def test_a_warm_start_of_another_width_is_rejected() -> None:
     narrow, wide = (
         SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12)
     )
@@ -285,8 +292,8 @@ def test_a_warm_start_of_another_width_is_refused() -> None:
     )
 
 
-def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
-    """An object class of one's own, learned after the shipped ones: the script takes both, and what it writes makes scenes."""
+def test_a_training_with_additional_classes_and_a_warm_start(tmp_path: Path) -> None:
+    """The checkpoint of a training with a new object class generates scenes."""
     folder = tmp_path / "own"
     folder.mkdir()
     brick = "  brick: {shape: box, size_mm: [60, 100, 40], mass_g: 300}\n"
@@ -315,6 +322,6 @@ def test_own_objects_and_a_warm_start(tmp_path: Path) -> None:
     assert any("brick" in kind for kind in kinds)
 
 
-def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
+def test_a_missing_checkpoint_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.safetensors"):
         load_checkpoint(tmp_path / "none.safetensors")

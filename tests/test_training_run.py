@@ -1,4 +1,4 @@
-"""A run is taken up only with what it was begun with."""
+"""A run is resumed only with its own configuration and input files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +10,14 @@ from drake_clutter.learning.training_run import CONFIG_FILE, TrainingRun
 
 
 @dataclass
-class Asked:
-    """A config."""
+class Config:
+    """A configuration."""
 
     rate: float = 0.1
 
 
-class Nothing:
-    """Learns nothing."""
+class NoLearner:
+    """A learner that does nothing."""
 
     step = 0
 
@@ -29,14 +29,14 @@ class Nothing:
         """See `Learner`."""
 
 
-def test_another_config_or_teacher_is_refused(tmp_path: Path) -> None:
+def test_another_config_or_input_file_is_rejected(tmp_path: Path) -> None:
     teacher, out = tmp_path / "teacher", tmp_path / "out"
-    teacher.write_text("knows")
-    TrainingRun(out, Asked(), Nothing(), 1, [teacher]).save()
+    teacher.write_text("first")
+    TrainingRun(out, Config(), NoLearner(), 1, [teacher]).save()
     assert str(teacher) in (out / CONFIG_FILE).read_text()
-    TrainingRun(out, Asked(), Nothing(), 1, [teacher])
+    TrainingRun(out, Config(), NoLearner(), 1, [teacher])
     with pytest.raises(InputError, match="another config or other files"):
-        TrainingRun(out, Asked(0.2), Nothing(), 1, [teacher])
-    teacher.write_text("knows better")
+        TrainingRun(out, Config(0.2), NoLearner(), 1, [teacher])
+    teacher.write_text("second")
     with pytest.raises(InputError, match="another config or other files"):
-        TrainingRun(out, Asked(), Nothing(), 1, [teacher])
+        TrainingRun(out, Config(), NoLearner(), 1, [teacher])

@@ -1,4 +1,4 @@
-"""The exploration episode's book-keeping, on scripted outcomes and on real ones; the agents that need no learning."""
+"""Exploration episodes with scripted and real outcomes, beliefs and baseline policies."""
 
 from collections import Counter
 from dataclasses import replace
@@ -51,7 +51,7 @@ REWARDS = ExplorationConfig(detection_reward=2.0, collapse_penalty=-5.0)
 
 
 class Scripted:
-    """An executor that takes the picked cover aside, or ends as it was told to."""
+    """Executor that moves the picked cover aside, or returns scripted results."""
 
     def __init__(self, *results: MoveResult) -> None:
         self._results = iter(results)
@@ -76,7 +76,7 @@ class Scripted:
 
 
 class Episode:
-    """An episode on a backend, move by move."""
+    """An episode on a backend, stepped move by move."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ def episode(detector: LabelDetector, *results: MoveResult, max_moves: int = 10) 
     return Episode(Scripted(*results), detector, max_moves)
 
 
-def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
+def test_rewards_and_record_of_a_successful_episode(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.PLACED, MoveResult.NO_FREE_PLACEMENT, MoveResult.PLACED)
     task = game.task
     at_first = task.detected
@@ -128,7 +128,7 @@ def test_an_episode_that_finds_all(detector: LabelDetector) -> None:
     assert task.scene is third.outcome.scene
 
 
-def test_what_a_collapse_uncovers_does_not_count(detector: LabelDetector) -> None:
+def test_objects_uncovered_by_a_collapse_do_not_count(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.PLACED, MoveResult.COLLAPSED)
     task = game.task
     game.step(Move("cover 2"))
@@ -143,7 +143,7 @@ def test_what_a_collapse_uncovers_does_not_count(detector: LabelDetector) -> Non
         task.record(MoveAttempt(Decision(Move("marker")), step.outcome, step.next_perception))
 
 
-def test_out_of_moves_counts_moves_that_could_not_be_carried_out(detector: LabelDetector) -> None:
+def test_moves_that_were_not_carried_out_count_as_moves(detector: LabelDetector) -> None:
     game = episode(detector, *[MoveResult.NO_FREE_PLACEMENT] * 2, max_moves=2)
     task = game.task
     for _ in range(2):
@@ -152,7 +152,7 @@ def test_out_of_moves_counts_moves_that_could_not_be_carried_out(detector: Label
     assert task.termination is TerminationReason.OUT_OF_MOVES
 
 
-def test_all_found_on_the_last_move_is_a_success(detector: LabelDetector) -> None:
+def test_finding_all_objects_with_the_last_move_is_a_success(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.PLACED, MoveResult.PLACED, max_moves=2)
     task = game.task
     game.step(Move("cover 1"))
@@ -160,8 +160,8 @@ def test_all_found_on_the_last_move_is_a_success(detector: LabelDetector) -> Non
     assert task.termination is TerminationReason.ALL_FOUND
 
 
-def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
-    """The cover is put back over what it hid."""
+def test_detected_objects_stay_detected(detector: LabelDetector) -> None:
+    """The cover is placed over the revealed objects again."""
     game = episode(detector, MoveResult.PLACED, MoveResult.PLACED)
     task = game.task
     game.step(Move("cover 1"))
@@ -176,7 +176,7 @@ def test_what_was_seen_once_stays_known(detector: LabelDetector) -> None:
     assert step.newly_found == ("p",)
 
 
-def test_nothing_hidden_is_found_at_once(detector: LabelDetector) -> None:
+def test_an_episode_without_hidden_objects_ends_at_once(detector: LabelDetector) -> None:
     scene = scene_of(resting("large_marker", name="marker"))
     task = ExplorationTask(scene, detector.perceive(scene), REWARDS, 10)
     assert (task.termination, task.initially_hidden, task.found) == (
@@ -186,7 +186,7 @@ def test_nothing_hidden_is_found_at_once(detector: LabelDetector) -> None:
     )
 
 
-def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
+def test_no_legal_move_places_an_object_on_itself(detector: LabelDetector) -> None:
     game = episode(detector)
     with pytest.raises(ValueError, match="allowed is to put an object on another one or on tray"):
         game.step(Move("marker", "marker"))
@@ -194,7 +194,7 @@ def test_an_object_does_not_go_onto_itself(detector: LabelDetector) -> None:
     assert game.backend.belief.history == ()
 
 
-def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> None:
+def test_legal_moves_do_not_name_hidden_objects(detector: LabelDetector) -> None:
     observation = detector.perceive(HIDING).observation
     moves = legal_moves(observation)
     names = {"cover 1", "cover 2", "marker"}
@@ -205,8 +205,8 @@ def test_legal_moves_say_nothing_of_what_is_hidden(detector: LabelDetector) -> N
     assert legal_moves(replace(observation, detections=())) == []
 
 
-def test_a_real_episode(config: ClutterConfig) -> None:
-    """Largest-clear takes both covers away, the one nearer to the camera first. Drake settles."""
+def test_an_episode_with_rendering_and_settling(config: ClutterConfig) -> None:
+    """Largest-clear moves both covers, first the one nearer to the camera; Drake settles them."""
     backend, seen = (
         make_teleport_backend_factory("settle", config)(HIDING, rng(1)),
         list[tuple[str, ...]](),
@@ -233,7 +233,7 @@ def test_a_real_episode(config: ClutterConfig) -> None:
 
 
 def scripted(*moves: Move) -> Policy:
-    """Make these moves, then none."""
+    """Return a policy that makes some moves and then has none."""
     return lambda belief, *_: Decision(dict(enumerate(moves)).get(len(belief.history)))
 
 
@@ -244,7 +244,7 @@ def test_an_episode_ends_when_the_policy_has_no_move(detector: LabelDetector) ->
     assert game.backend.belief.invalid_moves == (Move("cover 1"),)
 
 
-def test_chosen_moves_go_on_when_all_is_found_but_not_after_a_collapse(
+def test_an_episode_can_continue_after_all_objects_were_found_but_not_after_a_collapse(
     detector: LabelDetector,
 ) -> None:
     moves = [Move("cover 1"), Move("cover 2"), Move("cover 1"), Move("cover 2")]
@@ -263,7 +263,7 @@ def test_chosen_moves_go_on_when_all_is_found_but_not_after_a_collapse(
 # --- Belief ---
 
 
-def test_invalid_moves_are_those_since_anything_last_changed(detector: LabelDetector) -> None:
+def test_invalid_moves_are_cleared_by_a_change(detector: LabelDetector) -> None:
     refused, placed = MoveResult.NOT_PLANNED, MoveResult.PLACED
     game = episode(detector, refused, refused, placed, refused, MoveResult.DROPPED)
     one, two = Move("cover 1"), Move("cover 2")
@@ -275,8 +275,8 @@ def test_invalid_moves_are_those_since_anything_last_changed(detector: LabelDete
     assert game.backend.belief.history == (one, two, one, two, two)
 
 
-def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) -> None:
-    """All its moves are invalid then, and what failed before stays so."""
+def test_an_object_detected_at_its_old_pose_was_not_placed(detector: LabelDetector) -> None:
+    """All its moves become invalid, and earlier invalid moves stay invalid."""
     before = detector.perceive(HIDING).observation
     belief = Belief().update(before).record(Move("marker"), MoveResult.NOT_PLANNED)
     place = Pose((-0.2, 0.25, 0.1), HIDING["cover 1"].X_TO.quaternion)
@@ -293,7 +293,7 @@ def test_what_is_seen_where_it_was_has_not_been_placed(detector: LabelDetector) 
     assert {o.name: o.X_TO for o in placed.update(unseen).objects}["cover 1"] == place
 
 
-def test_nothing_is_said_of_what_is_lost(detector: LabelDetector) -> None:
+def test_invalid_moves_of_a_lost_object_are_removed(detector: LabelDetector) -> None:
     belief = Belief().update(detector.perceive(HIDING).observation)
     for move in (Move("marker"), Move("cover 1", "marker"), Move("cover 1")):
         belief = belief.record(move, MoveResult.NOT_PLANNED)
@@ -307,7 +307,7 @@ def test_nothing_is_said_of_what_is_lost(detector: LabelDetector) -> None:
 
 
 def imagined(*detections: tuple[str, str, int]) -> Observation:
-    """What a camera might show: (name, class, pixels), side by side, each with a clear top."""
+    """Return an observation of objects (name, class, pixels) side by side with clear tops."""
     camera = DEFAULT_CELL.camera
     found = []
     for index, (name, class_name, pixels) in enumerate(detections):
@@ -321,7 +321,7 @@ def imagined(*detections: tuple[str, str, int]) -> Observation:
 
 
 def sweep(policy: Policy, observation: Observation, count: int) -> list[str]:
-    """The objects that a policy picks one after the other; all go to the tray."""
+    """Return the objects that a policy picks one after the other, all to the tray."""
     tried: tuple[Move, ...] = ()
     for _ in range(count):
         move = policy(Belief(history=tried), observation, rng()).move
@@ -331,7 +331,7 @@ def sweep(policy: Policy, observation: Observation, count: int) -> list[str]:
     return [move.pick for move in tried]
 
 
-def test_largest_first_goes_by_volume_and_repeats_only_after_a_sweep() -> None:
+def test_largest_first_orders_by_volume_and_picks_each_object_once_before_any_again() -> None:
     observation = imagined(
         ("m", "large_marker", 900),
         ("b", "sugar_box", 10),
@@ -345,11 +345,11 @@ def test_largest_first_goes_by_volume_and_repeats_only_after_a_sweep() -> None:
         "a",
         "b",
         "m",
-    ]  # 2.2, 1.1, 0.59, 0.59 and 0.03 litres; of two alike the first by name
+    ]  # 2.2, 1.1, 0.59, 0.59 and 0.03 liters; of two alike the first by name
     assert sweep(largest_first, observation, 12) == [*order, *order, "c", "k"]
 
 
-def test_what_comes_into_view_is_picked_before_a_repeat() -> None:
+def test_newly_detected_objects_are_picked_before_any_is_picked_again() -> None:
     observation = imagined(
         ("c", "cracker_box", 20), ("k", "master_chef_can", 1), ("m", "large_marker", 900)
     )
@@ -357,7 +357,7 @@ def test_what_comes_into_view_is_picked_before_a_repeat() -> None:
     assert largest_first(Belief(history=tried), observation, rng()).move == Move("m")
 
 
-def test_largest_clear_goes_by_pixels() -> None:
+def test_largest_clear_orders_by_pixels() -> None:
     observation = imagined(
         ("m", "large_marker", 900),
         ("b", "sugar_box", 10),
@@ -368,7 +368,7 @@ def test_largest_clear_goes_by_pixels() -> None:
     assert sweep(largest_clear, observation, 6) == [*order, "m", "c"]
 
 
-def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) -> None:
+def test_largest_clear_does_not_pick_supporting_objects(detector: LabelDetector) -> None:
     scene = scene_of(
         *(resting("cracker_box", name="below"), resting("large_marker", floor=0.060, name="on it")),
         resting("pudding_box", xy=(0.2, 0.2), name="aside"),
@@ -378,7 +378,7 @@ def test_largest_clear_leaves_what_carries_something(detector: LabelDetector) ->
     assert sweep(largest_clear, observation, 3) == ["aside", "on it", "aside"]
 
 
-def test_largest_clear_takes_any_if_no_top_is_clear(detector: LabelDetector) -> None:
+def test_largest_clear_considers_all_objects_if_no_top_is_clear(detector: LabelDetector) -> None:
     observation = detector.perceive(HIDING).observation
     covered = replace(observation, depth=np.full_like(observation.depth, 0.5))
     move = largest_clear(Belief(), covered, rng()).move
@@ -400,7 +400,9 @@ def test_random_is_uniform_over_the_legal_moves() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(BASELINE_POLICIES))
-def test_every_agent_chooses_legal_moves_repeatably(name: str, detector: LabelDetector) -> None:
+def test_every_baseline_chooses_legal_moves_reproducibly(
+    name: str, detector: LabelDetector
+) -> None:
     observation = detector.perceive(HIDING).observation
 
     def choices(seed: int) -> tuple[Move, ...]:

@@ -1,4 +1,4 @@
-"""Scenes by the batch: the same for any number of workers; the summary's figures on a batch made by hand."""
+"""Scene generation: reproducibility, agents, and the summary of a batch."""
 
 from collections import Counter
 from functools import partial
@@ -35,7 +35,7 @@ def job(nodes: int = 10, seed: int = 5) -> GenerationJob:
 
 
 def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
-    """The scenes with their verdicts, as scene files."""
+    """Return the scenes with their verdicts, as scene files."""
     made = map_ordered(partial(SceneGenerator, which), range(count), workers=workers)
     return [
         yaml.dump(scene_to_dict(generated.scene, DEFAULT_CELL, generated.verdict))
@@ -43,14 +43,14 @@ def batch(which: GenerationJob, count: int, workers: int = 1) -> list[str]:
     ]
 
 
-def test_the_scenes_do_not_depend_on_the_number_of_workers() -> None:
+def test_scenes_do_not_depend_on_the_number_of_workers() -> None:
     alone = batch(job(), 4)
     assert batch(job(), 4, workers=2) == alone
     assert len(set(alone)) == 4
 
 
-def test_a_scene_depends_on_its_index_alone() -> None:
-    """In any order, with whatever was generated before."""
+def test_a_scene_depends_only_on_its_index() -> None:
+    """The order of generation does not matter."""
     generator, other = SceneGenerator(job(6)), SceneGenerator(job(6))
     forwards = [generator(index) for index in (0, 1, 2)]
     backwards = [other(index) for index in (2, 1, 0)][::-1]
@@ -63,8 +63,8 @@ def test_a_scene_depends_on_its_index_alone() -> None:
     assert SceneGenerator(job(6, seed=6))(0).scene.objects != forwards[0].scene.objects
 
 
-def test_graphs_that_cannot_be_laid_out_are_counted_and_drawn_anew() -> None:
-    """On a tray of 0.3 m few graphs fit."""
+def test_graphs_that_cannot_be_laid_out_are_counted_and_replaced() -> None:
+    """Few graphs can be laid out on a tray of 0.3 m."""
     world = world_with("layout.tray_side=0.30", "layout.max_stack_height=0.25")
     generator = SceneGenerator(GenerationJob("random", "ycb7", None, 7, 1, world))
     made = [generator(index) for index in range(4)]
@@ -76,7 +76,7 @@ def test_graphs_that_cannot_be_laid_out_are_counted_and_drawn_anew() -> None:
 
 
 def test_the_random_generator_is_uniform_over_feasible_rules() -> None:
-    """After the tray's only rule, three are feasible with nodes to spare."""
+    """After the first rule, three rules are feasible if nodes remain."""
     grammar = GRAMMARS["ycb7"]
     generator = rng(0)
     second = Counter(
@@ -86,7 +86,7 @@ def test_the_random_generator_is_uniform_over_feasible_rules() -> None:
     assert min(second.values()) > 200 - 4 * 11.5  # four standard deviations
 
 
-def test_a_generated_scene_says_whether_it_is_solvable() -> None:
+def test_stable_scenes_have_a_solvability() -> None:
     made = [SceneGenerator(job(12))(index) for index in range(6)]
     assert {m.verdict.stable for m in made} == {True, False}
     for m in made:
@@ -95,7 +95,7 @@ def test_a_generated_scene_says_whether_it_is_solvable() -> None:
             assert m.solvable is Solvability.SOLVABLE
 
 
-def test_the_hill_climber_hides_more_than_chance() -> None:
+def test_the_hill_climber_hides_more_objects_than_the_random_generator() -> None:
     grammar, config = GRAMMARS["ycb7"], ClutterConfig()
     environment = ClutterGeneration(
         list(grammar.classes.values()), GenerationTaskConfig(nodes=12), config
@@ -117,7 +117,7 @@ def test_the_hill_climber_hides_more_than_chance() -> None:
     assert min(climbed) > 0
 
 
-def test_an_unknown_agent_is_refused() -> None:
+def test_invalid_agents_are_rejected() -> None:
     for name, temperature, named in (
         ("clever", None, "clever"),
         ("none.safetensors", None, "none.safetensors"),
@@ -139,7 +139,7 @@ def laid_out(*rules: str) -> Scene:
     return scene
 
 
-def test_summary_of_a_batch_by_hand() -> None:
+def test_summary_of_a_small_batch() -> None:
     can, box = (
         ("drop_object", "end", f"insert_{name}") for name in ("tomato_soup_can", "sugar_box")
     )
@@ -147,7 +147,7 @@ def test_summary_of_a_batch_by_hand() -> None:
         laid_out(*can, "orient_flat_0", *box, "orient_side_0"),  # two stacks, two objects
         laid_out(
             *box, "orient_side_0", *can, "orient_upright_90"
-        ),  # the same: a can is symmetric, order says nothing
+        ),  # the same graph: a can is symmetric
         laid_out("drop_object", "end", "insert_meta_sugar_box_1"),  # one stack of two objects
         laid_out(
             "drop_object",
@@ -196,7 +196,7 @@ def test_summary_of_a_batch_by_hand() -> None:
     }
 
 
-def test_a_batch_without_a_stable_scene_has_no_mean() -> None:
+def test_summary_of_a_batch_without_stable_scenes() -> None:
     scene = laid_out("drop_object", "end", "insert_sugar_box", "orient_flat_0")
     toppled = Verdict(Instability(InstabilityReason.TOPPLED, "sugar_box_1", 0.0, 1.0), {}, {}, ())
     summary = summarize_scenes(job(), [(scene, toppled)])

@@ -1,4 +1,4 @@
-"""The fewest moves: on scenes made by hand, against trying everything, and played again by the same seed."""
+"""Oracle search: known plans, exhaustive search as a reference, and episodes of its plans."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ EXECUTOR = StaticExecutor(CONFIG, JUDGE)
 
 
 def covered(x: float = 0.0, y: float = 0.0, tag: str = "") -> list[SceneObject]:
-    """A small box under a large one."""
+    """Return a small box below a large one, which hides it."""
     return [
         resting("gelatin_box", xy=(x, y), name=f"small{tag}"),
         resting("cracker_box", xy=(x, y), floor=0.028, name=f"cover{tag}"),
@@ -73,7 +73,7 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
         {"cover", "on top", "cover 2"},
     ),
     "hidden under hidden": (
-        # Of the middle box a corner shows once the upper is gone, of the small one nothing before the middle one is.
+        # Moving the upper box shows a corner of the middle one, but nothing of the small one.
         [*covered(), resting("cereal_box_large", floor=0.088, name="on top"), IN_VIEW],
         2,
         {"cover", "on top"},
@@ -94,7 +94,9 @@ KNOWN: dict[str, tuple[list[SceneObject], int, set[str]]] = {
 
 
 @pytest.mark.parametrize(("objects", "moves", "picked"), KNOWN.values(), ids=list(KNOWN))
-def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[str]) -> None:
+def test_shortest_plans_of_known_length(
+    objects: list[SceneObject], moves: int, picked: set[str]
+) -> None:
     scene = scene_of(*objects)
     assert JUDGE.find_instability(scene) is None
     solution = SEARCH.solve(scene)
@@ -116,7 +118,7 @@ def test_known_fewest_moves(objects: list[SceneObject], moves: int, picked: set[
 
 
 def replayed(scene: Scene, solution: SearchResult, seed: int) -> set[str]:
-    """What has been in view when the plan is done; no move of it fails."""
+    """Return the detected objects after a plan, none of whose moves fails."""
     generator = item_rng(seed)
     known = {d.name for d in JUDGE.ray_caster.observe(scene)[0].detections}
     for move in solution.plan:
@@ -129,14 +131,15 @@ def replayed(scene: Scene, solution: SearchResult, seed: int) -> set[str]:
     return known
 
 
-def test_no_plan_for_nothing_costs_nothing() -> None:
+def test_a_scene_without_hidden_objects_needs_no_search() -> None:
     solution = SEARCH.solve(scene_of(IN_VIEW), budget=0)
     assert solution == SearchResult(Solvability.SOLVABLE, (), 0, (), 0)
 
 
 # --- Unsolvable ---
 
-# The box is held down by its weight alone, which hides it: neither can ever go. What lies below is never found.
+# The held box stands only because the weight holds it down, and the weight hides it: neither
+# can be moved, and objects below them cannot be revealed.
 HELD_DOWN = [
     resting("sugar_box", Orientation.UPRIGHT_0, (-0.0445, 0.0), name="foot"),
     resting("cracker_box", xy=(0.032, 0.0), floor=0.175, name="held"),
@@ -145,21 +148,21 @@ HELD_DOWN = [
 BELOW_IT = resting("gelatin_box", xy=(0.055, 0.0), name="below it")
 
 
-def test_what_lies_under_what_never_moves_is_never_found() -> None:
+def test_objects_below_immovable_ones_are_unrevealable() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, IN_VIEW))
     assert solution.solvability is Solvability.UNSOLVABLE
     assert solution.unrevealable == ("foot", "held", "below it")
     assert (solution.plan, solution.is_optimal, solution.moves_evaluated) == ((), False, 0)
 
 
-def test_what_is_hidden_elsewhere_is_not_named() -> None:
+def test_revealable_objects_are_not_reported_as_unrevealable() -> None:
     solution = SEARCH.solve(scene_of(*HELD_DOWN, BELOW_IT, *covered(0.2, 0.25)))
     assert solution.solvability is Solvability.UNSOLVABLE
     assert solution.unrevealable == ("foot", "held", "below it")
 
 
-def test_no_room_for_any_move() -> None:
-    """Tried out: on a tray of 26 cm the cover can be put nowhere. No object is named, as it is no matter of what is fixed."""
+def test_a_scene_without_free_placements_is_unsolvable() -> None:
+    """On a tray of 26 cm there is no placement for the cover. No object is immovable."""
     solution = SEARCH.solve(scene_of(*covered(), side=0.26))
     assert (solution.solvability, solution.plan, solution.unrevealable) == (
         Solvability.UNSOLVABLE,
@@ -170,9 +173,11 @@ def test_no_room_for_any_move() -> None:
     assert solution.moves_evaluated > 0
 
 
-def test_a_stack_that_collapses_whatever_is_picked() -> None:
-    """A pair that overhangs its foot under a box: whoever takes one of the four makes others fall, and nothing else is there to
-    put down on them first. Proved by trying nothing."""
+def test_a_stack_that_collapses_with_every_pick_is_unsolvable() -> None:
+    """A pair overhangs its foot below a load; picking any of the four objects makes others fall.
+
+    No move is evaluated, as no object can be picked.
+    """
     pair = [
         resting("sugar_box", xy=(0.0, y), floor=0.038, name=name)
         for name, y in (("left", -0.0455), ("right", 0.0455))
@@ -190,13 +195,13 @@ def test_a_stack_that_collapses_whatever_is_picked() -> None:
 
 
 @pytest.mark.parametrize("budget", [0, 1])
-def test_undecided_on_a_small_budget(budget: int) -> None:
+def test_a_small_budget_leaves_the_scene_undecided(budget: int) -> None:
     solution = SEARCH.solve(scene_of(*KNOWN["under two boxes"][0]), budget=budget)
     assert solution == SearchResult(Solvability.UNDECIDED, (), 2, (), budget)
     assert not solution.is_optimal
 
 
-def test_no_more_moves_than_the_budget_are_tried() -> None:
+def test_the_budget_is_respected() -> None:
     scene = scene_of(*KNOWN["one deep, one not"][0])
     answers = []
     for budget in range(12):
@@ -210,8 +215,8 @@ def test_no_more_moves_than_the_budget_are_tried() -> None:
     assert set(answers[decided:]) == {Solvability.SOLVABLE}
 
 
-def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
-    """Because of a box that leans 3 mm beside it, the static judge cannot tell whether the cover can go; Drake can."""
+def test_inconclusive_verdicts_do_not_raise_the_lower_bound() -> None:
+    """A box that leans beside the cover makes the static verdict inconclusive; Drake decides."""
     R_TO = Rotation.from_euler("y", 3, degrees=True).as_matrix()
     leaning = SceneObject(
         "leaning", CLASSES["gelatin_box"], Pose.from_rotation(R_TO, (0.1335, 0.0, 0.0372))
@@ -233,7 +238,7 @@ def test_the_bound_is_not_raised_by_what_cannot_be_judged() -> None:
 # --- What the search does not take, or is not to try ---
 
 
-def test_no_plan_begins_with_what_has_failed() -> None:
+def test_no_plan_starts_with_an_invalid_move() -> None:
     scene = scene_of(*covered(), IN_VIEW)
     (first,) = SEARCH.solve(scene).plan
     (other,) = SEARCH.solve(scene, invalid_moves=[first]).plan
@@ -243,7 +248,7 @@ def test_no_plan_begins_with_what_has_failed() -> None:
     assert SEARCH.solve(scene, invalid_moves=nothing_left).plan == ()
 
 
-def test_more_objects_than_the_search_takes() -> None:
+def test_scenes_with_too_many_objects_are_rejected() -> None:
     markers = [
         resting("large_marker", xy=(0.01 * (k % 8), 0.1 * (k // 8)), name=f"m{k}")
         for k in range(65)
@@ -252,15 +257,16 @@ def test_more_objects_than_the_search_takes() -> None:
         SEARCH.solve(scene_of(*markers))
 
 
-# --- Against trying everything ---
+# --- Exhaustive search as a reference ---
 
 
-# Stable, with something hidden, and with few enough objects in view to try every move. That of seed 45 takes more than two.
+# Stable scenes with hidden objects, and few enough objects in view to evaluate all sequences of
+# two moves. The scene of seed 45 needs more than two.
 RANDOM = {seed: random_scene(seed, 4, 8) for seed in (2, 17, 22, 33, 39, 45, 67)}
 
 
-def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
-    """The least number of moves, up to `most`, of all sequences of legal moves that reveal everything without a collapse."""
+def shortest_plan_length(scene: Scene, seed: int, most: int) -> int | None:
+    """Return the length of a shortest plan by exhaustive search, up to `most` moves."""
     observation = JUDGE.ray_caster.observe(scene)[0]
     known = frozenset(d.name for d in observation.detections)
     level = [(scene, observation, known, item_rng(seed).bit_generator.state)]
@@ -274,30 +280,30 @@ def fewest_by_trying(scene: Scene, seed: int, most: int) -> int | None:
                 generator.bit_generator.state = state
                 outcome = executed(EXECUTOR, scene, observation, move, generator)
                 if outcome.result is MoveResult.PLACED:
-                    look = JUDGE.ray_caster.observe(outcome.scene)[0]
-                    seen = known | {d.name for d in look.detections}
-                    after.append((outcome.scene, look, seen, generator.bit_generator.state))
+                    observed = JUDGE.ray_caster.observe(outcome.scene)[0]
+                    seen = known | {d.name for d in observed.detections}
+                    after.append((outcome.scene, observed, seen, generator.bit_generator.state))
         level = after
     return None
 
 
 @pytest.mark.parametrize("seed", RANDOM)
-def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
-    """With the same draws, so that places agree. Two moves of four objects in view are some 270 to try."""
+def test_the_lower_bound_and_the_plan_agree_with_exhaustive_search(seed: int) -> None:
+    """Placements agree, as both use the same random state."""
     scene = RANDOM[seed]
     assert JUDGE.find_instability(scene) is None
     solution = SEARCH.solve(scene, seed=2, budget=300)
-    fewest = fewest_by_trying(scene, 2, 2)
-    if fewest is None:
+    shortest = shortest_plan_length(scene, 2, 2)
+    if shortest is None:
         assert seed == 45
         assert solution.lower_bound > 2
         assert len(solution.plan) > 2 or solution.solvability is not Solvability.SOLVABLE
         return
-    assert fewest == (1 if seed == 2 else 2)
+    assert shortest == (1 if seed == 2 else 2)
     assert (solution.solvability, solution.lower_bound, len(solution.plan)) == (
         Solvability.SOLVABLE,
-        fewest,
-        fewest,
+        shortest,
+        shortest,
     )
     assert solution.is_optimal
     assert replayed(scene, solution, 2) == set(scene.names)
@@ -306,8 +312,8 @@ def test_the_bound_and_the_plan_agree_with_trying_everything(seed: int) -> None:
 # --- Repeatable ---
 
 
-def test_the_same_seed_gives_the_same_solution() -> None:
-    """Whatever was searched before, and by a judge of its own."""
+def test_the_result_depends_only_on_the_seed() -> None:
+    """Neither earlier searches nor the judge's cache matter."""
     scene = RANDOM[33]
     solution = SEARCH.solve(scene, seed=5)
     SEARCH.solve(scene_of(*KNOWN["two stacks"][0]), seed=1)
@@ -316,14 +322,14 @@ def test_the_same_seed_gives_the_same_solution() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_plan_holds_for_its_seed(seed: int) -> None:
+def test_a_plan_succeeds_in_an_episode_of_its_seed(seed: int) -> None:
     for scene in (RANDOM[22], RANDOM[39]):
         solution = SEARCH.solve(scene, seed=seed)
         assert solution.solvability is Solvability.SOLVABLE
         assert replayed(scene, solution, seed) == set(scene.names)
 
 
-def test_drake_confirms_a_plan() -> None:
+def test_a_plan_succeeds_in_drake() -> None:
     scene = scene_of(*covered(), *covered(0.2, 0.25, " 2"))
     solution = SEARCH.solve(scene, seed=4)
     backend = make_teleport_backend_factory("settle", CONFIG)(scene, item_rng(4))
