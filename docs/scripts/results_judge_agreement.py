@@ -52,11 +52,11 @@ def _scenes(results: Mapping[str, Any]) -> str:
     text = section(
         "Scenes",
         "RG scenes judged by the static judge and by Drake with the same random offsets. "
+        "`benchmarks/collect_drake_verdicts.py` collects Drake's verdicts. "
         "*Verdicts equal*, *false stable* and *false unstable*: of the scenes with a conclusive "
         "static verdict. *Hidden lists equal*: of the scenes that both call stable. Intervals are "
         "95 %.",
-        command="python benchmarks/judge_agreement.py benchmarks/results/drake_verdicts"
-        " --out benchmarks/results/judges.json",
+        command="python benchmarks/judge_agreement.py runs/drake_verdicts --out FILE",
         seed=0,
         results=["benchmarks/results/judges.json", "benchmarks/results/drake_verdicts/"],
     )
