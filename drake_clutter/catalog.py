@@ -1,4 +1,4 @@
-"""The catalog of object classes: sizes, masses, labels and the folders of their assets.
+"""The catalog of object classes: sizes, masses, labels and asset folders.
 
 An *asset folder* holds `catalog.yaml` and one folder for each class, which `drake_clutter.assets`
 builds from it. The shipped one is `sdf_assets/`; a user's own adds classes to it. The origin of an
@@ -45,7 +45,7 @@ class Shape(Enum):
 
 
 class RestOrientation(Enum):
-    """Which axis of an object points up when it rests, by the object's extent along it.
+    """Which axis points up when an object rests, by the extent along it.
 
     A mesh keeps its own axes: x counts as the shortest and z as the longest.
     """
@@ -56,7 +56,7 @@ class RestOrientation(Enum):
 
 
 class PairArrangement(Enum):
-    """How the two objects of a pair ("meta" objects in Kumar et al. 2022) stand side by side."""
+    """How the two objects of a pair ("meta" in Kumar et al. 2022) stand side by side."""
 
     LYING = "lying"
     STANDING = "standing"
@@ -79,6 +79,7 @@ class LabelDesign(StrictModel):
 
 
 def _check_class_name(name: str) -> str:
+    """Return a valid name of a class."""
     if not _NAME.fullmatch(name) or name in _RESERVED_NAMES:
         words = ", ".join(sorted(_RESERVED_NAMES))
         raise allowed_error(f"a name of lower-case letters, digits and _, and none of {words}")
@@ -149,7 +150,9 @@ class CatalogFile(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class ObjectClass:
-    """A validated object class. Classes compare by identity, as a catalog holds each once.
+    """A validated object class.
+
+    Classes compare by identity, as a catalog holds each once.
 
     Attributes:
         name: Name of the class.
@@ -267,6 +270,15 @@ class Catalog:
 
 
 def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
+    """Return the extents of a watertight mesh [m].
+
+    Args:
+        path: The mesh file.
+        where: Field of the catalog, for error messages.
+
+    Raises:
+        InputError: The mesh cannot be read, is not watertight, or has an unsuitable size.
+    """
     if not path.is_file():
         raise InputError(f"{where}.mesh: no file {path}; give a mesh that lies beside the catalog")
     try:
@@ -287,6 +299,7 @@ def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
 
 
 def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
+    """Return the class of an entry of a catalog."""
     mesh = folder / entry.mesh if entry.mesh else None
     if mesh is not None:
         size = _measure_mesh(mesh, where)
@@ -317,7 +330,7 @@ def catalog_path(folder: Path) -> Path:
 
 @lru_cache
 def load_catalog(folder: Path | None = None) -> Catalog:
-    """Return the shipped catalog, with the classes and sets of a user's asset folder added.
+    """Return the shipped catalog, extended by a user's asset folder.
 
     Args:
         folder: A user's asset folder, or None for the shipped one alone.

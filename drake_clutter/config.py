@@ -130,7 +130,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Clutt
 
 
 def upgrade_config(given: Any) -> Any:
-    """Return a config document with the camera, tray and arm of version 0.1 in its cell."""
+    """Return a config document of version 0.1 with camera, tray and arm in its cell."""
     if not isinstance(given, dict):
         return given
     upgraded = {
@@ -170,6 +170,7 @@ def upgrade_header_configs(given: Any) -> Any:
 
 
 def _complete_configs(given: Any) -> Any:
+    """Return a document with current names of fields and complete cells."""
     if not isinstance(given, dict):
         return given
     completed = {key: _complete_configs(value) for key, value in given.items()}
@@ -182,6 +183,7 @@ def _complete_configs(given: Any) -> Any:
 
 
 def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
+    """Return a camera's document of version 0.1 in the form of this version."""
     camera = {key: value for key, value in old.items() if key not in ("altitude", "hidden_below")}
     if "altitude" in old:
         camera["pose"] = {"translation": [0.0, 0.0, old["altitude"]], "rpy_deg": [180.0, 0.0, 0.0]}
@@ -191,7 +193,7 @@ def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
 
 
 def upgrade_cell(old: Any) -> Any:
-    """Return the document of a cell with the arm of version 0.1 as its robot and gripper.
+    """Return a cell's document with the arm of version 0.1 as robot and gripper.
 
     Version 0.1 has the fields `base`, `home`, `suction` and `payload`.
     """

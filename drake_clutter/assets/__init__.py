@@ -1,4 +1,4 @@
-"""Builder of the SDF models, collision pieces and textured visuals of a catalog's classes."""
+"""Builder of SDF models, collision pieces and textured visuals of object classes."""
 
 from drake_clutter.assets.asset_builder import build_assets, build_class
 from drake_clutter.assets.textures import MOTIFS

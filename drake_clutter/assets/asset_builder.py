@@ -1,4 +1,4 @@
-"""Building the SDF model of an object class: inertia, collision geometry, textured visual."""
+"""Building an object class: SDF model, collision geometry, textured visual."""
 
 import os
 import re
@@ -109,6 +109,7 @@ class _Inertial:
 
 
 def _load_centered_mesh(path: Path) -> trimesh.Trimesh:
+    """Return a mesh with the center of its bounding box at the origin."""
     mesh = trimesh.load_mesh(path)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
@@ -153,12 +154,14 @@ def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
 
 
 def _obj_text(mesh: trimesh.Trimesh) -> str:
+    """Return a mesh as the content of an OBJ file."""
     lines = ["v {:.7f} {:.7f} {:.7f}".format(*vertex) for vertex in mesh.vertices]
     lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
     return "\n".join(lines) + "\n"
 
 
 def _collision_sdf(name: str, geometry: str, hint: float) -> str:
+    """Return the SDF element of one collision geometry."""
     return f"""      <collision name="{name}">
         <geometry>
           {geometry}
@@ -169,6 +172,7 @@ def _collision_sdf(name: str, geometry: str, hint: float) -> str:
 
 
 def _collisions_sdf(object_class: ObjectClass, num_pieces: int) -> str:
+    """Return the SDF elements of a class's collision geometry."""
     x, y, z = object_class.size
     if object_class.shape is Shape.BOX:
         return _collision_sdf("box", f"<box><size>{x!r} {y!r} {z!r}</size></box>", max(x, y, z))
@@ -225,6 +229,7 @@ def _make_asset_files(object_class: ObjectClass) -> dict[str, str]:
 
 
 def _comment_text(text: str) -> str:
+    """Return text that can stand in an XML comment, which may not contain "--"."""
     return re.sub(r"-{2,}", "-", text).rstrip("-")  # XML comments may not hold two hyphens
 
 

@@ -1,4 +1,4 @@
-"""The motifs of product labels: each draws one piece, and a label is covered with pieces."""
+"""Motifs of product labels. A label is covered with the pieces of one motif."""
 
 import math
 import random
@@ -13,7 +13,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class MotifPen:
-    """Draws one piece in its own coordinates: the unit circle, with x right and y down.
+    """Draws one piece in the unit circle, with x right and y down.
 
     Attributes:
         draw: The picture.
@@ -32,6 +32,7 @@ class MotifPen:
     rng: random.Random
 
     def _pixels(self, points: Iterable[Point]) -> list[Point]:
+        """Return points of the piece in pixels of the picture."""
         c, s = math.cos(self.angle) * self.radius, math.sin(self.angle) * self.radius
         return [(self.center[0] + c * x - s * y, self.center[1] + s * x + c * y) for x, y in points]
 

@@ -145,6 +145,7 @@ def map_strip_texture(mesh: trimesh.Trimesh, region: Region) -> TexturedMesh:
 
 
 def _data_uri(kind: str, data: bytes) -> str:
+    """Return data as a URI with base64 encoding."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 

@@ -141,14 +141,19 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @lru_cache
 def _text_extent(lines: str, size: int) -> tuple[float, float, float, float]:
-    """Return the bounding box of text in a font size: left, top, right, bottom [pixels]."""
+    """Return left, top, right and bottom of text in a font size [pixels]."""
     return ImageDraw.Draw(Image.new("L", (1, 1))).multiline_textbbox(
         (0, 0), lines, font=_font(size), align="center", spacing=size * 0.1
     )
 
 
 def _font_size(lines: str, box: tuple[float, float]) -> int:
-    """Return the largest font size [pixels] in which text fits into a box of width and height."""
+    """Return the largest font size in which text fits into a box [pixels].
+
+    Args:
+        lines: The text.
+        box: Width and height of the box [pixels].
+    """
     left, top, right, bottom = _text_extent(lines, 100)
     return int(100 * min(box[0] / max(1, right - left), box[1] / max(1, bottom - top)))
 

@@ -1,4 +1,4 @@
-"""Export of a scene as a binary glTF file, for viewers, modeling programs and web pages."""
+"""Export of a scene as a binary glTF file."""
 
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
@@ -23,6 +23,7 @@ ROOT_NODE = "tray_frame"
 
 
 def _add_tray(picture: trimesh.Scene, support: Support) -> None:
+    """Add the support as a node with one child for each of its boxes."""
     picture.graph.update(frame_to=TRAY, frame_from=ROOT_NODE, matrix=np.eye(4))
     for tray_box in support_boxes(support):
         box = trimesh.creation.box(tray_box.size)
@@ -38,10 +39,10 @@ def _add_tray(picture: trimesh.Scene, support: Support) -> None:
 
 
 def write_glb(scene: Scene, folder: Path) -> Path:
-    """Write `scene.glb`: the support and every object as a named node below the node `tray_frame`.
+    """Write `scene.glb` with a named node for the support and for every object.
 
-    The y axis of glTF points up; `tray_frame` maps T's z axis to it. The pose of an object's node
-    in `tray_frame` is X_TO. Returns the path of `scene.glb`.
+    The nodes are below the node `tray_frame`, in which the pose of an object's node is X_TO. The y
+    axis of glTF points up; `tray_frame` maps T's z axis to it. Returns the path of `scene.glb`.
     """
     picture = trimesh.Scene()
     picture.graph.update(frame_to=ROOT_NODE, matrix=np.linalg.inv(Y_UP_TO_Z_UP))

@@ -19,6 +19,7 @@ from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 
 
 def _add_defaults(root: Element) -> None:
+    """Add the default classes of visual and collision geometry."""
     default = SubElement(root, "default")
     # Masses come from the inertials. The shell inertia avoids an error for meshes that are not
     # closed.
@@ -34,6 +35,7 @@ def _add_defaults(root: Element) -> None:
 
 
 def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]) -> None:
+    """Add texture, material and meshes of a class."""
     name = object_class.name
     SubElement(asset, "texture", name=name, type="2d", file=f"{name}/label.png")
     SubElement(asset, "material", name=name, texture=name)
@@ -43,6 +45,7 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
 
 
 def _add_tray(worldbody: Element, support: Support) -> None:
+    """Add the support as a fixed body."""
     tray = SubElement(worldbody, "body", name=TRAY)
     for box in support_boxes(support):
         geometry = {
@@ -60,6 +63,7 @@ def _add_tray(worldbody: Element, support: Support) -> None:
 
 
 def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[str]) -> None:
+    """Add an object as a body with a free joint."""
     object_class, X_TO = scene_object.object_class, scene_object.X_TO
     inertial = load_inertial(object_class)
     body = SubElement(
@@ -92,9 +96,9 @@ def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[
 
 
 def write_mjcf(scene: Scene, folder: Path) -> Path:
-    """Write `scene.xml` and a folder of meshes for each class, and return the path of `scene.xml`.
+    """Write `scene.xml` and a folder of meshes for each class.
 
-    Visuals are in group 2, collision geometry is in group 3.
+    Visuals are in group 2, collision geometry is in group 3. Returns the path of `scene.xml`.
     """
     root = Element("mujoco", model="scene")
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 """An array of floats."""
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Transform (4, 4) from a glTF file, whose y axis points up, to a frame whose z axis does."""
+"""Transform from a frame with y up (glTF) to one with z up. Shape (4, 4)."""
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ def _use_standard_friction(collision: ElementTree.Element) -> None:
 
 
 def _model(text: str, name: str) -> ElementTree.Element:
+    """Return the model of an SDF document under another name, with standard friction."""
     model = ElementTree.fromstring(text).find("model")
     assert model is not None
     model.set("name", name)
@@ -44,12 +45,13 @@ def _model(text: str, name: str) -> ElementTree.Element:
 
 
 def _pose_text(pose: Pose) -> str:
+    """Return a pose as translation and roll, pitch, yaw."""
     X_AB = rigid_transform(pose)
     return format_numbers([*X_AB.translation(), *RollPitchYaw(X_AB.rotation()).vector()])
 
 
 def write_sdf(scene: Scene, folder: Path) -> Path:
-    """Write `scene.sdf`, a world with one model for each object, and the meshes of each class.
+    """Write `scene.sdf`, a world with one model per object, and meshes per class.
 
     Returns the path of `scene.sdf`.
     """

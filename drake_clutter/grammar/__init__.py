@@ -1,4 +1,4 @@
-"""The scene grammar: graphs, production rules and derivations, independent of poses and physics."""
+"""The scene grammar: graphs, production rules and derivations."""
 
 from drake_clutter.grammar.clutter_graph import ClutterGraph, canonical_form
 from drake_clutter.grammar.orientation import Orientation, resting_rotation

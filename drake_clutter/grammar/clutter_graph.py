@@ -1,4 +1,4 @@
-"""The scene graph of Kumar et al. (2022): a tray, objects on it, and objects on those."""
+"""The scene graph of Kumar et al. (2022): tray, objects, and what they carry."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -9,13 +9,19 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.grammar.orientation import Orientation, symmetry_key
 
 TRAY = "tray"
+"""Kind of the root node."""
 OBJECT_SLOT = "object_slot"
+"""Non-terminal kind: an object whose class is not chosen yet."""
 OPEN_SLOT = "open_slot"
+"""Non-terminal kind: the top of a stack that can still grow."""
 END = "end"
+"""Terminal kind: the top of a stack that is complete."""
 DUMMY = "dummy"
+"""Terminal kind: the common top of a pair, on which an object can stand."""
 NON_TERMINAL_KINDS = frozenset({OBJECT_SLOT, OPEN_SLOT})
+"""Kinds that no terminal graph contains."""
 STRUCTURE_KINDS = frozenset({TRAY, END, DUMMY}) | NON_TERMINAL_KINDS
-"""Kinds of nodes that are not objects; every other kind is the name of an object class."""
+"""Kinds of nodes that are not objects; other kinds are names of object classes."""
 
 PRIMITIVE = "primitive"
 """Kind of a non-terminal edge.

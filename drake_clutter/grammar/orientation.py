@@ -1,4 +1,4 @@
-"""The ten terminal orientations: how an object rests, and its yaw about the tray's z axis."""
+"""The ten terminal orientations: how an object rests, and its yaw."""
 
 from enum import Enum
 from functools import lru_cache
@@ -57,6 +57,7 @@ def _resting_axes(object_class: ObjectClass, rest: RestOrientation) -> tuple[int
 
 @lru_cache(maxsize=4096)
 def _cached_rotation(object_class: ObjectClass, orientation: Orientation) -> NDArray[np.float64]:
+    """Return R_TO (3, 3), see `resting_rotation`."""
     along_x, up = _resting_axes(object_class, orientation.rest)
     R_AO = np.zeros((3, 3))  # A is the tray's frame before the yaw
     R_AO[0, along_x] = R_AO[2, up] = 1.0
@@ -73,15 +74,17 @@ def resting_rotation(object_class: ObjectClass, orientation: Orientation) -> NDA
 
 
 def symmetry_key(object_class: ObjectClass, orientation: Orientation) -> tuple[int, ...]:
-    """Return a key that is equal for orientations in which objects of a class look the same."""
+    """Return a key that is equal for orientations that look the same.
+
+    Objects look the same up to the symmetry of their class: that of a box, of a cylinder, or none.
+    """
     R_TO = resting_rotation(object_class, orientation)
     if object_class.shape is Shape.CYLINDER:
         axis = R_TO[:, 2]
         description = np.outer(axis, axis)  # identifies the axis up to its sign
     elif object_class.shape is Shape.BOX:
-        description = (
-            R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T
-        )  # the box's moments name it
+        # The second moments identify the orientation up to the symmetry of a box.
+        description = R_TO @ np.diag(np.square(object_class.size)) @ R_TO.T
     else:
         description = R_TO
     return tuple(int(value) for value in np.round(description * 1e6).ravel())

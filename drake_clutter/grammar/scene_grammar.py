@@ -57,7 +57,9 @@ Match = Mapping[str, int]
 
 
 class SceneGrammar:
-    """The grammar G = (N_NT, N_T, E, R, S) for a set of object classes (Kumar et al. 2022, eq. 1).
+    """The grammar G = (N_NT, N_T, E, R, S) for a set of object classes.
+
+    Source: Kumar et al. 2022, eq. 1.
 
     Attributes:
         classes: Object classes by name.

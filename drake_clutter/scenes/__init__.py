@@ -1,1 +1,1 @@
-"""Scenes: data, layout, files, placement, and the interfaces of judges and executors."""
+"""Scenes: data, layout, files, placement; interfaces of judges and executors."""

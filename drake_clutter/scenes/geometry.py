@@ -47,6 +47,7 @@ class _Polytope:
 
 
 def _distinct_directions(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors along directions (N, 3), without repeated or opposite ones."""
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     first = np.argmax(np.abs(unit) > 1e-6, axis=1)
     unit = unit * np.sign(unit[np.arange(len(unit)), first])[:, None]
@@ -58,6 +59,7 @@ _polytopes: dict[ObjectClass, tuple[_Polytope, ...]] = {}
 
 
 def _pieces(object_class: ObjectClass) -> tuple[_Polytope, ...]:
+    """Return the polytopes of a class's convex pieces, which are cached."""
     if object_class not in _polytopes:
         _polytopes[object_class] = tuple(_Polytope(piece) for piece in object_class.convex_pieces)
     return _polytopes[object_class]

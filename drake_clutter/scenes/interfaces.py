@@ -83,7 +83,10 @@ class Verdict:
 
     @property
     def stable(self) -> bool:
-        """Whether no object moved or rotated past the limits, left the support or kept moving."""
+        """Whether the scene is stable.
+
+        No object moved or rotated past the limits, left the support or kept moving.
+        """
         return self.instability is None
 
 
@@ -113,7 +116,9 @@ class InconclusiveReason(Enum):
 
 @dataclass(frozen=True)
 class InconclusiveVerdict:
-    """A judge's result for a scene that its model does not cover. `DrakeJudge` covers every scene.
+    """A judge's result for a scene that its model does not cover.
+
+    `DrakeJudge` covers every scene.
 
     Attributes:
         reason: What the model does not cover.

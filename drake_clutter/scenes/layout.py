@@ -1,4 +1,4 @@
-"""From a terminal graph to poses: resting orientations, pairs, and stacks side by side."""
+"""From a terminal graph to poses: resting objects, pairs, and stacks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class LayoutFailure:
 
 
 class _RestingPose(NamedTuple):
-    """An object class in a resting orientation, in the axes of T about the object's origin.
+    """An object class at rest, in the axes of T about the object's origin.
 
     Attributes:
         quaternion: Quaternion (w, x, y, z) of R_TO.
@@ -59,13 +59,14 @@ class _RestingPose(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _resting_pose(object_class: ObjectClass, orientation: Orientation) -> _RestingPose:
+    """Return a class in a resting orientation."""
     X_TO = Pose.from_rotation(resting_rotation(object_class, orientation), (0.0, 0.0, 0.0))
     corners = X_TO.apply(object_class.corners)
     return _RestingPose(X_TO.quaternion, corners.min(axis=0), corners.max(axis=0))
 
 
 class Stack:
-    """One object or pair on the support with everything above it, centered on the support.
+    """An object or pair on the support and everything above it, centered.
 
     Attributes:
         nodes: Graph nodes of its objects, each before the objects that it carries.
@@ -157,7 +158,7 @@ def _sample_positions(
     config: LayoutConfig,
     rng: np.random.Generator,
 ) -> NDArray[np.float64] | None:
-    """Sample positions of rectangles on the support that keep the gap, large rectangles first.
+    """Sample positions of rectangles that keep the gap, large rectangles first.
 
     Args:
         half_sizes: Half sizes of S rectangles [m]. Shape (S, 2).

@@ -33,12 +33,15 @@ _SURFACE_TOLERANCE = 0.008
 _MIN_POINTS = 12
 """Fewest unidentified depth points that form a box; fewer are noise at edges."""
 _EDGE_WINDOW = 25
-"""Side of the window around a pixel that must be free of the arm and the rim [pixels].
+"""Side of the window around a pixel without arm and rim [pixels].
 
 Closer to them, a depth camera has shadows of its own.
 """
 _TOP_QUANTILE = 0.98
-"""Quantile of the heights of unidentified points at which a box ends; above are outliers."""
+"""Quantile of the heights of unidentified points at which a box ends.
+
+Higher points are outliers.
+"""
 _PIXEL_STRIDE = 2
 """Every so many-th pixel is used, in both directions."""
 _COLUMN_SIZE = 0.02
@@ -70,7 +73,7 @@ class OccludedBox:
 
     @staticmethod
     def below_points(points_T: NDArray[np.floating], top: float) -> "OccludedBox":
-        """Return the box from the floor up to a height, with the smallest base around points.
+        """Return the box up to a height with the smallest base around points.
 
         Args:
             points_T: Points, of which only x and y are used [m]. Shape (N, 2) or (N, 3).
@@ -86,7 +89,7 @@ class OccludedBox:
 def occluded_boxes(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> tuple[OccludedBox, ...]:
-    """Return boxes over the occluded space and over everything seen that is not a known object.
+    """Return boxes over occluded space and over unidentified depth points.
 
     Args:
         known_objects: K_t, the known objects at their present poses.
@@ -107,7 +110,7 @@ def occluded_boxes(
 def _boxes_behind(
     known_objects: Sequence[SceneObject], observation: Observation
 ) -> list[OccludedBox]:
-    """Return boxes over the space that a tilted camera cannot see behind known objects.
+    """Return boxes over the space behind known objects, for a tilted camera.
 
     The space is cut into vertical columns. Space closer to an object than the surface tolerance is
     left out, as nothing fits in between.

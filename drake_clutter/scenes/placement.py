@@ -22,11 +22,11 @@ from drake_clutter.scenes.scene import TRAY, Pose
 CELL_SIZE = 0.005
 """Side of the grid cells on the support in which placements are searched [m]."""
 _DEPTH_TOLERANCE = 0.004
-"""Largest difference between a measured and a known height that counts as equal [m]."""
+"""Largest difference of depths that count as equal [m]."""
 _HEIGHT_STEP = 0.020
 """Distance between the heights at which the space above a cell is checked [m]."""
 _EDGE_MARGIN = 0.005
-"""Smallest distance between a center of mass and the edge of the carrying face [m]."""
+"""Smallest distance of a center of mass from the carrying face's edge [m]."""
 _YAWS = (0.0, np.pi / 2)
 """Rotations of the picked object that are tried, in this order [rad]."""
 
@@ -148,7 +148,7 @@ def _orient_object(
 
 @lru_cache(maxsize=16)
 def _tray_candidates(support: Support) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells of the support and their costs, the cells farthest from its center first.
+    """Return the cells of the support with costs, the outermost first.
 
     Returns:
         Cells, shape (n, 2), and their negative distances from the center [m], shape (n,).
@@ -163,7 +163,7 @@ def _tray_candidates(support: Support) -> tuple[NDArray[np.int64], NDArray[np.fl
 def _top_candidates(
     observation: Observation, target: Detection
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells on the visible part of an object's top, those nearest to its center first.
+    """Return the cells on an object's visible top with costs, the central ones first.
 
     Returns:
         Cells, shape (n, 2), and their distances from the center [m], shape (n,).
@@ -197,7 +197,7 @@ def _top_candidates(
 
 @njit(cache=True)
 def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
-    """Return the first of the cells above which the footprint is free, and those of equal cost.
+    """Return the first cells above which the footprint is free, all of equal cost.
 
     Args:
         depth: Depth image [m]. Shape (height, width).
@@ -252,12 +252,12 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
 
 
 def top_height(detection: Detection) -> float:
-    """Return the height of a detected object's highest point above the support's floor [m]."""
+    """Return the height of a detected object's highest point [m]."""
     return float(detection.X_TO.apply(detection.object_class.corners)[:, 2].max())
 
 
 def has_clear_top(observation: Observation, detection: Detection) -> bool:
-    """Return whether the camera sees the space right above an object, over its whole top."""
+    """Return whether the camera sees the space right above an object's whole top."""
     corners = detection.X_TO.apply(detection.object_class.corners)
     top = float(corners[:, 2].max())
     grid = _Grid.over(observation.support)
@@ -281,7 +281,10 @@ class FreePlacements(NamedTuple):
 
 _PlacementCache = dict[tuple[Move, ExplorationConfig], FreePlacements | None]
 _FREE_PLACEMENTS: WeakKeyDictionary[Observation, _PlacementCache] = WeakKeyDictionary()
-"""Results of earlier searches, by observation: action filters and commands ask for the same."""
+"""Results of earlier searches, by observation.
+
+Action filters and commands search for the same placements.
+"""
 
 
 def find_free_placements(
@@ -289,7 +292,7 @@ def find_free_placements(
     move: Move,
     config: ExplorationConfig,
 ) -> FreePlacements | None:
-    """Return the equally good placements for a move, or None if no placement is known to be free.
+    """Return the equally good placements for a move, or None if none is known.
 
     The object keeps its orientation, or is rotated by a quarter turn about the vertical if only
     that fits. A placement is free where the camera sees through the space that the object will
@@ -317,6 +320,7 @@ def _search_placements(
     move: Move,
     config: ExplorationConfig,
 ) -> FreePlacements | None:
+    """Return the placements for a move, see `find_free_placements`."""
     picked = observation[move.pick]
     if move.place == TRAY:
         floor = 0.0

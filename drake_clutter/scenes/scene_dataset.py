@@ -26,7 +26,7 @@ from drake_clutter.validation import to_plain, validate
 VERSION = 1
 """Version of the file format."""
 _LAYOUT_TRIES = 100
-"""Layouts sampled for a graph that was laid out before; it fits, so a failure is bad luck."""
+"""Layouts sampled for a graph before `relayout` gives up."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class SceneDataset:
 def relayout(
     derivation: Derivation, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator
 ) -> Scene:
-    """Return a scene for a graph that was laid out before, with its stacks in new positions.
+    """Return a scene for a graph, with its stacks in new positions.
 
     Raises:
         InputError: No layout fits on the support.
@@ -115,6 +115,7 @@ def relayout(
 
 
 def _digest(head: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return the hash of a dataset's header and scenes."""
     return hashlib.sha256(json.dumps([head, entries], sort_keys=True).encode()).hexdigest()
 
 
@@ -198,6 +199,7 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
 
 
 def _pose(numbers: Sequence[float]) -> Pose:
+    """Return a pose from translation and quaternion, which is normalized."""
     x, y, z, *quaternion = numbers
     w, i, j, k = (float(v) for v in np.array(quaternion) / np.linalg.norm(quaternion))
     return Pose((x, y, z), (w, i, j, k))

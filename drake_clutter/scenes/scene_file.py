@@ -35,7 +35,7 @@ from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 VERSION = 2
 """Version of the files that are written."""
 _QUATERNION_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's norm from 1, so that 0.7071 is accepted and normalized."""
+"""Largest deviation of a quaternion's norm from 1; 0.7071 is precise enough."""
 _EDGE_KINDS: dict[str, EdgeKind] = {PRIMITIVE: PRIMITIVE} | {
     orientation.name.lower(): orientation for orientation in Orientation
 }
@@ -79,6 +79,7 @@ class _PoseEntry(StrictModel):
 
     @property
     def pose(self) -> Pose:
+        """The pose."""
         return Pose(self.translation, self.quaternion)
 
 
@@ -168,6 +169,7 @@ class _Document(StrictModel):
 
     @property
     def work_cell(self) -> WorkCell:
+        """The cell of the file, or the default cell with the tray of version 1."""
         if self.cell is not None:
             return self.cell
         cell = default_cell()
@@ -306,11 +308,12 @@ def _build_verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
 
 
 def _pose_to_dict(pose: Pose) -> dict[str, list[float]]:
+    """Return a pose as it stands in a scene file."""
     return {"translation": list(pose.translation), "quaternion": list(pose.quaternion)}
 
 
 def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) -> dict[str, Any]:
-    """Return the document of a scene file as plain lists and mappings; see `save_scene`."""
+    """Return a scene file's document as plain lists and mappings."""
     plain = to_plain(cell.with_support(scene.support))
     document: dict[str, Any] = {
         "version": VERSION,
@@ -350,6 +353,7 @@ def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) 
 
 
 def _verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
+    """Return a verdict as it stands in a scene file."""
     fields: dict[str, Any] = {"stable": verdict.stable}
     if verdict.instability is not None:
         failure = verdict.instability

@@ -1,4 +1,4 @@
-"""A camera in Drake: rendered images of a scene, and the visible fraction of each object."""
+"""Rendering in Drake: images of a scene, and visible fractions of objects."""
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
@@ -144,6 +144,7 @@ class CameraRenderer:
         self._X_T_parked = RigidTransform(render_cameras.X_TC @ [0.0, 0.0, -5.0])
 
     def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
+        """Build the diagram for numbers of objects of each class."""
         builder = DiagramBuilder()
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, support, 0.01, visuals=True)
@@ -181,6 +182,7 @@ class CameraRenderer:
         return labels
 
     def _label_image(self, labels: Mapping[int, int], X_TC: RigidTransform) -> NDArray[np.int64]:
+        """Return the index in the scene of the object in each pixel, given the shown labels."""
         camera = self._label_camera if X_TC is self._X_TC else self._color_camera
         image = self._query().RenderLabelImage(camera, self._world_frame(), X_TC)
         lookup = np.full(2**15, _NO_OBJECT)
@@ -188,12 +190,14 @@ class CameraRenderer:
         return np.asarray(lookup[image.data[..., 0]])
 
     def _query(self) -> QueryObject:
+        """Return the query object of the scene graph."""
         scene_graph = self._scene_plant.scene_graph
         return scene_graph.get_query_output_port().Eval(
             scene_graph.GetMyContextFromRoot(self._context)
         )
 
     def _world_frame(self) -> FrameId:
+        """Return the frame of the world."""
         return self._scene_plant.scene_graph.world_frame_id()
 
     def render(self, scene: Scene, X_TC: Pose | None = None) -> RenderedImages:
@@ -253,7 +257,7 @@ class CameraRenderer:
         }
 
     def hidden_objects(self, fractions: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the names whose visible fraction is below the camera's threshold, in order."""
+        """Return the names of the objects whose visible fraction is below the threshold."""
         return tuple(
             name
             for name, fraction in fractions.items()
@@ -261,7 +265,7 @@ class CameraRenderer:
         )
 
     def _non_overlapping_groups(self, scene: Scene) -> list[list[int]]:
-        """Return the objects in groups whose bounding rectangles in the image do not overlap."""
+        """Return groups of objects that do not overlap in the image."""
         corners = [self.camera.project(o.corners_T) for o in scene.objects]
         lower = [c.min(axis=0) - 2 for c in corners]
         upper = [c.max(axis=0) + 2 for c in corners]

@@ -120,6 +120,7 @@ def validate_models(cell: WorkCell) -> None:
 
 
 def _bodies(plant: MultibodyPlant, *models: ModelInstanceIndex) -> tuple[RigidBody, ...]:
+    """Return the bodies of model instances."""
     return tuple(plant.get_body(i) for model in models for i in plant.GetBodyIndices(model))
 
 
@@ -130,6 +131,7 @@ def _add_solid(
     shape: Box | Sphere,
     color: Sequence[float] | None,
 ) -> None:
+    """Add a shape that is fixed to the world, with visual geometry if it has a color."""
     world = plant.world_body()
     plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
     if color is not None:
@@ -137,7 +139,10 @@ def _add_solid(
 
 
 def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tuple[RigidBody, ...]:
-    """Add a fixture's model, fixed to the world; see `fixture_name` for its model instance."""
+    """Add a fixture's model, fixed to the world, and return its bodies.
+
+    `fixture_name` returns the fixture's name for each of these bodies.
+    """
     field = f"fixtures.{fixture.name}.model"
     instance = parse_model(plant, fixture.model, visuals=visuals, field=field)
     plant.RenameModelInstance(instance, f"{_FIXTURE_PREFIX}{fixture.name}")
@@ -162,7 +167,7 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
 def joint_state_indices(
     plant: MultibodyPlant, arm: Arm
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of the arm's q (n,) and v (n,) in the finalized plant's state."""
+    """Return the indices of the arm's q (n,) and v (n,) in the plant's state."""
     joints = [plant.GetJointByName(name, arm.robot) for name in arm.joints]
     return np.array([j.position_start() for j in joints]), np.array(
         [j.velocity_start() for j in joints]

@@ -16,7 +16,10 @@ from drake_clutter.simulation.settle import SettleResult, settle
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 TOUCHING_MARGIN = 0.003
-"""Objects farther apart than this, random offsets included, settle independently [m]."""
+"""Objects farther apart than this settle independently [m].
+
+The distance includes the random offsets.
+"""
 
 
 class DrakeJudge:

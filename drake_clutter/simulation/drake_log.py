@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def suppress_drake_log(level: int) -> Iterator[None]:
-    """Suppress Drake's log messages below a level of `logging` while the context is active."""
+    """Suppress Drake's log messages below a level of `logging` in this context."""
     logger = logging.getLogger("drake")
     previous_level = logger.level
     logger.setLevel(level)

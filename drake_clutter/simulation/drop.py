@@ -13,7 +13,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.scene_plant import add_scene_plant
 
 _START_RANGE = 0.3
-"""Largest distance of a start position from the center, as a fraction of the support's size.
+"""Largest start distance from the center, as a fraction of the support's size.
 
 The rim alone does not keep dropped objects on the support.
 """
@@ -78,5 +78,6 @@ def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> lis
 
 
 def _on_tray(scene_object: SceneObject, support: Support) -> bool:
+    """Return whether an object's origin is over the support and above its floor."""
     x, y, z = scene_object.X_TO.translation
     return support.contains(x, y) and z > 0

@@ -1,4 +1,4 @@
-"""A judge and an executor that use the static model, and Drake where it does not apply."""
+"""Judge and executor with the static model, and Drake where it does not apply."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
 class HybridJudge:
-    """Judges scenes statically, and in Drake where that is inconclusive (a `SceneJudge`)."""
+    """Judges scenes statically, or in Drake where that is inconclusive."""
 
     def __init__(self, config: ClutterConfig) -> None:
         self._static = StaticStabilityJudge(config)
@@ -33,7 +33,7 @@ class HybridJudge:
 
 
 class HybridExecutor:
-    """Executes moves statically, and in Drake where that is inconclusive (a `MoveExecutor`)."""
+    """Executes moves statically, or in Drake where that is inconclusive."""
 
     def __init__(self, config: ClutterConfig, *, simulate_collapse: bool = True) -> None:
         """Create both executors.

@@ -1,4 +1,4 @@
-"""A scene as a MultibodyPlant: the support is welded to the world, every object is free."""
+"""A scene as a MultibodyPlant: the support is fixed, every object is free."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -167,6 +167,7 @@ def _stayed_close(
 
 
 def _distance(X_TA: Pose, X_TB: Pose) -> float:
+    """Return the distance between the origins of two frames [m]."""
     return float(np.linalg.norm(X_TA.p - X_TB.p))
 
 

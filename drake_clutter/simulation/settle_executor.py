@@ -1,4 +1,4 @@
-"""Pick-and-place moves by teleport, after which Drake settles the affected objects."""
+"""Pick-and-place moves by teleport, settled in Drake."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,11 +13,11 @@ from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import SettleResult, settle
 
 _COLLAPSE_TIME_STEP = 0.005
-"""Time step for the aftermath of a fall, which is only shown and decides nothing [s]."""
+"""Time step for the aftermath of a fall, which is only recorded [s]."""
 
 
 class SettleExecutor:
-    """Executes moves by teleport and settles the affected objects in Drake (a `MoveExecutor`).
+    """Executes moves by teleport and settles affected objects (a `MoveExecutor`).
 
     The picked object appears at its placement, and objects that it carried fall. The scene
     collapses when any other object moves or rotates past the limits of stability, or the picked
@@ -61,26 +61,23 @@ class SettleExecutor:
                 continue
             settled.append(settle(group, scene.support, settle_config, record=True))
             if settled[-1].instability is not None:
-                if not self._simulate_collapse:
-                    after = moved.with_poses(settled[-1].poses)
-                    motion = _merge_motions(moved.poses, settled)
-                    return Outcome(
-                        MoveResult.COLLAPSED,
-                        after,
-                        settled[-1].instability,
-                        motion,
-                        X_TO_released=released.X_TO,
+                if self._simulate_collapse:
+                    coarse_config = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
+                    whole = settle(
+                        moved.objects,
+                        scene.support,
+                        coarse_config,
+                        record=True,
+                        simulate_collapse=True,
                     )
-                coarse_config = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
-                whole = settle(
-                    moved.objects, scene.support, coarse_config, record=True, simulate_collapse=True
-                )
-                fall = settled[-1].instability
+                    poses, motion = whole.poses, whole.motion
+                else:
+                    poses, motion = settled[-1].poses, _merge_motions(moved.poses, settled)
                 return Outcome(
                     MoveResult.COLLAPSED,
-                    moved.with_poses(whole.poses),
-                    fall,
-                    whole.motion,
+                    moved.with_poses(poses),
+                    settled[-1].instability,
+                    motion,
                     X_TO_released=released.X_TO,
                 )
         motion = _merge_motions(moved.poses, settled)
@@ -111,6 +108,7 @@ def _groups_to_settle(scene: Scene, released: SceneObject) -> list[list[SceneObj
 
 
 def _merge_poses(settled: Sequence[SettleResult]) -> dict[str, Pose]:
+    """Return the last poses of separately settled groups, by name."""
     return {name: pose for result in settled for name, pose in result.poses.items()}
 
 

@@ -6,14 +6,17 @@ from numba import njit
 MAX_CONTACT_GAP = 0.002
 """Faces whose heights differ by less than this are in contact [m]."""
 MAX_OVERLAP = 0.0015
-"""Objects that overlap by more than this, in height and seen from above, interpenetrate [m]."""
+"""Objects that overlap by more than this interpenetrate [m].
+
+The overlap counts both in height and seen from above.
+"""
 MAX_MISS_DISTANCE = 0.060
-"""Largest horizontal distance at which an object counts as placed beside its support [m].
+"""Largest distance at which an object counts as placed beside its support [m].
 
 Such an object begins at the height at which another one ends and misses it. The distance exceeds
 the gap of a standing pair (50 mm).
 """
-# Faults that `find_contacts` returns.
+# Faults that `find_contacts` returns; `InconclusiveReason` explains them.
 NO_FAULT, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
 GROUND = -1
 """Index of the support's floor in pairs of objects."""
@@ -147,7 +150,7 @@ def _overlap(records, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
-    """Return the corners of those parts of an object's top that another object does not cover.
+    """Return the parts of an object's top that another object does not cover.
 
     Args:
         records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
@@ -158,7 +161,7 @@ def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[
         margin: Distance to keep from the upper object [m].
 
     Returns:
-        Corners in T [m]. Shape (V, 2).
+        Corners of all parts in T [m]. Shape (V, 2).
     """
     top, count = records[shape].top, records[shape].top_count
     outline, outline_count = records[above].footprint, records[above].footprint_count

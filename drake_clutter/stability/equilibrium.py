@@ -1,10 +1,10 @@
-"""Quasi-static equilibrium of stacked objects: do contact forces exist that hold them?
+"""Quasi-static equilibrium of stacked objects.
 
-All contacts are level. A force may act anywhere in a contact polygon, that is, at its corners.
-Equilibrium under vertical forces is a non-negative least-squares problem with three rows for each
-object (force, two moments about its center of mass) and one column for each corner. With friction
-there are six rows for each object and four columns for each corner, the edges of a friction
-pyramid.
+Objects are in equilibrium if contact forces exist that balance their weights. All contacts are
+level. A force may act anywhere in a contact polygon, that is, at its corners. Equilibrium under
+vertical forces is a non-negative least-squares problem with three rows for each object (force, two
+moments about its center of mass) and one column for each corner. With friction there are six rows
+for each object and four columns for each corner, the edges of a friction pyramid.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from drake_clutter.stability.contacts import GROUND, contact_polygon
 from drake_clutter.stability.nnls import nnls
 
 _MOMENT_ARM = 0.05
-"""Length by which moments are divided, so that they weigh about as much as forces [m]."""
+"""Length by which moments are divided, to weigh as much as forces [m]."""
 _RESIDUAL_TOLERANCE = 1e-6
 """Residual that counts as zero, as a fraction of the total weight."""
 NO_LOADS = np.empty((0, 4))
@@ -23,7 +23,7 @@ NO_LOADS = np.empty((0, 4))
 
 @njit(cache=True)
 def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, friction, loads):  # type: ignore[no-untyped-def]
-    """Return how much of each object's weight and moment no contact forces can balance.
+    """Return the weight and moment of each object that contacts cannot balance.
 
     Args:
         records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
@@ -199,7 +199,7 @@ def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type:
 
 @njit(cache=True)
 def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
-    """Return a description of stacks that does not depend on their position on the support.
+    """Return a description of stacks that is independent of their positions.
 
     Args:
         shapes: Row of each object's shape in the table. Shape (n,).

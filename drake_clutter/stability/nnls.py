@@ -10,6 +10,7 @@ from numba import njit
 
 @njit(cache=True, fastmath={"reassoc"})
 def _dot(a, b, count):  # type: ignore[no-untyped-def]
+    """Return the dot product of the first elements of two vectors."""
     total = 0.0
     for k in range(count):
         total += a[k] * b[k]
@@ -33,7 +34,9 @@ def _factor_row(A, members, m, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def nnls(A, b, tolerance):  # type: ignore[no-untyped-def]
-    """Return the x >= 0 that minimizes |A^T x - b|, by active sets on the normal equations.
+    """Return the x >= 0 that minimizes |A^T x - b|, by an active-set method.
+
+    The unconstrained problems of the active set are solved by the normal equations.
 
     Args:
         A: The transposed matrix, so that a column is contiguous. Shape (columns, rows).

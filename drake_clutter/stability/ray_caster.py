@@ -1,4 +1,4 @@
-"""Casting a camera's rays at convex objects: depth images, masks and visible fractions.
+"""Ray casting at convex objects: depth images, masks and visible fractions.
 
 The rays go through the centers of the pixels. The rays that meet a face fill a convex polygon of
 the image, row by row, and on a face the inverse depth is linear in the pixel, so a ray costs one
@@ -25,7 +25,7 @@ _MAX_OCCLUDERS = 64
 
 @njit(cache=True, inline="always")
 def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
-    """Return the coefficients of a plane's inverse depth as a linear function of the pixel.
+    """Return a plane's inverse depth as a linear function of the pixel.
 
     Args:
         camera: `Pinhole` of the camera.
@@ -216,15 +216,17 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
 
 @njit(cache=True)
 def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
-    """Return the objects in front of a target as bits, for every ray that would meet it."""
+    """Return the objects in front of a target as bits, for each ray of the target."""
     window = _window(table.records[shapes[target]], p_T[target], camera, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
     if window[1] > 0:
         _cast_object(table, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
     rows, columns = np.nonzero(hit[window[0] : window[1], window[2] : window[3]] == 0)
-    rows, columns = rows + window[0], columns + window[2]
-    own, occluders = np.empty(len(rows), np.float32), np.zeros(len(rows), np.uint64)
+    rows = rows + window[0]
+    columns = columns + window[2]
+    own = np.empty(len(rows), np.float32)
+    occluders = np.zeros(len(rows), np.uint64)
     for k in range(len(rows)):
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
@@ -273,13 +275,14 @@ class RayCaster:
         """
         if not len(shapes):
             return [], (slice(0, 0), slice(0, 0))
-        unoccluded, visible = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int64)
+        unoccluded = np.zeros(len(shapes), np.int64)
+        visible = np.zeros(len(shapes), np.int64)
         arguments = (self._shapes.arrays, shapes, p_T, self._pinhole)
         row, row_end, column, column_end = _cast_scene(
             *arguments, self._nearest, self._hit, unoccluded, visible
         )
         fractions = [
-            s / a if a else 1.0 for s, a in zip(visible.tolist(), unoccluded.tolist(), strict=True)
+            v / u if u else 1.0 for v, u in zip(visible.tolist(), unoccluded.tolist(), strict=True)
         ]
         return fractions, (slice(row, row_end), slice(column, column_end))
 
@@ -311,15 +314,14 @@ class RayCaster:
         return {o.name: fraction for o, fraction in zip(objects, fractions, strict=True)}
 
     def occluder_sets(self, scene: Scene, name: str) -> dict[frozenset[str], int]:
-        """Return by which sets of objects an object is occluded, with numbers of rays.
+        """Return which sets of objects occlude an object, with their numbers of rays.
 
         Args:
             scene: A scene of at most 64 objects.
             name: Name of the occluded object.
 
         Returns:
-            For each set of names, the number of the object's rays that meet exactly these before
-                it.
+            Number of the object's rays that meet exactly these objects first, by set of names.
 
         Raises:
             KeyError: No object has this name.

@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 MAX_LEVEL_ANGLE = np.radians(1.5)
 """A face or axis farther from level than this leans [rad]."""
 RIM_CORNERS = 16
-"""Corners of a can's rim, as in its contact mesh in Drake, and the most that a face can have."""
+"""Corners of a can's rim, as in Drake's contact mesh; the most of any face."""
 STRIP_HALF_WIDTH = 0.006
 """Half the width of the strip on which a lying cylinder rests [m].
 
@@ -72,7 +72,10 @@ class _Surface(NamedTuple):
 
 
 def _hull_surface(corners: Floats) -> _Surface:
-    """Return the surface of a convex hull of uniform density; coplanar triangles form one face."""
+    """Return the surface of a convex hull of uniform density.
+
+    Coplanar triangles form one face.
+    """
     hull = ConvexHull(corners)
     planes = hull.equations * [1.0, 1.0, 1.0, 1.0 / np.ptp(corners, axis=0).max()]
     member = np.full(len(planes), -1)
@@ -102,12 +105,14 @@ def _hull_surface(corners: Floats) -> _Surface:
 
 
 def _ring(radius: float, z: float, sides: int) -> Floats:
+    """Return points on a horizontal circle [m]. Shape (sides, 3)."""
     angle = np.arange(sides) * (2 * np.pi / sides)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides, z)])
 
 
 @cache
 def _surface(object_class: ObjectClass) -> _Surface:
+    """Return the surface of a class in O."""
     if object_class.shape is not Shape.CYLINDER:
         return _hull_surface(object_class.corners)
     radius, half = object_class.size[0] / 2, object_class.size[2] / 2
@@ -116,9 +121,10 @@ def _surface(object_class: ObjectClass) -> _Surface:
 
 
 def _convex_outline(points: Floats, max_corners: int) -> Floats:
-    """Return the corners of the convex hull of points seen from above, counter-clockwise [m].
+    """Return the corners of the hull of points seen from above [m].
 
-    If there are more than `max_corners`, evenly spaced ones are chosen. Shape (C, 2).
+    They are counter-clockwise. If there are more than `max_corners`, evenly spaced ones are chosen.
+    Shape (C, 2).
     """
     corners = points[ConvexHull(points[:, :2]).vertices, :2]
     return (
@@ -202,6 +208,7 @@ def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> Orie
 
 
 def _area(face: Floats) -> float:
+    """Return the area of a planar polygon (C, 3) [m^2]."""
     return float(np.linalg.norm(np.cross(face[1:-1] - face[0], face[2:] - face[0]).sum(axis=0)) / 2)
 
 
@@ -281,6 +288,7 @@ class ShapeTable:
         self._start()
 
     def _start(self) -> None:
+        """Empty the table."""
         self._row_by_shape: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
         self.arrays = _allocate(64, 512, 4096)
 
@@ -309,6 +317,7 @@ class ShapeTable:
         )
 
     def _add(self, scene_object: SceneObject) -> None:
+        """Add the shape of an object as a new row."""
         shape = orient_shape(scene_object.object_class, scene_object.X_TO.quaternion)
         row = len(self._row_by_shape)
         face = int(self.arrays.records["last_face"].max())

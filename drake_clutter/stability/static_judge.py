@@ -1,4 +1,4 @@
-"""A judge of scenes that solves static equilibrium and casts rays instead of simulating."""
+"""A judge that solves static equilibrium and casts rays instead of simulating."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -34,7 +34,7 @@ Sizes are round numbers, so stacks whose balance equals the reach of the random 
 _TOUCHING_MARGIN = 0.003
 """Objects farther apart than this do not touch [m]."""
 _CACHE_RESOLUTION = 1e-6
-"""Stacks whose objects have equal relative positions to within this share a result [m]."""
+"""Stacks with relative positions equal to within this share a result [m]."""
 _MARGIN_RANGE = (-0.030, 0.150)
 """Range of the margins that `stability_margins` can return [m]."""
 _MARGIN_RESOLUTION = 1e-4
@@ -135,6 +135,7 @@ class StaticStabilityJudge:
     def _find_instability(
         self, scene: Scene, shapes: Ints, p_T: Floats
     ) -> Instability | InconclusiveVerdict | None:
+        """Return the first object that does not stand, see `find_instability`."""
         graph = self._contact_graph(scene, shapes, p_T)
         if isinstance(graph, InconclusiveVerdict):
             if graph.reason is InconclusiveReason.UNSUPPORTED:
@@ -157,7 +158,7 @@ class StaticStabilityJudge:
         return {name: frozenset(below) for name, below in supports.items()}
 
     def contact_group(self, scene: Scene, name: str) -> Scene:
-        """Return the scene of an object and all that it may touch, directly or through others.
+        """Return the part of a scene that an object may touch, directly or indirectly.
 
         Raises:
             KeyError: No object has this name.
@@ -172,10 +173,11 @@ class StaticStabilityJudge:
     def objects_losing_support(
         self, scene: Scene, name: str
     ) -> tuple[str, ...] | InconclusiveVerdict:
-        """Return the objects that would fall if an object were removed, in the scene's order.
+        """Return the objects that would fall if an object were removed.
 
-        Of an unbalanced stack, the object farthest from equilibrium falls, then the next one
-        without it, until the rest stands. Only the object's contact group is examined.
+        They are in the scene's order. Of an unbalanced stack, the object farthest from equilibrium
+        falls, then the next one without it, until the rest stands. Only the object's contact group
+        is examined.
 
         Raises:
             KeyError: No object has this name.
@@ -209,10 +211,11 @@ class StaticStabilityJudge:
         return tuple(scene.objects[row].name for row in sorted(falling))
 
     def stability_margins(self, scene: Scene) -> dict[str, float] | InconclusiveVerdict:
-        """Return by how much the contacts below each object may shrink before its stack tips [m].
+        """Return by how much the contacts below each object may shrink [m].
 
-        Only vertical forces count. A negative margin is the missing width. Margins are exact to 0.1
-        mm within -30 to 150 mm. An object that can roll has margin 0.
+        At the margin, the object's stack loses its balance. Only vertical forces count. A negative
+        margin is the missing width. Margins are exact to 0.1 mm within -30 to 150 mm. An object
+        that can roll has margin 0.
         """
         graph = self._contact_graph(scene, *self._arrays(scene.objects))
         if isinstance(graph, InconclusiveVerdict):
@@ -250,7 +253,7 @@ class StaticStabilityJudge:
         return margins
 
     def is_disassemblable(self, scene: Scene) -> bool | InconclusiveVerdict:
-        """Return whether all objects can be removed one by one while the rest always stands.
+        """Return whether all objects can be removed one by one without a collapse.
 
         Only objects that carry nothing are removed.
         """
@@ -354,7 +357,7 @@ class StaticStabilityJudge:
     def _contact_graph(
         self, scene: Scene, shapes: Ints, p_T: Floats
     ) -> _ContactGraph | InconclusiveVerdict:
-        """Return the objects and their contacts, or why the model does not cover the scene."""
+        """Return the contacts of a scene, or why the model does not cover it."""
         fault, faulty, pairs, stack = contacts.find_contacts(
             self._shapes.arrays.records, shapes, p_T, scene.support.half_size
         )
@@ -363,6 +366,7 @@ class StaticStabilityJudge:
         return _ContactGraph(shapes, p_T, pairs, stack)
 
     def _arrays(self, objects: Sequence[SceneObject]) -> tuple[Ints, Floats]:
+        """Return rows and positions of objects; empty the cache if it is invalid or full."""
         arrays = self._shapes.rows_and_positions(objects)
         if self._generation != self._shapes.generation or len(self._cache) > _MAX_CACHED_STACKS:
             self._cache.clear()
@@ -407,14 +411,14 @@ class StaticStabilityJudge:
 
 
 def _single_stack(rows: Iterable[int], count: int) -> Ints:
-    """Return stack numbers (count,) in which the given objects form stack 0, the others none."""
+    """Return stack numbers with the given objects in stack 0, the others in none."""
     stack = np.full(count, -1)
     stack[list(rows)] = 0
     return stack
 
 
 def _contacts_among(pairs: Ints, rows: list[int]) -> Ints:
-    """Return the contacts among objects and with the ground, renumbered by their position."""
+    """Return the contacts among objects and with the ground, renumbered."""
     number = {row: k for k, row in enumerate(rows)} | {contacts.GROUND: contacts.GROUND}
     renumbered = [
         (number[a], number[b]) for a, b in pairs.tolist() if a in number and b in number and b >= 0
