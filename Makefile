@@ -1,5 +1,5 @@
 # make demo   SG* makes a scene, the arm searches it; the results are in out/demo
-# make test   every check: lint, format, types, tests
+# make test   every check: lint, format, spelling, types, tests
 # make test-any PYTHON=...   the tests with an interpreter and its packages as they are, without what is not installed
 # make docs   the documentation site: out/site/index.html
 # Each makes its own environment in .venv first; the demo's has only what the demo needs.
@@ -16,6 +16,7 @@ demo: .venv/demo
 test: .venv/all
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/codespell
 	.venv/bin/mypy
 	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 --dist loadfile
 

@@ -26,9 +26,8 @@ def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
 
     print(f"{len(scene.objects)} objects, hidden at the start: {list(task.initially_hidden)}")
     for transition in task.transitions:
-        print(
-            f"{transition.move}: {transition.outcome.result.value}, found {list(transition.newly_found)}"
-        )
+        result = transition.outcome.result.value
+        print(f"{transition.move}: {result}, found {list(transition.newly_found)}")
     print(f"ended: {task.termination.value if task.termination else 'no move left'}")
 
 

@@ -31,7 +31,7 @@ MODULES = sorted(
 
 
 def room_of(module: Path) -> str:
-    """The first name below the package, e.g. "grammar" for grammar/rules.py; the package's own file is ""."""
+    """Return a module's first name below the package, such as "grammar"; "" for the package."""
     return "" if module == Path("__init__.py") else module.with_suffix("").parts[0]
 
 

@@ -1,4 +1,4 @@
-"""What is shipped can be installed: source archive, then wheel, then an empty environment, used from another directory."""
+"""The source archive, the wheel built from it, and its installation in an empty environment."""
 
 import json
 import os
@@ -15,11 +15,15 @@ import drake_clutter
 
 ROOT = Path(__file__).resolve().parent.parent
 VERSIONED = f"drake_clutter-{drake_clutter.__version__}"
-WHERE = "from drake_clutter.resources import resource_path as s; print(s('sdf_assets/catalog.yaml')); print(s('models'))"
+PRINT_PATHS = """
+from drake_clutter.resources import resource_path
+print(resource_path("sdf_assets/catalog.yaml"))
+print(resource_path("models"))
+"""
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    """Runs a command as a user would, with nothing of this test's environment on Python's path; returns what it prints."""
+    """Run a command outside of this test's Python environment; return its output."""
     environment = {
         name: value
         for name, value in os.environ.items()
@@ -34,7 +38,7 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from the source archive and not from the checkout: so the archive is complete, too."""
+    """Build the source archive and, from it, the wheel; return the wheel's path."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
     (path,) = folder.glob("*.whl")
@@ -43,7 +47,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty environment into which pip installed the wheel with its base dependencies, in the locked versions."""
+    """Install the wheel and its locked dependencies; return the environment's folder."""
     folder = tmp_path_factory.mktemp("installed")
     python = folder / "bin" / "python"
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder)
@@ -93,7 +97,7 @@ def test_the_lock_satisfies_the_wheel(wheel: Path) -> None:
 
 def test_the_installed_package_works_from_anywhere(installed: Path, tmp_path: Path) -> None:
     python = installed / "bin" / "python"
-    for line in run(python, "-c", WHERE, cwd=tmp_path).splitlines():
+    for line in run(python, "-c", PRINT_PATHS, cwd=tmp_path).splitlines():
         assert Path(line).is_relative_to(installed)
     assert "doctor" in run(installed / "bin" / "drake-clutter", "--help", cwd=tmp_path)
 
@@ -118,5 +122,5 @@ def test_the_installed_package_renders_and_finds_its_assets(
 
 def test_the_editable_package_works_from_anywhere(tmp_path: Path) -> None:
     """The environment that `make test` makes."""
-    for line in run(sys.executable, "-c", WHERE, cwd=tmp_path).splitlines():
+    for line in run(sys.executable, "-c", PRINT_PATHS, cwd=tmp_path).splitlines():
         assert Path(line).is_relative_to(ROOT)
