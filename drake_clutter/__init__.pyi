@@ -88,4 +88,5 @@ from .tasks.feasibility_study import FeasibilityStudy as FeasibilityStudy
 from .systems.closed_loop import ClosedLoop as ClosedLoop
 from .systems.scenario import Scenario as Scenario
 
+__all__: list[str]
 __version__: str

@@ -259,7 +259,8 @@ def run_command(
             try:
                 runpy.run_path(script, run_name="__main__")
             except SystemExit as ended:
-                assert not ended.code, line
+                if ended.code:
+                    pytest.fail(f"{line}: exit code {ended.code}")
         case ["make", target]:
             assert f"\n{target}:" in Path("Makefile").read_text(encoding="utf-8")
         case ["pip", "install", requirement]:
@@ -345,7 +346,7 @@ def module_names() -> frozenset[str]:
 
 @each_page
 def test_named_files_exist(page: Path) -> None:
-    """Paths from the root of the repository or of the package; modules without a folder anywhere."""
+    """Paths from the root of the repository or the package exist; so do modules anywhere."""
     missing = []
     for name in FILE.findall(prose(page)):
         if "/" not in name:

@@ -20,8 +20,8 @@ def test_every_export_is_there_and_documented(name: str) -> None:
     exported = getattr(drake_clutter, name)
     assert exported.__name__ == name
     assert exported.__module__.startswith("drake_clutter.")
-    first = (inspect.getdoc(exported) or "").split("\n")[0]
-    assert first
+    first_line = (inspect.getdoc(exported) or "").split("\n")[0]
+    assert re.fullmatch(r"[A-Z].{5,90}[.]", first_line), first_line
 
 
 def test_importing_the_package_imports_nothing_heavy() -> None:

@@ -4,8 +4,9 @@ An explorer is an agent with an exploration policy. K_t is the set of the object
 view up to time t.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -123,30 +124,44 @@ class Belief:
         return replace(self, objects=objects, invalid_moves=invalid_moves)
 
 
-Policy = Callable[[Belief, Observation, np.random.Generator], Decision]
-"""Exploration policy.
+class Policy(Protocol):
+    """Exploration policy: chooses the next move from what has been seen."""
 
-Args:
-    belief: State of the knowledge; its invalid moves must not be chosen.
-    observation: Latest observation, with the names of the belief.
-    rng: Random generator.
+    def __call__(
+        self, belief: Belief, observation: Observation, rng: np.random.Generator, /
+    ) -> Decision:
+        """Return the next move.
 
-Returns:
-    The next move.
-"""
-Tracker = Callable[[Sequence[SceneObject], Observation], tuple[Observation, tuple[str, ...]]]
-"""Data association of detections with known objects.
+        Args:
+            belief: State of the knowledge; its invalid moves must not be chosen.
+            observation: Latest observation, with the names of the belief.
+            rng: Random generator.
+        """
 
-Args:
-    objects: K_t.
-    observation: Observation with arbitrary names of the detections.
 
-Returns:
-    The observation with the names of K_t, and the names of known objects that are neither at their
-    pose nor in view elsewhere.
-"""
-ActionFilter = Callable[[Belief, Observation], Sequence[Move]]
-"""Returns the infeasible ones among the legal moves."""
+class Tracker(Protocol):
+    """Data association of detections with known objects."""
+
+    def __call__(
+        self, objects: Sequence[SceneObject], observation: Observation, /
+    ) -> tuple[Observation, tuple[str, ...]]:
+        """Return an observation with the names of the known objects.
+
+        Args:
+            objects: K_t.
+            observation: Observation with arbitrary names of the detections.
+
+        Returns:
+            The observation with the names of K_t, and the names of known objects that are neither
+            at their pose nor in view elsewhere.
+        """
+
+
+class ActionFilter(Protocol):
+    """Finds moves that the backend cannot execute."""
+
+    def __call__(self, belief: Belief, observation: Observation, /) -> Sequence[Move]:
+        """Return the infeasible ones among the legal moves."""
 
 
 def update_belief(
