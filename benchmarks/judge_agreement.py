@@ -167,26 +167,27 @@ class BatchComparison:
     ) -> None:
         part = replace(scene, objects=tuple(scene[name] for name in group["objects"]))
         fall = group["fall"]
-        found: Instability | InconclusiveVerdict | None = judge.find_instability(part)
+        verdict: Instability | InconclusiveVerdict | None = judge.find_instability(part)
         is_floating = (
-            isinstance(found, InconclusiveVerdict) and found.reason is InconclusiveReason.FLOATING
+            isinstance(verdict, InconclusiveVerdict)
+            and verdict.reason is InconclusiveReason.FLOATING
         )
         if is_floating:  # The support is in another group: judge again with all stable groups.
             stable_names = [
                 n for other in all_groups if not other["fall"] for n in other["objects"]
             ]
             stable_objects = tuple(scene[name] for name in stable_names)
-            found = judge.find_instability(replace(scene, objects=part.objects + stable_objects))
-        pair = verdict_name(found), "stable" if fall is None else "falls"
+            verdict = judge.find_instability(replace(scene, objects=part.objects + stable_objects))
+        pair = verdict_name(verdict), "stable" if fall is None else "falls"
         self.stacks.pairs[pair] += 1
         if fall is not None:
             reason, name, *_ = fall
             self.by_drake_reason[reason].pairs[pair] += 1
             self.by_class[scene[name].object_class.name].pairs[pair] += 1
-        if found is not None:
-            self.by_static_reason[found.reason.value].pairs[pair] += 1
+        if verdict is not None:
+            self.by_static_reason[verdict.reason.value].pairs[pair] += 1
         if pair[0] not in ("cannot judge", pair[1]):
-            static = "stable" if found is None else str(found.reason.value)
+            static = "stable" if verdict is None else str(verdict.reason.value)
             drake = f"falls: {fall[0]}" if fall else "stable"
             self.disagreements.append(Disagreement(part, static, drake))
 

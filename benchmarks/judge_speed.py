@@ -348,24 +348,24 @@ def measure_scenes(
         num_slow: Number of scenes, the first, for Drake's and PyBullet's judges.
         judges: The judges by name.
     """
-    found: dict[str, tuple[list[float], list[Verdict]]] = {}
+    measured: dict[str, tuple[list[float], list[Verdict]]] = {}
     for name, judge in judges.items():
         if isinstance(judge, StaticStabilityJudge):
             clear = judge._cache.clear if name == STATIC_COLD else lambda: None
             seconds, answers = time_cases(
                 f"{label}: {name}", judge.judge, cases, repeats=REPEATS, before=clear
             )
-            found[name] = seconds, [to_verdict(answer) for answer in answers]
+            measured[name] = seconds, [to_verdict(answer) for answer in answers]
         else:
             slow_seconds, slow_answers = time_cases(
                 f"{label}: {name}", judge.judge, cases[:num_slow], SLOW_SCENES
             )
-            found[name] = slow_seconds, [to_verdict(answer) for answer in slow_answers]
+            measured[name] = slow_seconds, [to_verdict(answer) for answer in slow_answers]
     progress_bar = track(cases[:num_slow], f"{label}: {BULLET}", console=Console(stderr=True))
     runs = [run_in_bullet(case) for case in progress_bar]
-    found[BULLET] = [r.step_seconds for r in runs], [(r.is_stable, None) for r in runs]
-    reference = found[DRAKE_ACCURATE][1] if DRAKE_ACCURATE in found else None
-    judge_rows = {name: judge_metrics(*pair, reference) for name, pair in found.items()}
+    measured[BULLET] = [r.step_seconds for r in runs], [(r.is_stable, None) for r in runs]
+    reference = measured[DRAKE_ACCURATE][1] if DRAKE_ACCURATE in measured else None
+    judge_rows = {name: judge_metrics(*pair, reference) for name, pair in measured.items()}
     judge_rows[BULLET]["load_mean_ms"] = 1000 * float(np.mean([r.load_seconds for r in runs]))
 
     rays = RayCaster(CONFIG.cell.camera)

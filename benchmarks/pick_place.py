@@ -269,8 +269,8 @@ class MoveTester:
 
 def quantiles(values: Sequence[float]) -> dict[str, float]:
     """Return the median, 95th and 99th percentile."""
-    found = np.quantile(values, [0.5, 0.95, 0.99]) if len(values) else [math.nan] * 3
-    return dict(zip(("p50", "p95", "p99"), map(float, found), strict=True))
+    percentiles = np.quantile(values, [0.5, 0.95, 0.99]) if len(values) else [math.nan] * 3
+    return dict(zip(("p50", "p95", "p99"), map(float, percentiles), strict=True))
 
 
 def fraction(successes: int, count: int) -> dict[str, Any]:
