@@ -1,9 +1,9 @@
 """Rollouts of exploration policies in several environments at a time, and their metrics."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +14,25 @@ from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import ExplorationObservation
 from drake_clutter.tasks.exploration_task import TerminationReason
 
-PolicyFn = Callable[
-    [Sequence[ClutterExploration], Sequence[ExplorationObservation]],
-    tuple[NDArray[np.int64], list[Any]],
-]
-"""A policy for a batch of environments.
 
-Args:
-    environments: B environments.
-    observations: Their current observations.
+class PolicyFn(Protocol):
+    """A policy for a batch of environments."""
 
-Returns:
-    Actions (B, 2), and for each action an object that is stored with it in the rollout.
-"""
+    def __call__(
+        self,
+        environments: Sequence[ClutterExploration],
+        observations: Sequence[ExplorationObservation],
+        /,
+    ) -> tuple[NDArray[np.int64], list[Any]]:
+        """Return the next actions.
+
+        Args:
+            environments: B environments.
+            observations: Their current observations.
+
+        Returns:
+            Actions (B, 2), and for each action an object that is stored with it in the rollout.
+        """
 
 
 @dataclass

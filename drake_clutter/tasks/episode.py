@@ -223,15 +223,17 @@ class SteppedBackend:
             yield MoveAttempt(true_decision, outcome, self.perception)
 
 
-BackendFactory = Callable[[Scene, np.random.Generator], SteppedBackend]
-"""Creates the backend of an episode.
+class BackendFactory(Protocol):
+    """Creates the backends of episodes, which share an executor and a detector."""
 
-The executor and the detector are shared by all its backends.
+    def __call__(self, scene: Scene, rng: np.random.Generator, /) -> SteppedBackend:
+        """Return the backend of an episode.
 
-Args:
-    scene: The scene, at rest.
-    rng: Random generator of the episode.
-"""
+        Args:
+            scene: The scene, at rest.
+            rng: Random generator of the episode.
+        """
+
 
 TELEPORT_FIDELITIES = ("static", "static_or_drake", "settle")
 """Models of the outcome of a move in which objects are teleported.
