@@ -51,7 +51,7 @@ def main(steps: int, scenes: int, out: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--steps", type=int, default=40_000)
     parser.add_argument("--scenes", type=int, default=64, help="scenes per evaluation")
     parser.add_argument("--out", type=Path, default=Path("out/tutorial/generator.safetensors"))
     arguments = parser.parse_args()
