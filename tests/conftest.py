@@ -76,22 +76,22 @@ def resting(
 
 
 def tray(side: float) -> Support:
-    """The default tray with another inner side, m."""
+    """Return the default tray with another inner side [m]."""
     return DEFAULT_CELL.support.model_copy(update={"size": (side, side)})
 
 
 def cell_with(*settings: str) -> WorkCell:
-    """The default cell with some fields changed, such as "robot.base.x=-0.8"."""
+    """Return the default cell with changed fields, such as "robot.base.x=-0.8"."""
     return load_config_as(DEFAULT_CELL, settings=settings)
 
 
 def world_with(*settings: str) -> ClutterConfig:
-    """The default config with some fields changed, such as "settle.jitter=0.003"."""
+    """Return the default config with changed fields, such as "settle.jitter=0.003"."""
     return load_config(settings=settings)
 
 
 def scene_of(*objects: SceneObject, side: float = 0.70) -> Scene:
-    """A scene without a graph, on a tray of an inner side, m."""
+    """Return a scene without a graph, on a tray of an inner side [m]."""
     return Scene(objects, tray(side))
 
 
@@ -110,7 +110,7 @@ def random_scene(seed: int, fewest: int = 16, most: int = 16, objects: str = "yc
 
 
 def training_script(name: str) -> ModuleType:
-    """A script of `training/`, as a module."""
+    """Return a script of `training/` as a module."""
     return importlib.import_module(f"training.{name}")
 
 
@@ -121,7 +121,7 @@ def executed(
     move: Move,
     generator: np.random.Generator,
 ) -> Outcome:
-    """What an executor makes of a move, put where the observation shows a free place."""
+    """Return the outcome of a move to a placement that the observation shows to be free."""
     command = resolve_placement(move, observation, WORLD.exploration, generator)
     if command is None:
         return Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
@@ -129,17 +129,17 @@ def executed(
 
 
 def rng(seed: int = 0) -> np.random.Generator:
-    """A generator for what a test leaves to chance."""
+    """Return a random generator."""
     return np.random.default_rng(seed)
 
 
 OPTIONAL = ("torch", "safetensors", "tensorboard", "threadpoolctl", "ray", "pybullet")
-"""Packages that a test may take and that need not be installed: then it is skipped."""
+"""Optional packages; tests that need a missing one are skipped."""
 _MISSING = "|".join(name for name in OPTIONAL if importlib.util.find_spec(name) is None)
 
 
 def _skipped_if_missing(report: AnyReport, path: Path) -> AnyReport:
-    """Return a report, as one of a skipped test if it failed for want of an optional package."""
+    """Return a report; a test that failed for lack of an optional package is skipped."""
     words = rf"No module named '({_MISSING})[.\w]*'|install drake_clutter with \[\w+\]"
     if _MISSING and report.failed and (found := re.search(words, report.longreprtext)):
         report.outcome = "skipped"
@@ -151,7 +151,7 @@ def _skipped_if_missing(report: AnyReport, path: Path) -> AnyReport:
 def pytest_make_collect_report(
     collector: pytest.Collector,
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Skip modules that take what is not installed."""
+    """Skip modules that need a package that is not installed."""
     return _skipped_if_missing((yield), collector.path)
 
 
@@ -159,7 +159,7 @@ def pytest_make_collect_report(
 def pytest_runtest_makereport(
     item: pytest.Item,
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Skip tests that take what is not installed."""
+    """Skip tests that need a package that is not installed."""
     return _skipped_if_missing((yield), item.path)
 
 
@@ -181,7 +181,7 @@ def config() -> ClutterConfig:
 
 @pytest.fixture(scope="session")
 def judge(config: ClutterConfig) -> DrakeJudge:
-    """One judge for all tests: none of its verdicts may depend on the earlier ones."""
+    """One judge for all tests; its verdicts must not depend on earlier ones."""
     return DrakeJudge(config)
 
 
@@ -193,7 +193,7 @@ def static_judge(config: ClutterConfig) -> StaticStabilityJudge:
 
 @pytest.fixture(scope="session")
 def detector(config: ClutterConfig) -> LabelDetector:
-    """One detector for all tests, for the same reason."""
+    """One detector for all tests, to share its engine."""
     return LabelDetector(config.cell.camera)
 
 

@@ -47,7 +47,7 @@ def plant_of(model: str, package: Path) -> tuple[MultibodyPlant, list[ProximityP
 
 
 def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
-    """Drake's stubs hide the compliance type's value; only a compliant geometry has a modulus."""
+    """Assert the contact properties; only a compliant geometry has a modulus."""
     assert properties.HasProperty("hydroelastic", "compliance_type")
     assert properties.HasProperty("hydroelastic", "hydroelastic_modulus") is not rigid
     if not rigid:
@@ -59,13 +59,13 @@ def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
 
 
 def document(folder: Path) -> dict[str, Any]:
-    """The visual's glTF."""
+    """Return the glTF document of a visual."""
     read: dict[str, Any] = json.loads((folder / "visual.gltf").read_text())
     return read
 
 
 def example(folder: Path) -> Path:
-    """A copy of the example's sources."""
+    """Return a copy of the example's sources."""
     folder.mkdir()
     for name in ("catalog.yaml", "mug.stl"):
         shutil.copy(EXAMPLE / name, folder)
@@ -149,7 +149,7 @@ def test_the_committed_assets_are_what_the_code_builds(tmp_path: Path) -> None:
 
 
 def test_labels_differ() -> None:
-    """By the mean color of what lies uppermost when a package lies down; sRGB, 0 to 255."""
+    """The expected faces are on top of a lying package, by their mean colors (sRGB)."""
     means = {}
     for name, entry in CLASSES.items():
         texture = draw_texture(entry)
@@ -284,7 +284,7 @@ def test_the_tray(tmp_path: Path) -> None:
 
 
 def test_the_builder_leaves_drake_s_reader_alone() -> None:
-    """CoACD, loaded before Drake, makes Drake's SDF reader throw."""
+    """The builder loads CoACD after Drake; otherwise Drake's SDF reader would throw."""
     code = (
         "import drake_clutter.assets, drake_clutter.simulation.scene_plant as p; "
         "from pydrake.systems.framework import DiagramBuilder;"

@@ -82,7 +82,7 @@ def test_half_covered(camera: CameraRenderer) -> None:
 def test_a_smaller_box_in_the_center_hides_what_its_top_covers(
     name: str, length: float, width: float, height: float, camera: CameraRenderer
 ) -> None:
-    """Both rectangles as the pinhole sees them: scaled by 1 / distance."""
+    """Areas of both rectangles scale with the inverse squared distance."""
     covered = length * width / (1.60 - 0.060 - height) ** 2 / (0.230 * 0.160 / (1.60 - 0.060) ** 2)
     shares = camera.visible_fractions(scene_of(BELOW, resting(name, floor=0.060, name="above")))
     assert shares == {"below": pytest.approx(1 - covered, abs=0.02), "above": 1.0}
@@ -93,7 +93,7 @@ def test_unoccluded_objects_are_fully_visible(camera: CameraRenderer) -> None:
 
 
 def test_fractions_refer_to_each_object_rendered_alone(camera: CameraRenderer) -> None:
-    """Objects that are far apart in the image share a rendering: it must not show."""
+    """Objects that are far apart in the image share a rendering, without effect."""
     label = camera.render_label(CROWDED)
     expected = {}
     for index, o in enumerate(CROWDED.objects):
@@ -124,8 +124,8 @@ def test_depth_in_the_center_is_the_distance_to_the_top(
 ) -> None:
     corner = resting("large_marker", xy=(0.3, 0.3), name="marker")
     images = camera.render(scene_of(*objects, corner))
-    middle = images.depth[239:241, 319:321]
-    assert middle == pytest.approx(np.full((2, 2), 1.60 - top), abs=0.001)
+    center = images.depth[239:241, 319:321]
+    assert center == pytest.approx(np.full((2, 2), 1.60 - top), abs=0.001)
     assert (images.label[239:241, 319:321] == (0 if objects else -1)).all()
 
 
@@ -143,7 +143,7 @@ def test_shapes_and_types(camera: CameraRenderer) -> None:
 def outline(
     camera: CameraRenderer, o: SceneObject
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of the object's convex outline in the image, and its centroid, in pixels."""
+    """Return corners and centroid of the object's convex outline in the image [pixels]."""
     points = camera.camera.project(o.corners_T)
     around = points[ConvexHull(points).vertices]
     following = np.roll(around, -1, axis=0)
@@ -153,7 +153,7 @@ def outline(
 
 @pytest.mark.parametrize("index", range(5), ids=SCATTERED.names)
 def test_project_agrees_with_the_label_image(index: int, camera: CameraRenderer) -> None:
-    """Up to the pixel: a pixel is the object's if its middle is."""
+    """Masks agree to the pixel: a pixel belongs to an object if its center does."""
     corners, centroid = outline(camera, SCATTERED.objects[index])
     rows, columns = np.nonzero(camera.render_label(SCATTERED) == index)
     assert np.array([columns.mean(), rows.mean()]) == pytest.approx(centroid, abs=1.0)
@@ -185,8 +185,8 @@ def test_project_by_hand(camera: CameraRenderer) -> None:
     points = camera.camera.project(
         np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.0, 0.16, 0.0], [0.16, 0.16, 0.8]])
     )
-    middle = np.array([319.0, 239.0])
-    assert points - middle == pytest.approx(
+    center = np.array([319.0, 239.0])
+    assert points - center == pytest.approx(
         f * np.array([[0, 0], [0.1, 0], [0, -0.1], [0.2, -0.2]])
     )
 

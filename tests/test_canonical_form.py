@@ -36,7 +36,7 @@ def test_a_can_looks_the_same_in_all_ten(class_name: str) -> None:
 
 
 def test_a_markers_symmetric_orientations() -> None:
-    """It lies in all ten, and looks the same rolled about its axis."""
+    """The marker lies in all ten orientations, which differ by the axis only."""
     by_form: dict[str, set[str]] = {}
     for orientation in Orientation:
         by_form.setdefault(form(single("large_marker", orientation.name.lower())), set()).add(

@@ -1,4 +1,4 @@
-"""The shipped catalog, and what the reader says to a broken one."""
+"""The shipped catalog, and errors for invalid ones."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ BOX = "shape: box, size_mm: [10, 20, 30], mass_g: 50"
 
 
 def user_catalog(folder: Path, text: str) -> Path:
-    """A folder with `text` as its catalog."""
+    """Return a folder with `text` as its catalog."""
     (folder / "catalog.yaml").write_text(text)
     return folder
 

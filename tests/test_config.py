@@ -1,4 +1,4 @@
-"""The config: defaults, a user's file over them, what older files say, and what is refused."""
+"""The config: defaults, files, earlier versions, invalid values."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -80,7 +80,7 @@ def test_fields_under_their_earlier_names(tmp_path: Path) -> None:
 def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
     tmp_path: Path,
 ) -> None:
-    """Whatever its cameras are called."""
+    """Fields of the cell are kept, and override those that moved there from version 0.1."""
     text = "{pose: {translation: [0, 0, 2], rpy_deg: [180, 0, 0]}, width: 320}"
     config = load_config(
         config_file(tmp_path, f"cell: {{cameras: {{camera: {text}, arm: {text}}}}}")
@@ -218,7 +218,7 @@ def test_a_broken_file_is_refused(text: str, named: str, tmp_path: Path) -> None
 
 
 def test_a_setting_names_an_entry_of_a_list() -> None:
-    """The other fields of the entry stay, and so do the other entries."""
+    """Settings keep the other fields of an entry and the other entries."""
     cell = cell_with("fixtures.0.pose.z=-0.05", "robot.limits.acceleration.1=2")
     (table,), (before,) = cell.fixtures, DEFAULT_CELL.fixtures
     assert table == before.model_copy(

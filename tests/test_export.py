@@ -1,4 +1,4 @@
-"""Exported folders: moved elsewhere, and read back by the programs that they are for."""
+"""Exported folders can be moved, and are read back by the target programs."""
 
 import re
 import shutil
@@ -44,7 +44,7 @@ BULLET = 1e-5
 
 @pytest.fixture(scope="module")
 def mug(tmp_path_factory: pytest.TempPathFactory) -> ObjectClass:
-    """The example's mesh class, with its origin away from its center of mass."""
+    """Return the example's mesh class, whose origin is not its center of mass."""
     folder = tmp_path_factory.mktemp("user") / "custom_class"
     folder.mkdir()
     for name in ("catalog.yaml", "mug.stl"):
@@ -78,7 +78,7 @@ def scene(mug: ObjectClass) -> Scene:
 def exported(
     request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[ExportFormat, Path]:
-    """The format and the main file of an export that was moved after it was written."""
+    """Return the format and main file of an export that was moved afterwards."""
     format: ExportFormat = request.param
     out = tmp_path_factory.mktemp("export") / "before"
     out.mkdir()
@@ -90,14 +90,14 @@ def exported(
 
 
 def matrix_of(pose: Pose) -> NDArray[np.float64]:
-    """The pose as a matrix, (4, 4)."""
+    """Return a pose as a matrix (4, 4)."""
     return np.asarray(rigid_transform(pose).GetAsMatrix4())
 
 
 def check(
     scene: Scene, name: str, mass: float | None, X_TO: NDArray[np.float64], tolerance: float = 1e-6
 ) -> None:
-    """Mass (kg) and pose (4, 4) that a program read are the scene's; m and rad."""
+    """Assert that mass [kg] and pose (4, 4) equal those of the scene [m, rad]."""
     assert pytest.approx(matrix_of(scene[name].X_TO), abs=tolerance) == X_TO, name
     assert mass is None or mass == pytest.approx(scene[name].object_class.mass, abs=1e-6), name
 

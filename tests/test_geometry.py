@@ -29,13 +29,13 @@ def turned(
     translation: tuple[float, float, float],
     name: str = "b",
 ) -> SceneObject:
-    """An object turned about one axis of the tray."""
+    """Return an object rotated about one axis of the tray."""
     rotation = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return SceneObject(name, CLASSES[class_name], Pose.from_rotation(rotation, translation))
 
 
 def both_ways(first: SceneObject, second: SceneObject) -> float:
-    """The penetration, which is the same in either order."""
+    """Return the penetration depth, which is the same in either order."""
     depth = penetration_depth(first, second)
     assert penetration_depth(second, first) == pytest.approx(depth, abs=1e-12)
     return depth
@@ -52,7 +52,7 @@ def test_two_boxes_side_by_side(axis: int, depth: float) -> None:
 
 
 def test_a_box_inside_another_is_as_deep_as_its_way_out() -> None:
-    """The shortest way out of the middle is along the thin sides: half of each."""
+    """The shortest separation is along the thin sides: half of each."""
     first, second = turned("cracker_box", "z", 0, (0, 0, 0)), turned("sugar_box", "z", 0, (0, 0, 0))
     assert both_ways(first, second) == pytest.approx((0.060 + 0.038) / 2)
 
@@ -97,7 +97,7 @@ def test_a_corner_against_a_face(depth: float) -> None:
 
 @pytest.mark.parametrize("depth", [0.003, 0.0, -0.002])
 def test_a_can_beside_a_box(depth: float) -> None:
-    """Its 32-sided prism has a corner on its x axis."""
+    """The inscribed prism of 32 sides has a corner on the x axis."""
     can = resting("master_chef_can", name="can")
     box = turned("cracker_box", "z", 0, (0.051 + 0.030 - depth, 0, 0.115))
     assert both_ways(can, box) == pytest.approx(depth, abs=1e-12)
@@ -126,7 +126,7 @@ def test_a_can_on_a_can() -> None:
 def random_pairs(
     names: tuple[str, str], count: int, reach: float
 ) -> list[tuple[SceneObject, SceneObject]]:
-    """Two objects near each other, turned any way."""
+    """Return two objects near each other, in any orientation."""
     generator = rng(1)
 
     def anyhow(name: str, class_name: str) -> SceneObject:
@@ -185,7 +185,10 @@ def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
     "names", [("tomato_soup_can", "cracker_box"), ("large_marker", "large_marker")]
 )
 def test_moving_a_cylinder_out_by_the_depth_parts_it(names: tuple[str, str]) -> None:
-    """By a bit less, in no direction. And points that lie in both prove an overlap."""
+    """The depth separates the objects, a smaller distance in no direction does not.
+
+    Points in both objects prove a penetration.
+    """
     generator = rng(2)
     overlapping = 0
     for a, b in random_pairs(names, 40, 0.06):
@@ -215,7 +218,7 @@ def parted(a: SceneObject, b: SceneObject, distance: float) -> bool:
 
 
 def points_inside(o: SceneObject, generator: np.random.Generator) -> NDArray[np.float64]:
-    """(N, 3) m in O, within the cylinder, a bit inside the prism that stands for it."""
+    """Return points in the inscribed prism of a cylinder in O [m]. Shape (N, 3)."""
     radius, half = 0.99 * o.object_class.size[0] / 2, o.object_class.size[2] / 2
     angle, distance = (
         generator.uniform(0, 2 * math.pi, 2000),
@@ -227,7 +230,7 @@ def points_inside(o: SceneObject, generator: np.random.Generator) -> NDArray[np.
 
 
 def inside(o: SceneObject, p_T: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether points in the tray frame lie in a box, or in a cylinder of 99 % the radius."""
+    """Return whether points in T are in a box, or in a cylinder of 99 % of the radius."""
     p_O = (p_T - o.X_TO.p) @ o.X_TO.rotation
     half = np.asarray(o.object_class.size) / 2
     if o.object_class.shape.value == "box":
@@ -254,7 +257,7 @@ def names_of(groups: list[list[SceneObject]]) -> list[list[str]]:
 
 
 def test_touching_groups() -> None:
-    """A chain through neighbors within the margin is one group; order is the scene's."""
+    """A chain of neighbors within the margin is one group, in the order of the scene."""
     chain = [
         resting("sugar_box", Orientation.FLAT_90, (x, 0.0), name=name)
         for name, x in (("a", 0.0), ("c", 0.1825), ("b", 0.091))

@@ -1,4 +1,4 @@
-"""The rule sheet, matching, budgets, and derivations under every kind of policy."""
+"""Production rules, matching, budgets, and derivations under several policies."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -53,7 +53,7 @@ EXAMPLE = (
 
 
 def ordered(graph: ClutterGraph) -> tuple[Nodes, Edges]:
-    """Nodes and edges with their kinds, in order."""
+    """Return nodes and edges with their kinds, in order."""
     return list(graph.nx.nodes(data="kind")), list(graph.nx.edges(data="kind"))
 
 

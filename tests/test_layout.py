@@ -16,11 +16,11 @@ from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
 
 RANDOM_SCENES = 2000
-"""`benchmarks/layout_penetration.py` checks 10,000 alike; here they would take minutes."""
+"""Number of random layouts; `benchmarks/layout_penetration.py` checks 10,000."""
 ROUNDING = 1e-9
 
 Footprint = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Lower and upper corner, (2,) m each."""
+"""Lower and upper corner of a footprint, (2,) each [m]."""
 
 
 def derived(*rules: str) -> Derivation:
@@ -55,7 +55,7 @@ def carriers(graph: ClutterGraph, node: int) -> list[int]:
 
 
 def twins(graph: ClutterGraph) -> list[tuple[int, int]]:
-    """The two objects of every pair."""
+    """Return the two objects of every pair."""
     return [
         (one, other)
         for node, kind in graph.nx.nodes(data="kind")
@@ -65,7 +65,7 @@ def twins(graph: ClutterGraph) -> list[tuple[int, int]]:
 
 
 def check_scene(scene: Scene, config: LayoutConfig) -> None:
-    """Asserts everything that the layout promises of a scene."""
+    """Assert all properties of a layout."""
     assert scene.graph is not None
     objects = {o.node: o for o in scene.objects}
     assert set(objects) == {node for node, _ in scene.graph.objects()}
@@ -85,8 +85,8 @@ def check_scene(scene: Scene, config: LayoutConfig) -> None:
         assert upper[2] <= config.max_stack_height
         if below:
             own = [objects[node] for pair in paired if o.node in pair for node in pair] or [o]
-            middle = np.mean([b.X_TO.p[:2] for b in own], axis=0)
-            assert middle == pytest.approx(
+            center = np.mean([b.X_TO.p[:2] for b in own], axis=0)
+            assert center == pytest.approx(
                 np.mean([b.X_TO.p[:2] for b in below], axis=0), abs=ROUNDING
             )
     for one, other in paired:
@@ -101,7 +101,7 @@ def check_scene(scene: Scene, config: LayoutConfig) -> None:
 
 
 def footprints(scene: Scene) -> list[tuple[Footprint, Footprint]]:
-    """The axis-aligned footprints of every two stacks."""
+    """Return the axis-aligned footprints of every two stacks."""
     assert scene.graph is not None
     stack_of: dict[int, int] = {}
     for node in scene.graph.breadth_first_order():
@@ -182,7 +182,7 @@ def test_a_pair_by_hand(rule: str, gap: float, thickness: float) -> None:
 
 
 def tower(count: int) -> Derivation:
-    """Cracker boxes on end, 230 mm each."""
+    """Return the derivation of a stack of upright cracker boxes, 230 mm each."""
     inserted = ["insert_cracker_box"] * count + ["orient_upright_0"] * count
     return derived("drop_object", *["stack_object"] * (count - 1), "end", *inserted)
 
@@ -234,7 +234,7 @@ def test_the_same_seed_gives_the_same_layout() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_stacks_are_spread_over_the_whole_tray(axis: int) -> None:
-    """Uniform over the places that are allowed: the mean and the spread of 400 draws."""
+    """Positions are uniform over the allowed ones: mean and spread of 400 samples."""
     derivation = derived("drop_object", "end", "insert_tomato_soup_can", "orient_flat_0")
     drawn = np.array(
         [laid_out(derivation, seed=seed).objects[0].X_TO.p[axis] for seed in range(400)]

@@ -87,7 +87,7 @@ def test_what_something_unknown_may_lie_on() -> None:
 
 
 def highest(plan: PickPlacePlan) -> float:
-    """m, of the cup while it carries."""
+    """Return the greatest height of the cup during the transport [m]."""
     carry = plan.segments[1]
     q = carry.trajectory.vector_values(np.linspace(0, carry.duration, 40)).T
     return float(ToolKinematics(DEFAULT_CELL).pose(q)[:, 2, 3].max())

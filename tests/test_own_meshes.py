@@ -1,4 +1,4 @@
-"""A user's own convex meshes under the static judge, its rays and Drake."""
+"""Convex meshes of a user: static judge, rays and Drake."""
 
 import math
 from itertools import product
@@ -84,7 +84,7 @@ def as_made(
     degrees: float = 0.0,
     name: str = "own",
 ) -> SceneObject:
-    """On its z, turned about it."""
+    """Return an object standing on its z axis, rotated about it."""
     R_TO = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return SceneObject(
         name,
@@ -99,7 +99,7 @@ def as_made(
         ("prism", 0.105, 10.0, True),
         ("prism", 0.125, 10.0, False),
         ("frustum", 0.123, 0.0, False),
-        # A wedge's center of mass is a third of the way from its high end: 20 mm off its middle.
+        # A wedge's center of mass is a third of the way from its high end: 20 mm off its center.
         ("wedge", 0.123, 0.0, True),
         ("wedge", 0.107, 180.0, False),
     ],
@@ -113,7 +113,7 @@ def test_own_meshes_near_the_edge_of_a_box(
     static_judge: StaticStabilityJudge,
     judge: DrakeJudge,
 ) -> None:
-    """The edge is at 115 mm."""
+    """Objects overhang the edge at 115 mm."""
     scene = scene_of(BELOW, as_made(own[class_name], (x, 0.0), 0.060, degrees))
     mine, drakes = static_judge.judge(scene, rng(1)), judge.judge(scene, rng(1))
     assert isinstance(mine, Verdict)
@@ -129,7 +129,7 @@ def test_a_box_on_a_frustums_small_top(
     static_judge: StaticStabilityJudge,
     judge: DrakeJudge,
 ) -> None:
-    """Its top is a square of 42 mm on its corner; its outline would carry the box at 30 mm."""
+    """The top face, a rotated square of 42 mm, carries; the outline would carry more."""
     scene = scene_of(
         as_made(own["frustum"], (0.0, 0.0), 0.0),
         resting("gelatin_box", xy=(x, 0.0), floor=0.060, name="box"),
@@ -166,7 +166,7 @@ def test_margins_of_own_meshes(
 def test_a_mesh_stands_on_a_face_askew_in_its_frame(
     own: dict[str, ObjectClass], static_judge: StaticStabilityJudge
 ) -> None:
-    """On each of its six faces."""
+    """The oblique box stands on each of its six faces."""
     for turn in ("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270):
         R_TO = Rotation.from_euler(*turn, degrees=True).as_matrix() @ ASKEW.T
         lowest = float((own["askew"].corners @ R_TO.T)[:, 2].min())
@@ -193,7 +193,7 @@ def test_nothing_stands_on_a_slope(
 def test_the_caster_sees_own_meshes_as_the_camera_does(
     own: dict[str, ObjectClass], config: ClutterConfig
 ) -> None:
-    """Turned any way. Of a few hundred pixels hardly one is judged otherwise."""
+    """Visible fractions agree with the renderer in any orientation, but for single pixels."""
     turns = Rotation.random(4, rng=rng(2)).as_matrix()
     tumbled = [
         SceneObject(name, own[name], Pose.from_rotation(turn, (x, 0.02, 0.15)))

@@ -57,7 +57,7 @@ def carried_by(scene: Scene, name: str) -> set[str]:
 
 
 def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = ()) -> float:
-    """How deep the object at its new pose penetrates any other, m."""
+    """Return how deep the object at its new pose penetrates any other one [m]."""
     placed = SceneObject(name, scene[name].object_class, X_TO)
     return max(
         (penetration_depth(placed, o) for o in scene.objects if o.name not in (name, *besides)),
@@ -89,7 +89,7 @@ def test_the_same_seed_gives_the_same_place_and_chance_breaks_ties(detector: Lab
 
 
 def test_a_draw_takes_one_of_the_free_places(detector: LabelDetector) -> None:
-    """They are searched for once; asking whether there are any draws nothing."""
+    """Placements are cached, and a search draws no random numbers."""
     observation, move = seen(detector, scene_of(resting("sugar_box", name="box"))), Move("box")
     generator = rng(3)
     places = find_free_placements(observation, move, CONFIG)
@@ -147,7 +147,7 @@ def inside_outline(o: SceneObject, xy: NDArray[np.float64]) -> bool:
 
 
 def test_no_room_on_the_tray(detector: LabelDetector) -> None:
-    """The only place that would hold the box is where it stands, which nobody can see."""
+    """The only free space for the box is where it stands, which is hidden."""
     scene = scene_of(resting("cracker_box", name="box"), side=0.26)
     assert placement(detector, scene, "box") is None
     # 50 mm are left beside it: enough for the marker of 18 mm with 10 mm of clearance on either
@@ -192,7 +192,7 @@ def test_beside_what_stands_on_the_top(detector: LabelDetector) -> None:
 
 
 def test_no_room_on_an_occupied_top(detector: LabelDetector) -> None:
-    """Beside a sugar box in the middle 27 mm and 35 mm of the top are left."""
+    """Beside a sugar box in the center, 27 mm and 35 mm of the top are free."""
     scene = scene_of(
         *(BELOW, resting("sugar_box", xy=(0.05, 0.05), floor=0.060, name="on top")),
         resting("sugar_box", xy=(-0.2, -0.25), name="picked"),
@@ -245,7 +245,7 @@ def test_the_air_above_the_picked_object_is_free(detector: LabelDetector) -> Non
 
 
 def test_what_stands_in_a_shadow_is_not_free(detector: LabelDetector) -> None:
-    """Behind a high wall the floor cannot be seen; no place is chosen there, whatever the seed."""
+    """No placement is chosen on the hidden floor behind a wall."""
     wall = [
         resting("cereal_box_large", Orientation.UPRIGHT_90, (0.22, y), name=f"wall {y}")
         for y in (-0.1, 0.1)

@@ -35,7 +35,7 @@ ALL_SHAPES = (
 
 
 def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
-    """The index of the object that each ray meets first, -1 for none."""
+    """Return the index of the object that each ray meets first, or -1."""
     found = np.full((caster.camera.height, caster.camera.width), -1)
     for detection in caster.observe(scene)[0].detections:
         found[detection.mask] = scene.names.index(detection.name)
@@ -185,7 +185,7 @@ def test_a_box_from_straight_above_covers_its_top(
 
 
 def test_a_box_in_a_corner_shows_its_sides() -> None:
-    """The hull of its eight corners in the picture, by the shoelace formula."""
+    """Return the area of the hull of a box's corners in the image (shoelace formula)."""
     box = resting("cracker_box", Orientation.UPRIGHT_0, (0.2, 0.15), name="box")
     low, high = (
         CAMERA.project(np.array([[x, y, z] for x in (0.12, 0.28) for y in (0.12, 0.18)]))
@@ -228,7 +228,7 @@ def test_the_order_of_the_objects_is_no_matter(seed: int) -> None:
 
 
 def test_what_was_cast_before_is_no_matter() -> None:
-    """The buffers are used again: nothing of a fuller scene stays in them."""
+    """Buffers that are reused hold nothing of earlier scenes."""
     caster = RayCaster(CAMERA)
     before = caster.observe(scene_of(resting("gelatin_box", name="box")))
     for seed in range(2):

@@ -1,4 +1,4 @@
-"""Sets of scenes in one file."""
+"""Scene datasets in one file."""
 
 from pathlib import Path
 
@@ -87,7 +87,7 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_graph_that_explorers_are_compared_on_was_learned_from() -> None:
-    """Of the sets that are shipped, up to symmetry; and none is there twice."""
+    """The shipped test datasets share no graph with the training ones, up to symmetry."""
     sets = {
         path: load_scene_dataset(path, CATALOG)
         for path in (Path(__file__).parents[1] / "training/scenes").glob("*.json")

@@ -31,7 +31,7 @@ GONE = object()
 
 
 def stable_verdict(scene: Scene) -> Verdict:
-    """Made up, with numbers that take all their digits."""
+    """Return an arbitrary verdict, with numbers that need all their digits."""
     generator = rng(1)
     settled = {o.name: o.X_TO.translated(generator.normal(size=3) * 1e-5) for o in scene.objects}
     shares = {name: float(generator.uniform()) for name in scene.names}
@@ -52,7 +52,7 @@ def reloaded(folder: Path, scene: Scene, verdict: Verdict | None = None) -> Scen
 
 
 def loads_or_is_refused(path: Path) -> bool:
-    """Whether the file loads; if not, it must be refused by an error that names it."""
+    """Return whether the file loads; otherwise the error must name it."""
     try:
         load_scene(path, CATALOG)
     except InputError as refusal:
@@ -86,7 +86,7 @@ def test_round_trip_is_exact(seed: int, tmp_path: Path) -> None:
 
 
 def test_poses_of_every_size_survive(tmp_path: Path) -> None:
-    """YAML 1.1 reads 1e-05 as a text; what is written has a point."""
+    """Small numbers are written with a point: YAML 1.1 reads 1e-05 as text."""
     objects = [
         resting("sugar_box", xy=(x, y), floor=z, name=f"box {index}")
         for index, (x, y, z) in enumerate(
@@ -140,7 +140,7 @@ def test_names_are_any_text(tmp_path: Path) -> None:
 
 
 def test_a_file_by_hand(tmp_path: Path) -> None:
-    """What a person would write: no graph, no node, whole numbers, a rounded quaternion."""
+    """A minimal file has no graph, no nodes, integers, and a rounded quaternion."""
     path = tmp_path / "mine.yaml"
     path.write_text("""
 version: 1
@@ -183,7 +183,7 @@ UNSTABLE = scene_to_dict(SCENE, DEFAULT_CELL, unstable_verdict(SCENE))
 
 
 def changed(document: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
-    """A copy of the document with one value replaced, or taken out."""
+    """Return a copy of the document with one value replaced or removed."""
     result = copy.deepcopy(document)
     at: Any = result
     for key in path[:-1]:
@@ -202,7 +202,7 @@ def written(folder: Path, document: Any) -> Path:
 
 
 def object_node() -> int:
-    """Index of the first object in the graph's list of nodes."""
+    """Return the index of the first object in the graph's list of nodes."""
     return next(
         index for index, node in enumerate(DOCUMENT["graph"]["nodes"]) if node["kind"] in CLASSES
     )
@@ -416,7 +416,7 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_cut_off_is_refused(tmp_path: Path) -> None:
-    """At every length: what is not refused holds whole objects, and from the first one on."""
+    """A truncated file is refused, or holds the first objects completely."""
     path = tmp_path / "scene.yaml"
     save_scene(path, SCENE, DEFAULT_CELL, stable_verdict(SCENE))
     whole = path.read_text()

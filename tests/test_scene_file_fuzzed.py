@@ -20,7 +20,7 @@ from drake_clutter.yaml_io import to_yaml
 
 
 def places(value: Any, at: Path_ = ()) -> Iterator[Path_]:
-    """The paths of all values in a document."""
+    """Return the paths of all values in a document."""
     for key, item in (
         value.items()
         if isinstance(value, dict)
@@ -72,7 +72,7 @@ STRANGE += [
 
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file to be overwritten again and again."""
+    """Return a file that each example overwrites."""
     return tmp_path_factory.mktemp("fuzz") / "scene.yaml"
 
 

@@ -143,7 +143,7 @@ def test_an_object_on_its_own_settles_alike_wherever_it_stands(config: ClutterCo
 
 
 def test_single_objects_keep_their_names(judge: DrakeJudge) -> None:
-    """The second falls just as the first did, whose result is kept."""
+    """The result of the first of two equal falls is used for the second one."""
     for name in ("one", "two"):
         verdict = judge.judge(scene_of(resting("gelatin_box", floor=0.15, name=name)), rng())
         assert verdict.instability is not None
@@ -153,7 +153,7 @@ def test_single_objects_keep_their_names(judge: DrakeJudge) -> None:
 
 @pytest.mark.parametrize("x", [0.6, 0.36])
 def test_a_single_object_beside_the_tray_has_left_it(x: float, judge: DrakeJudge) -> None:
-    """Also after one on the tray has settled alike."""
+    """An object beside the tray is simulated although an equal one settled on the tray."""
     assert judge.judge(scene_of(resting("cracker_box", name="box")), rng()).stable
     verdict = judge.judge(scene_of(resting("cracker_box", xy=(x, 0.0), name="box")), rng())
     assert verdict.instability is not None
@@ -192,7 +192,7 @@ def test_groups_settled_separately_give_the_same_verdict(
 
 
 def test_the_first_stack_that_falls_decides(judge: DrakeJudge) -> None:
-    """What was not looked at any more stays where it was."""
+    """Groups that were not simulated keep their poses."""
     falling = moved_aside(FALLING["overhang of more than half"][0], -0.2, "first ")
     standing = moved_aside(STABLE["box on box"], 0.2, "second ")
     scene = scene_of(*falling, *standing)

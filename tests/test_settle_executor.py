@@ -1,4 +1,4 @@
-"""Moves by teleport: what stays, what falls, what is left alone."""
+"""Moves by teleport and settling: what stays, what falls, what is not simulated."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_onto_another_object(executor: SettleExecutor, detector: LabelDetector) 
 
 
 def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecutor) -> None:
-    """More than the margin within which objects are simulated together."""
+    """The gap is larger than the margin within which objects are simulated together."""
     start = STACKS["on the can"].X_TO
     raised = start.translated((0.0, 0.0, 0.005))
     command = PickPlaceCommand(Move("on the can", "can"), start, raised)
@@ -77,7 +77,7 @@ def test_what_is_let_go_too_high_falls_onto_what_is_below(executor: SettleExecut
 
 
 def test_a_neighbor_is_no_support(executor: SettleExecutor) -> None:
-    """What is let go too high beside something close falls onto what is below all the same."""
+    """An object released high beside a neighbor falls onto what is below it."""
     picked, neighbor = (
         resting("gelatin_box", floor=0.101, name="picked"),
         resting("cracker_box", Orientation.UPRIGHT_0),

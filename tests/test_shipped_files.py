@@ -30,7 +30,7 @@ RESULTS = sorted(
 
 
 def script_config(name: str) -> Any:
-    """The config of the training that a file is named after."""
+    """Return the config class instance of the training that a file is named after."""
     if name.startswith("detector"):
         return training_script("train_detector").CONFIG
     if name.startswith("sg"):
@@ -72,7 +72,7 @@ def test_scene_sets(path: Path) -> None:
 
 
 def configs_in(document: Any) -> Iterator[tuple[str, Any]]:
-    """The configs in a result, by the name of what they are."""
+    """Yield the configs in a result, by their keys."""
     if isinstance(document, list):
         for item in document:
             yield from configs_in(item)

@@ -93,7 +93,7 @@ def test_what_is_placed_rests_on_what_is_below(move: Move, floor: float) -> None
 
 
 def test_the_same_rng_gives_the_same_outcome() -> None:
-    """Whatever was carried out before."""
+    """Outcomes do not depend on earlier moves."""
     one = execute_move(STACKS, Move("marker"), 7)
     execute_move(STACKS, Move("above"), 1)
     assert execute_move(STACKS, Move("marker"), 7) == one
@@ -160,7 +160,7 @@ def test_where_nothing_balances() -> None:
     assert outcome.instability is not None
     assert outcome.instability.reason is InstabilityReason.UNBALANCED
     assert outcome.scene["heavy"].X_TO.p[0] > 0.115
-    # Without the can the middle of the top is free, which is 15 mm inside the edge.
+    # Without the can the center of the top is free, which is 15 mm inside the edge.
     assert (
         execute_move(scene_of(*OVERHANG, HEAVY), Move("heavy", "over")).result is MoveResult.PLACED
     )
@@ -187,7 +187,7 @@ def leaning(o: SceneObject) -> SceneObject:
 
 
 LEANS = scene_of(*STACKS.objects, leaning(resting("gelatin_box", xy=(0.2, -0.2), name="leaning")))
-# As settling may leave it: its middle 1 mm inside the edge, where the judge wants 2 mm.
+# As settling may leave it: its center 1 mm inside the edge, where the judge wants 2 mm.
 JUST_RESTS = scene_of(
     *(
         resting("cracker_box", name="below"),
@@ -222,7 +222,7 @@ LEANING = InconclusiveVerdict(InconclusiveReason.LEANING, "leaning")
 def test_what_it_cannot_judge_is_a_result(
     scene: Scene, move: Move, answer: InconclusiveVerdict
 ) -> None:
-    """Also that something rests, before the move, which it would let fall."""
+    """A scene that the model lets fall before the move is inconclusive."""
     outcome = execute_move(scene, move)
     assert (outcome.result, outcome.inconclusive, outcome.instability) == (
         MoveResult.INCONCLUSIVE,
@@ -238,7 +238,7 @@ def test_what_it_cannot_judge_is_a_result(
     ids=str,
 )
 def test_objects_that_a_move_does_not_touch_are_not_judged(move: Move) -> None:
-    """The same as without the box that leans, wherever the picked one goes."""
+    """The outcome equals that without the leaning box, for any target."""
     outcome, without = execute_move(LEANS, move), execute_move(STACKS, move)
     assert (outcome.result, outcome.instability) == (without.result, without.instability)
     assert outcome.result is not MoveResult.INCONCLUSIVE
@@ -252,7 +252,7 @@ def test_objects_that_a_move_does_not_touch_are_not_judged(move: Move) -> None:
     ids=str,
 )
 def test_only_what_is_in_view_can_be_moved(move: Move, executor: MoveExecutor) -> None:
-    """The can is hidden."""
+    """The can is hidden in this scene."""
     name = move.pick if move.pick != "marker" else move.place
     with pytest.raises(KeyError, match=f"'{name}' is not in view"):
         execute_move(STACKS, move, executor=executor)
@@ -299,7 +299,7 @@ def test_drake_lets_it_go_at_the_same_place(
 
 
 def test_inconclusive_moves_are_settled_in_drake() -> None:
-    """It draws what it would have drawn, had it been asked first."""
+    """Drake draws the same random offsets as without the static executor."""
     generator, other = rng(5), rng(5)
     outcome = executed(HybridExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), generator)
     drakes = executed(SettleExecutor(CONFIG), LEANS, seen(LEANS), Move("leaning"), other)
@@ -313,7 +313,7 @@ def test_inconclusive_moves_are_settled_in_drake() -> None:
     "move", [Move("above"), Move("below"), Move("on the can", "marker")], ids=str
 )
 def test_conclusive_moves_are_not_settled_in_drake(move: Move) -> None:
-    """Not even about a collapse, of which it would show the motion."""
+    """Conclusive collapses are not simulated either."""
     generator, other = rng(5), rng(5)
     outcome = executed(HybridExecutor(CONFIG), STACKS, seen(STACKS), move, generator)
     assert outcome == executed(EXECUTOR, STACKS, seen(STACKS), move, other)

@@ -24,9 +24,9 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 UPRIGHT = Orientation.UPRIGHT_0
 MARGIN = 0.00205
-"""m: what the offsets of two objects, 1 mm each, can take away, and what is added for rounding."""
+"""Contact margin: two random offsets of 1 mm each, and the margin for rounding [m]."""
 STEP = 0.0001
-"""m, to which `margins` knows them."""
+"""Resolution of `stability_margins` [m]."""
 
 
 STATIC_JUDGE = StaticStabilityJudge(ClutterConfig())
@@ -42,7 +42,7 @@ def stands(*objects: SceneObject) -> bool:
 def reason_of(
     found: Instability | InconclusiveVerdict | None,
 ) -> InstabilityReason | InconclusiveReason | None:
-    """What is wrong. Which of two twins that fall alike is named is not asked."""
+    """Return the reason; the name of one of two identical objects is arbitrary."""
     return None if found is None else found.reason
 
 
@@ -69,7 +69,7 @@ def test_the_tipping_point(class_name: str, axis: int, half: float) -> None:
 
 
 def test_the_margin_grows_with_the_offsets() -> None:
-    """3 mm instead of 1 mm: a box that is 4 mm inside the edge may be pushed over it."""
+    """With offsets of 3 mm, a box 4 mm inside of the edge may be pushed over it."""
     scene = scene_of(BELOW, resting("sugar_box", xy=(0.111, 0.0), floor=0.060, name="above"))
     wide = world_with("settle.jitter=0.003")
     assert STATIC_JUDGE.find_instability(scene) is None
@@ -110,7 +110,7 @@ TABLE: dict[str, tuple[list[SceneObject], InstabilityReason | None]] = {
         ],
         None,
     ),
-    "a table on three legs of four, its middle on the diagonal": (
+    "a table on three legs of four, its center on the diagonal": (
         [
             *(
                 resting("tomato_soup_can", xy=xy, name=str(xy))
@@ -197,7 +197,7 @@ def test_known_statics(objects: list[SceneObject], reason: InstabilityReason | N
 def test_numerical_noise_is_no_matter(
     objects: list[SceneObject], reason: InstabilityReason | None
 ) -> None:
-    """As settling leaves it: 1 nm and 1 nrad."""
+    """The verdict tolerates noise of 1 nm and 1 nrad, as after settling."""
     generator = rng(1)
     noisy = []
     for o in objects:
@@ -264,7 +264,7 @@ def test_an_arch_that_friction_holds(config: ClutterConfig, judge: DrakeJudge) -
 
 
 def leaning(o: SceneObject, degrees: float) -> SceneObject:
-    """Turned about the tray's y, its lowest point at the height where it was."""
+    """Return the object rotated about the tray's y axis, with its lowest point unchanged."""
     R_TO = Rotation.from_euler("y", degrees, degrees=True).as_matrix() @ o.X_TO.rotation
     lowest = float((o.object_class.corners @ R_TO.T)[:, 2].min())
     return replace(o, X_TO=Pose.from_rotation(R_TO, (*o.X_TO.p[:2], o.bounds_T[0][2] - lowest)))
@@ -331,7 +331,7 @@ CANNOT: dict[str, tuple[list[SceneObject], InconclusiveReason]] = {
 def test_what_it_cannot_judge(
     objects: list[SceneObject], reason: InconclusiveReason, config: ClutterConfig
 ) -> None:
-    """Whatever is asked. What misses what should carry it falls; the rest may fall or not."""
+    """All queries are inconclusive; an object that misses its support falls."""
     scene = scene_of(*objects)
     answer = InconclusiveVerdict(reason, "it")
     assert (

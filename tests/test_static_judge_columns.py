@@ -31,7 +31,7 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 BOXES = ["cracker_box", "sugar_box", "pudding_box", "gelatin_box", "granola_box"]
 MILLIMETER = 0.001013
-"""m. Sizes are round, so that no outline begins just where another one ends."""
+"""A millimeter plus a fraction [m], so that no outlines coincide."""
 OFFSETS = st.integers(-60, 60).map(lambda k: k * MILLIMETER)
 LAYERS = st.lists(
     st.tuples(st.sampled_from(BOXES), st.sampled_from(list(Orientation)), OFFSETS, OFFSETS),
@@ -42,7 +42,7 @@ Layers = list[tuple[str, Orientation, float, float]]
 
 
 def column(layers: Layers) -> list[SceneObject]:
-    """Each object on the one before, its middle off that one's by the offset."""
+    """Return a column; the offsets are relative to the object below."""
     objects: list[SceneObject] = []
     x = y = floor = 0.0
     for class_name, orientation, dx, dy in layers:
@@ -55,7 +55,7 @@ def column(layers: Layers) -> list[SceneObject]:
 
 
 def how_far_inside(box: SceneObject, p_T: NDArray[np.float64]) -> float:
-    """m from a point to the nearest side of a box's outline seen from above; negative outside."""
+    """Return the distance from a point to a box's outline [m]; negative outside."""
     R_TO = box.X_TO.rotation
     level = [axis for axis in range(3) if abs(R_TO[2, axis]) < 0.5]
     sizes = box.object_class.size
@@ -70,10 +70,10 @@ def column_margins(objects: Sequence[SceneObject]) -> list[float]:
     It is measured in the outlines that meet below the object.
     """
     masses = np.array([o.object_class.mass for o in objects])
-    middles = np.array([o.X_TO.p for o in objects])
+    centers = np.array([o.X_TO.p for o in objects])
     found = []
     for k, o in enumerate(objects):
-        p_TC = masses[k:] @ middles[k:] / masses[k:].sum()
+        p_TC = masses[k:] @ centers[k:] / masses[k:].sum()
         found.append(
             min(how_far_inside(met, p_TC) for met in ([o] if k == 0 else [objects[k - 1], o]))
         )
@@ -230,7 +230,7 @@ def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
 @given(ANYTHING, st.randoms(use_true_random=False))
 @settings(max_examples=60)
 def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) -> None:
-    """Unless two objects cannot be judged, of which the first is named."""
+    """The order of the objects does not matter, unless two objects are inconclusive."""
     scene = scene_of(*column(layers), side=2.0)
     supports = STATIC_JUDGE.find_supports(scene)
     assume(not isinstance(supports, InconclusiveVerdict))
@@ -317,7 +317,7 @@ def test_a_force_that_ends_at_zero_ends_no_search() -> None:
 
 
 def test_any_number_of_orientations(config: ClutterConfig) -> None:
-    """A box has 6 faces of 4 corners, fewer than the table expects: its rows run out first."""
+    """The table grows in rows first: a box has fewer corners than it expects."""
     used = StaticStabilityJudge(config)
     for degrees in range(150):
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()

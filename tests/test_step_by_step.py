@@ -21,7 +21,7 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
     [
         # Half the smaller of the sides, 89 mm and 160 mm; below, all of it counts.
         ([BELOW, resting("sugar_box", floor=0.060, name="above")], {"below": 80.0, "above": 44.5}),
-        # The overhang's middle is 20 mm inside; of both, the middle is 52.8 mm off.
+        # The overhang's center is 20 mm inside; of both, the center is 52.8 mm off.
         (
             [BELOW, resting("sugar_box", xy=(0.095, 0.0), floor=0.060, name="above")],
             {"below": 115 - 95 * 514 / (514 + 411), "above": 20.0},
@@ -162,7 +162,7 @@ HELD_DOWN = scene_of(
 
 
 def test_what_only_its_load_holds_down_is_fixed() -> None:
-    """Whatever is pressed onto the box beyond its load makes it fall sooner: nothing can begin."""
+    """The box needs its load to stay, and further loads make it fall earlier."""
     assert STATIC_JUDGE.find_instability(HELD_DOWN) is None
     assert STATIC_JUDGE.immovable_objects(HELD_DOWN) == frozenset({"foot", "held", "weight"})
     assert STATIC_JUDGE.immovable_objects(COUNTERWEIGHT) == frozenset(COUNTERWEIGHT.names)
@@ -189,7 +189,7 @@ def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
 
 
 def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
-    """A class without assets, which the static judge does not need."""
+    """Return a class without assets, which the static judge does not need."""
     return ObjectClass(
         name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere")
     )
