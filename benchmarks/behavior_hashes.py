@@ -216,7 +216,7 @@ def main(
 ) -> None:
     """Run the cases and compare their traces with the records."""
     if unknown := [name for name in only or [] if name not in BACKENDS]:
-        raise InputError(f"--only {unknown[0]}; allowed are {', '.join(BACKENDS)}")
+        raise InputError(f"--only {unknown[0]}; expected {', '.join(BACKENDS)}")
     differences = list[str]()
     for name in BACKENDS:
         if not only or name in only:

@@ -203,8 +203,7 @@ class ObjectClass:
         mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
         if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
             raise InputError(
-                f"{self.sdf_path}: mass: {mass}; "
-                f"allowed is the catalog's, {self.mass:g} kg; {remedy}"
+                f"{self.sdf_path}: mass: {mass}; expected the catalog's, {self.mass:g} kg; {remedy}"
             )
         return self.sdf_path
 
@@ -293,7 +292,7 @@ def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
     if not 0.003 <= min(x, y, z) <= max(x, y, z) <= 1.0:
         raise InputError(
             f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; "
-            "allowed are 0.003 to 1 m a side (units are meters)"
+            "expected 0.003 to 1 m a side (units are meters)"
         )
     return x, y, z
 
@@ -360,6 +359,6 @@ def load_catalog(folder: Path | None = None) -> Catalog:
             if unknown or not members or len(set(members)) != len(members):
                 allowed_values = f"a list, without repeats, of {', '.join(classes)}"
                 problem = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
-                raise input_error(str(path), f"{problem}; allowed is {allowed_values}")
+                raise input_error(str(path), f"{problem}; expected {allowed_values}")
             object_sets[set_name] = members
     return Catalog(classes, object_sets, folders)

@@ -80,8 +80,8 @@ def resume_jsonl(
         differing = ", ".join(key for key, value in header.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(
-                f"{path}: holds records of something else ({differing}); give the same options or"
-                " another folder"
+                f"{path}: holds records with a different header ({differing}); use the same"
+                " options or another folder"
             )
         yield written_header
         yield from records
@@ -140,7 +140,7 @@ def _open_locked(journal_path: Path, path: Path) -> TextIO:
         except BlockingIOError as error:
             journal.close()
             raise InputError(
-                f"{path}: another run is adding to it; wait for it, or give another folder"
+                f"{path}: another process is appending to it; wait for it, or use another folder"
             ) from error
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(journal.fileno()), journal_path.stat()):

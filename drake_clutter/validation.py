@@ -219,7 +219,7 @@ def _error_message(schema: Any, error: ErrorDetails) -> str:
     if error_type in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
         owner, node = _locate(schema, location[:-1])
         names = ", ".join(node.get("properties", {}))
-        return f"{_field_path(owner, location[-1])}: is unknown; allowed are {names}"
+        return f"{_field_path(owner, location[-1])}: is unknown; expected {names}"
     if error_type in ("missing", "missing_argument"):
         owner, node = _locate(schema, location[:-1])
         if "prefixItems" in node:
@@ -238,7 +238,7 @@ def _error_message(schema: Any, error: ErrorDetails) -> str:
 
 def _value_message(field: str, value: Any, allowed: str) -> str:
     """Return the message about a value that is not allowed."""
-    return f"{field}{': ' if field else ''}{format_value(value)}; allowed is {allowed}"
+    return f"{field}{': ' if field else ''}{format_value(value)}; expected {allowed}"
 
 
 def _describe_allowed(error: ErrorDetails, node: Mapping[str, Any]) -> str:
@@ -353,9 +353,7 @@ def _parse_setting(setting: str, config: Any) -> Any:
     """Return FIELD=VALUE as nested mappings, completed by the rest of a list."""
     name, equals, text = setting.partition("=")
     if not equals or not name:
-        raise input_error(
-            f"--set {setting}", "allowed is FIELD=VALUE, such as layout.stack_gap=0.02"
-        )
+        raise input_error(f"--set {setting}", "expected FIELD=VALUE, such as layout.stack_gap=0.02")
     value = parse_yaml(text, f"--set {setting}", "FIELD=VALUE with a YAML value")
     parts = name.split(".")
     for depth in range(len(parts) - 1, -1, -1):

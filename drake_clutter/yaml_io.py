@@ -26,7 +26,7 @@ class _Loader(yaml.CSafeLoader):
             for key_node, _ in own_items:
                 key = self.construct_object(key_node, deep=True)
                 if key in seen:
-                    problem = f"{format_value(key)} is there twice in a mapping"
+                    problem = f"{format_value(key)} is a duplicate key in a mapping"
                     raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
                 seen.add(key)
         return mapping
@@ -73,10 +73,10 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        problem = f"cannot be read ({error.strerror}); allowed is {allowed_content}"
+        problem = f"cannot be read ({error.strerror}); expected {allowed_content}"
         raise input_error(str(path), problem) from error
     except UnicodeDecodeError as error:
-        problem = f"is not YAML ({error.reason}); allowed is {allowed_content}"
+        problem = f"is not YAML ({error.reason}); expected {allowed_content}"
         raise input_error(str(path), problem) from error
     return parse_yaml(text, str(path), allowed_content)
 
@@ -97,8 +97,6 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         reason = f"{line}{error.problem}"
-        raise input_error(
-            source, f"is not YAML ({reason}); allowed is {allowed_content}"
-        ) from error
+        raise input_error(source, f"is not YAML ({reason}); expected {allowed_content}") from error
     except Exception as error:  # many types, for a bad date, number or nesting
-        raise input_error(source, f"is not YAML ({error}); allowed is {allowed_content}") from error
+        raise input_error(source, f"is not YAML ({error}); expected {allowed_content}") from error

@@ -236,9 +236,9 @@ def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) ->
     [
         (
             "{motif: unicorns}",
-            r"classes\.block\.label\.motif: 'unicorns'; allowed are dots, crackers",
+            r"classes\.block\.label\.motif: 'unicorns'; expected dots, crackers",
         ),
-        ("{base: red}", r"classes\.block\.label\.base: 'red'; allowed is a color"),
+        ("{base: red}", r"classes\.block\.label\.base: 'red'; expected a color"),
         ("{accent: '#12345'}", r"classes\.block\.label\.accent"),
         (
             "{title: A title that nobody could ever read}",
@@ -260,7 +260,7 @@ def test_builds_only_the_named_classes(tmp_path: Path) -> None:
     assert build_assets(tmp_path, ["two"]) == [tmp_path / "two"]
     assert not (tmp_path / "one").exists()
     plant_of(f"package://{tmp_path.name}/two/model.sdf", tmp_path / "package.xml")
-    with pytest.raises(InputError, match="no sugar_box; allowed are one, two"):
+    with pytest.raises(InputError, match="no sugar_box; expected one, two"):
         build_assets(tmp_path, ["sugar_box"])
 
 

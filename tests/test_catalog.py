@@ -94,20 +94,20 @@ def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
     [
         (
             "brick: {shape: pyramid, size_mm: [10, 10, 10], mass_g: 5}",
-            r"classes\.brick\.shape: 'pyramid'; allowed is one of box, cylinder, mesh",
+            r"classes\.brick\.shape: 'pyramid'; expected one of box, cylinder, mesh",
         ),
         (
             "brick: {shape: box, size_mm: [10, 20], mass_g: 5}",
-            r"size_mm: \[10, 20\]; allowed is a list of 3 numbers",
+            r"size_mm: \[10, 20\]; expected a list of 3 numbers",
         ),
         (
             "brick: {shape: box, size_mm: [10, -20, 30], mass_g: 5}",
-            r"size_mm\[1\]: -20; allowed is .* from 3 to 1000",
+            r"size_mm\[1\]: -20; expected .* from 3 to 1000",
         ),
         ("brick: {shape: box, size_mm: [10, .nan, 30], mass_g: 5}", r"classes\.brick\.size_mm"),
         (
             "brick: {shape: cylinder, size_mm: [10, 20, 30], mass_g: 5}",
-            r"size_mm: .*\[10, 20, 30\]; allowed is diameter, ",
+            r"size_mm: .*\[10, 20, 30\]; expected diameter, ",
         ),
         (
             "brick: {shape: box, size_mm: [10, 20, 30]}",
@@ -116,23 +116,23 @@ def test_user_sets_mix_with_shipped(tmp_path: Path) -> None:
         ("brick: {shape: box, size_mm: [10, 20, 30], mass_g: 0}", r"classes\.brick\.mass_g: 0"),
         (
             f"brick: {{{BOX}, pairs: [leaning]}}",
-            r"classes\.brick\.pairs\[0\]: 'leaning'; allowed is one of lying, standing",
+            r"classes\.brick\.pairs\[0\]: 'leaning'; expected one of lying, standing",
         ),
         (f"brick: {{{BOX}, pairs: [lying, lying]}}", r"classes\.brick\.pairs: .*once"),
         (
             f"brick: {{{BOX}, color: red}}",
-            r"classes\.brick\.color: is unknown; allowed are shape, size_mm",
+            r"classes\.brick\.color: is unknown; expected shape, size_mm",
         ),
-        (f"Brick: {{{BOX}}}", r"classes\.Brick: 'Brick'; allowed is a name of lower-case letters"),
-        (f"tray: {{{BOX}}}", r"classes\.tray: 'tray'; allowed is a name of .* none of .*tray"),
+        (f"Brick: {{{BOX}}}", r"classes\.Brick: 'Brick'; expected a name of lower-case letters"),
+        (f"tray: {{{BOX}}}", r"classes\.tray: 'tray'; expected a name of .* none of .*tray"),
         (f"sugar_box: {{{BOX}}}", r"classes\.sugar_box: is shipped already"),
         (
             "brick: {shape: mesh, mass_g: 5}",
-            r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh",
+            r"classes\.brick: .* expected `mesh` and no `size_mm` for a mesh",
         ),
         (
             f"brick: {{{BOX}, mesh: brick.stl}}",
-            r"classes\.brick: .* allowed is `mesh` and no `size_mm` for a mesh",
+            r"classes\.brick: .* expected `mesh` and no `size_mm` for a mesh",
         ),
         ("brick: {shape: mesh, mesh: brick.stl, mass_g: 5}", r"classes\.brick\.mesh: no file"),
     ],
@@ -148,7 +148,7 @@ def test_bad_class(tmp_path: Path, entry: str, complaint: str) -> None:
 def test_bad_object_set(tmp_path: Path, members: str) -> None:
     user_catalog(tmp_path, f"object_sets:\n  tea: {members}\n")
     with pytest.raises(
-        InputError, match=r"object_sets\.tea: .*allowed is a list, without repeats, of cracker_box"
+        InputError, match=r"object_sets\.tea: .*expected a list, without repeats, of cracker_box"
     ):
         load_catalog(tmp_path)
 
@@ -188,7 +188,7 @@ def test_bad_meshes(tmp_path: Path) -> None:
     for mesh, complaint in (
         (opened, "not watertight"),
         (inverted, "not watertight"),
-        (in_millimetres, r"allowed are 0\.003 to 1 m"),
+        (in_millimetres, r"expected 0\.003 to 1 m"),
     ):
         mesh.export(tmp_path / "block.stl")
         with pytest.raises(InputError, match=complaint):
@@ -228,7 +228,7 @@ def test_a_model_of_another_mass_is_refused(tmp_path: Path) -> None:
     build_assets(tmp_path)
     assert body_mass(block(100)) == pytest.approx(0.100)
     with pytest.raises(
-        InputError, match=r"model\.sdf: mass: 0\.1; allowed is the catalog's, 0\.15 kg; run"
+        InputError, match=r"model\.sdf: mass: 0\.1; expected the catalog's, 0\.15 kg; run"
     ):
         body_mass(block(150))
     build_assets(tmp_path)

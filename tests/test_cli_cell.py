@@ -98,7 +98,7 @@ def test_scenes_keep_their_support(setting: str, scene_file: Path, tmp_path: Pat
     ]
     for command in commands:
         with pytest.raises(
-            InputError, match="the objects stand on their scene's support; allowed are other fields"
+            InputError, match="the support is that of the scene; expected other fields"
         ):
             run(*command, "--set", setting, "--out", tmp_path / "out")
 
@@ -106,20 +106,20 @@ def test_scenes_keep_their_support(setting: str, scene_file: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"robot": {"tool_frame": None}}, r"robot\.tool_frame: None; allowed is a text"),
-        ({"robot": {"model": ""}}, r"robot\.model: ''; allowed is a text"),
-        ({"robot": {"tool_frame": "nose"}}, r"robot\.tool_frame: 'nose'.*allowed"),
-        ({"robot": {"model": "none.sdf"}}, r"robot\.model: .*none\.sdf.*allowed"),
-        ({"robot": {"home": [0.0, 0.0]}}, r"robot\..*allowed"),
-        ({"robot": {"home": [0.0, 0.0, 0.0, 0.0, 0.0, 7.0]}}, r"robot\.home.*allowed"),
-        ({"robot": {"arm": 3}}, r"robot\.arm: is unknown; allowed are"),
-        ({"gripper": {"kind": "hand"}}, r"gripper\.kind: 'hand'; allowed"),
-        ({"support": {"size": [9.0, 0.5]}}, r"support\.size\[0\]: 9\.0; allowed"),
+        ({"robot": {"tool_frame": None}}, r"robot\.tool_frame: None; expected a text"),
+        ({"robot": {"model": ""}}, r"robot\.model: ''; expected a text"),
+        ({"robot": {"tool_frame": "nose"}}, r"robot\.tool_frame: 'nose'.*expected"),
+        ({"robot": {"model": "none.sdf"}}, r"robot\.model: .*none\.sdf.*expected"),
+        ({"robot": {"home": [0.0, 0.0]}}, r"robot\..*expected"),
+        ({"robot": {"home": [0.0, 0.0, 0.0, 0.0, 0.0, 7.0]}}, r"robot\.home.*expected"),
+        ({"robot": {"arm": 3}}, r"robot\.arm: is unknown; expected"),
+        ({"gripper": {"kind": "hand"}}, r"gripper\.kind: 'hand'; expected"),
+        ({"support": {"size": [9.0, 0.5]}}, r"support\.size\[0\]: 9\.0; expected"),
         (
             {"cameras": {"overhead": {"pose": {"rpy_deg": [0, 0, 0]}}}},
-            r"sees nothing of the support; allowed",
+            r"does not see the support; expected",
         ),
-        ({"fixtures": [{"name": "post"}]}, r"fixtures\[0\].*allowed"),
+        ({"fixtures": [{"name": "post"}]}, r"fixtures\[0\].*expected"),
     ],
 )
 def test_an_invalid_cell_is_reported_in_one_line(
@@ -169,7 +169,7 @@ def test_commands_without_an_arm_check_the_cell(
     Path("config.yaml").write_text("cell: {robot: {model: none.sdf}}")
     source = "--set" if options[0] == "--set" else options[1]
     with pytest.raises(
-        InputError, match=rf"{source}: robot\.model: .*none\.sdf'; allowed is an SDF or URDF file"
+        InputError, match=rf"{source}: robot\.model: .*none\.sdf'; expected an SDF or URDF file"
     ):
         run("generate", "--nodes", "6", "--count", "1", "--out", "out", *options)
     assert not Path("out").exists()
@@ -200,6 +200,6 @@ def test_a_study_refuses_cells_with_the_same_name(scene_file: Path, tmp_path: Pa
     other.write_text(config_yaml(load_cell(UR5E)))
     with pytest.raises(
         InputError,
-        match="--cell, --cell-override: ur5e_epick_tray is there twice; allowed are unique file",
+        match="--cell, --cell-override: ur5e_epick_tray occurs twice; expected unique file",
     ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")

@@ -200,7 +200,7 @@ def test_scenes_with_too_many_objects_are_rejected(scenes: SceneDataset) -> None
         ClutterExploration(scenes, max_objects=2).reset(seed=0)
     with pytest.raises(InputError, match="max_objects: 2; this scene has 11"):
         ClutterExploration(scenes, max_objects=2).reset(options={"scene": 0})
-    with pytest.raises(InputError, match="scene: 3; allowed is 0 to 2"):
+    with pytest.raises(InputError, match="scene: 3; expected 0 to 2"):
         ClutterExploration(scenes).reset(options={"scene": 3})
 
 
@@ -452,7 +452,7 @@ def test_ppo_starts_from_a_cloned_student(file: Path, tmp_path: Path) -> None:
     )
     with pytest.raises(
         InputError,
-        match=r"s\.safetensors: is a checkpoint of a student; allowed is one of a teacher",
+        match=r"s\.safetensors: is a checkpoint of a student; expected one of a teacher",
     ):
         train.main(tmp_path / "teacher", settings=settings)
     with pytest.raises(InputError, match=r"warm_start: .* another width"):
@@ -460,7 +460,7 @@ def test_ppo_starts_from_a_cloned_student(file: Path, tmp_path: Path) -> None:
 
 
 def test_invalid_agents_are_rejected(file: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--agent nobody; allowed are random, .*full-knowledge"):
+    with pytest.raises(InputError, match=r"--agent nobody; expected random, .*full-knowledge"):
         make_policy_factory("nobody", ClutterConfig())
     path = tmp_path / "s.safetensors"
     node_kind_ids = ClutterExploration(file).node_kind_ids
@@ -469,7 +469,7 @@ def test_invalid_agents_are_rejected(file: Path, tmp_path: Path) -> None:
     with pytest.raises(
         InputError,
         match=r"s\.safetensors: is a checkpoint of a generator; "
-        r"allowed is one of a teacher or student",
+        r"expected one of a teacher or student",
     ):
         make_policy_factory(str(path), ClutterConfig())
     save_checkpoint(

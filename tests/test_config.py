@@ -101,7 +101,7 @@ def test_what_is_given_in_the_cell_is_left_alone_and_goes_over_what_moved_there(
     ],
 )
 def test_parts_that_no_version_had_are_refused(text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"world\.yaml: .*allowed"):
+    with pytest.raises(InputError, match=r"world\.yaml: .*expected"):
         load_config_as(Scenario(), config_file(tmp_path, text), upgrade=upgrade_config)
 
 
@@ -121,36 +121,36 @@ def test_two_cameras_are_read_back(tmp_path: Path) -> None:
     [
         (
             "fixtures=[{name: tray, box: [1, 1, 1]}]",
-            "fixtures.tray: is taken; allowed are names that differ, also from tray, camera",
+            "fixtures.tray: is taken; expected names that differ, also from tray, camera",
         ),
         (
             "fixtures=[{name: a, box: [1, 1, 1]}, {name: a, box: [1, 1, 1]}]",
-            "fixtures.a: is taken; allowed are names that differ",
+            "fixtures.a: is taken; expected names that differ",
         ),
         ("fixtures=[{name: overhead, box: [1, 1, 1]}]", "gripper, overhead"),
-        ("fixtures=[{name: a}]", "fixtures[0]: {'name': 'a'}; allowed is either a box or a model"),
+        ("fixtures=[{name: a}]", "fixtures[0]: {'name': 'a'}; expected either a box or a model"),
         (
             "fixtures=[{name: a, box: [1, 1, 1], model: a.sdf}]",
-            "allowed is either a box or a model",
+            "expected either a box or a model",
         ),
         (
             "fixtures=[{name: a, box: [1, 1]}]",
-            "fixtures[0].box: [1, 1]; allowed is a list of 3 numbers",
+            "fixtures[0].box: [1, 1]; expected a list of 3 numbers",
         ),
         (
             "fixtures=[{name: a, box: [1, 1, 1], color: [2, 0, 0, 1]}]",
-            "fixtures[0].color[0]: 2; allowed is a finite number from 0",
+            "fixtures[0].color[0]: 2; expected a finite number from 0",
         ),
-        ("cameras={}", "cameras: {}; allowed is a mapping of at least one entry"),
-        ("robot.home=[]", "robot.home: []; allowed is a list of at least one entry"),
-        ("robot.home=[0, 0, 0]", "allowed are 3, as robot.home has"),
+        ("cameras={}", "cameras: {}; expected a mapping of at least one entry"),
+        ("robot.home=[]", "robot.home: []; expected a list of at least one entry"),
+        ("robot.home=[0, 0, 0]", "expected 3, as robot.home has"),
         (
             "robot.limits.jerk=[1, 2]",
-            "robot.limits.jerk: 2 values; allowed are 6, as robot.home has",
+            "robot.limits.jerk: 2 values; expected 6, as robot.home has",
         ),
         (
             "robot.limits.position=[[1, 2, 3]]",
-            "robot.limits.position[0]: [1, 2, 3]; allowed is a list of 2 numbers",
+            "robot.limits.position[0]: [1, 2, 3]; expected a list of 2 numbers",
         ),
     ],
 )
@@ -213,8 +213,8 @@ def test_a_broken_file_is_refused(text: str, named: str, tmp_path: Path) -> None
         load_config(path)
     assert str(refusal.value).startswith(f"{path}: ")
     assert "\n" not in str(refusal.value)
-    assert named in str(refusal.value).split("allowed are the fields of")[0]
-    assert "allowed" in str(refusal.value)
+    assert named in str(refusal.value).split("expected the fields of")[0]
+    assert "expected" in str(refusal.value)
 
 
 def test_a_setting_names_an_entry_of_a_list() -> None:

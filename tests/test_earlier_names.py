@@ -85,7 +85,7 @@ def test_fidelities_have_earlier_names(earlier: str, name: str, config: Any) -> 
     factories = [make_teleport_backend_factory(f, config) for f in (earlier, name)]
     first, second = (type(f.args[0]) for f in factories)  # type: ignore[attr-defined]
     assert first is second
-    with pytest.raises(InputError, match="allowed are static, static_or_drake, settle"):
+    with pytest.raises(InputError, match="expected static, static_or_drake, settle"):
         make_teleport_backend_factory("quick", config)
 
 

@@ -49,7 +49,7 @@ def test_a_repeated_policy_is_run_once() -> None:
 
 def test_an_unknown_scene_set() -> None:
     with pytest.raises(
-        InputError, match=r"--scenes sg_star_9: is not there; allowed are .*sg_star_25"
+        InputError, match=r"--scenes sg_star_9: does not exist; expected .*sg_star_25"
     ):
         load_evaluation_scenes("sg_star_9", None)
 
@@ -57,7 +57,7 @@ def test_an_unknown_scene_set() -> None:
 def test_invalid_input_is_refused_before_any_episode(tmp_path: Path) -> None:
     scenes = load_evaluation_scenes("sg_14", None)[:1]
     for out in (tmp_path, tmp_path / "none" / "out.json"):
-        with pytest.raises(InputError, match=r"--out .* allowed is a file in a folder that exists"):
+        with pytest.raises(InputError, match=r"--out .* expected a file in an existing folder"):
             run_evaluation(scenes, "random", out=out, max_episodes=0)
     with pytest.raises(InputError, match="was not trained with cereal_box_large"):
         run_evaluation(scenes, "random", "student", max_episodes=0)
@@ -105,6 +105,6 @@ def test_scenes_are_evaluated_in_their_own_cell(tmp_path: Path) -> None:
     mixed = [load_evaluation_scenes(str(tmp_path / str(number)), None)[0] for number in (0, 1)]
     with pytest.raises(
         InputError,
-        match=r"1\.yaml was made in another cell than 0\.yaml; allowed are scenes of one cell",
+        match=r"1\.yaml was made in another cell than 0\.yaml; expected scenes of one cell",
     ):
         common_cell(mixed)

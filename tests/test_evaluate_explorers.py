@@ -83,7 +83,8 @@ def test_episodes_are_run_once(tmp_path: Path) -> None:
     assert script.collect_episodes(path, scenes, "random", 2, **options)[:1] == records
     assert script.to_result(records[0]).hidden == scenes.scenes[0].num_hidden
     with pytest.raises(
-        InputError, match=r"random\.jsonl\.gz: holds records of something else \(agent, seed\)"
+        InputError,
+        match=r"random\.jsonl\.gz: holds records with a different header \(agent, seed\)",
     ):
         script.collect_episodes(path, scenes, "largest-clear", 1, **options | {"seed": 1})
     with pytest.raises(InputError, match="--out: is missing"):

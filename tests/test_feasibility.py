@@ -191,7 +191,7 @@ def test_cells_with_the_same_name_are_refused(scenes: Path, tmp_path: Path) -> N
         arguments += ["--cell", str(path)]
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
-    assert "cell is there twice; allowed are unique file names" in str(result.exception)
+    assert "cell occurs twice; expected unique file names" in str(result.exception)
 
 
 @pytest.fixture(scope="module")
@@ -328,13 +328,13 @@ def test_the_tray_pose_is_the_inverse_of_the_base_pose() -> None:
     [
         (
             "[{name: a, translation: [0, 0], quaternion: [0, 1, 0, 0]}]",
-            r"\[0\]\.translation: \[0, 0\]; allowed",
+            r"\[0\]\.translation: \[0, 0\]; expected",
         ),
         (
             "[{name: a, translation: [0, 0, 0], quaternion: [0, 0, 0, 0]}]",
-            "allowed is w, x, y, z that are not all zero",
+            "expected w, x, y, z that are not all zero",
         ),
-        ("{name: a}", "{'name': 'a'}; allowed is a list"),
+        ("{name: a}", "{'name': 'a'}; expected a list"),
         (
             "[{translation: [0, 0, 0]}]",
             r"\[0\]\.name: is missing; needed are name, translation, quaternion",
@@ -353,12 +353,12 @@ def test_invalid_targets(text: str, message: str, tmp_path: Path) -> None:
     [
         (
             "{suction: {cup_diameter: 1.0}}",
-            "gripper.cup_diameter: 1.0; allowed is a finite number from 0.005 to 0.1",
+            "gripper.cup_diameter: 1.0; expected a finite number from 0.005 to 0.1",
         ),
         ("{base: [0, 0]}", "base: is unknown"),
         (
             "{base: [0, 0, 0, north]}",
-            "robot.base.rpy_deg\\[2\\]: 'north'; allowed is a finite number",
+            "robot.base.rpy_deg\\[2\\]: 'north'; expected a finite number",
         ),
         ("{reach: 3}", "reach: is unknown"),
     ],

@@ -61,7 +61,7 @@ def test_a_training_set_holds_no_graph_that_is_unstable_in_drake(
 
 @pytest.mark.parametrize(
     ("with_poses", "message"),
-    [(False, r"something else \(weights\)"), (True, "results of other options")],
+    [(False, r"different header \(weights\)"), (True, "results of other options")],
 )
 def test_an_interrupted_run_is_not_resumed_with_other_weights(
     with_poses: bool, message: str, tmp_path: Path

@@ -264,7 +264,7 @@ def test_a_rule_that_does_not_match_or_exist_is_refused() -> None:
 
 @pytest.mark.parametrize("nodes", [-1, 0, 2])
 def test_a_budget_too_small_for_an_object_is_refused(nodes: int) -> None:
-    with pytest.raises(InputError, match=f"nodes: {nodes}; allowed is 3"):
+    with pytest.raises(InputError, match=f"nodes: {nodes}; expected 3"):
         NodeBudget(nodes)
 
 
@@ -475,8 +475,8 @@ def test_feasible_is_exactly_what_can_be_completed(nodes: int, exact: bool) -> N
     [
         ({0: "sugar_box"}, {}, "exactly one tray"),
         ({0: TRAY, 1: TRAY}, {(0, 1): PRIMITIVE}, "exactly one tray"),
-        ({0: TRAY, 1: END}, {}, "leads to every node"),
-        ({0: TRAY, 1: END}, {(0, 2): PRIMITIVE}, "0 -> 2 joins a node that is not there"),
+        ({0: TRAY, 1: END}, {}, "is reachable from the tray"),
+        ({0: TRAY, 1: END}, {(0, 2): PRIMITIVE}, "0 -> 2 refers to a node that does not exist"),
         (
             {0: TRAY, 1: "sugar_box", 2: END},
             {(0, 1): PRIMITIVE, (1, 2): PRIMITIVE, (2, 1): PRIMITIVE},

@@ -135,7 +135,7 @@ def test_recorded_episodes_are_not_repeated(
     assert [record["number"] for record in records] == numbers == [first, first + 1, first + 2]
     with pytest.raises(
         InputError,
-        match=r"row\.jsonl\.gz: holds records of something else \(row, scenario, weights\)",
+        match=r"row\.jsonl\.gz: holds records with a different header \(row, scenario, weights\)",
     ):
         script.collect_episodes(replace(evaluation, agent="student-dagger"), 3, 1, path)
 

@@ -253,7 +253,7 @@ def test_scenes_with_too_many_objects_are_rejected() -> None:
         resting("large_marker", xy=(0.01 * (k % 8), 0.1 * (k // 8)), name=f"m{k}")
         for k in range(65)
     ]
-    with pytest.raises(InputError, match="objects: 65; allowed are 64 at most"):
+    with pytest.raises(InputError, match="objects: 65; expected at most 64"):
         SEARCH.solve(scene_of(*markers))
 
 

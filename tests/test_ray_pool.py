@@ -305,6 +305,6 @@ def test_an_absent_cluster_is_reported_quickly(tmp_path: Path) -> None:
     result = run(
         "evaluate", tmp_path, "--out", tmp_path / "out.json", "--ray", "127.0.0.1:9", code=2
     )
-    assert "--ray 127.0.0.1:9: no cluster to work with" in result.stderr
-    assert "allowed is auto, " in result.stderr
+    assert "--ray 127.0.0.1:9: cannot connect to a cluster" in result.stderr
+    assert "expected auto, " in result.stderr
     assert time.monotonic() - start < 60

@@ -349,5 +349,5 @@ def test_occluder_sets_take_64_objects_at_most() -> None:
     cover = RAYS.occluder_sets(scene_of(*cards[:64]), "0")
     assert max(cover, key=lambda before: cover[before]) == frozenset(str(k) for k in range(1, 64))
     assert math.isclose(sum(cover.values()), int((labels(scene_of(cards[0])) == 0).sum()))
-    with pytest.raises(ValueError, match="65 objects; allowed are 64 at most"):
+    with pytest.raises(ValueError, match="65 objects; expected at most 64"):
         RAYS.occluder_sets(scene_of(*cards), "0")

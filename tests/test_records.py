@@ -31,7 +31,7 @@ def test_records_are_made_once(name: str, tmp_path: Path) -> None:
     first = resume_jsonl(path, {"seed": 1}, maker)
     assert next(first)["seed"] == 1
     assert [next(first), next(first)] == [0, 1]
-    with pytest.raises(InputError, match="another run is adding to it"):
+    with pytest.raises(InputError, match="another process is appending to it"):
         next(resume_jsonl(path, {"seed": 1}, maker))
     assert read_jsonl(path)[1:] == [0, 1]
     first.close()
@@ -42,7 +42,9 @@ def test_records_are_made_once(name: str, tmp_path: Path) -> None:
     assert list(resume_jsonl(path, {"seed": 1}, maker))[1:] == [0, 1, 2]
     assert path.read_bytes() == content
     assert maker.made == [0, 1, 2]
-    with pytest.raises(InputError, match=rf"{name}: holds records of something else \(seed\)"):
+    with pytest.raises(
+        InputError, match=rf"{name}: holds records with a different header \(seed\)"
+    ):
         next(resume_jsonl(path, {"seed": 2}, maker))
     assert path.read_bytes() == content
 

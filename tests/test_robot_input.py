@@ -38,31 +38,31 @@ def message(spec: RobotSpec) -> str:
     [
         (
             {"model": "ur6.sdf"},
-            f"robot.model: 'ur6.sdf'; allowed is an SDF or URDF file, or {SHIPPED}",
+            f"robot.model: 'ur6.sdf'; expected an SDF or URDF file, or {SHIPPED}",
         ),
-        ({"base_link": "foot"}, "robot.base_link: 'foot'; allowed in ur5e.sdf is base"),
+        ({"base_link": "foot"}, "robot.base_link: 'foot'; expected in ur5e.sdf: base"),
         (
             {"tool_frame": "hand"},
-            "robot.tool_frame: 'hand'; allowed in ur5e.sdf are base, shoulder, upper_arm, "
+            "robot.tool_frame: 'hand'; expected in ur5e.sdf: base, shoulder, upper_arm, "
             "forearm, wrist_1, wrist_2, wrist_3, flange",
         ),
-        ({"tool_frame": "base"}, "robot.tool_frame: 'base'; allowed is one that joints move"),
-        ({"home": (0.0,) * 5}, f"robot.home: 5 values; allowed is 6 values, for {JOINTS}"),
+        ({"tool_frame": "base"}, "robot.tool_frame: 'base'; expected a frame that joints move"),
+        ({"home": (0.0,) * 5}, f"robot.home: 5 values; expected 6 values, for {JOINTS}"),
         (
             {"home": (0.0, 0.0, 7.0, 0.0, 0.0, 0.0)},
-            "robot.home: 7 for joint 'elbow_joint'; allowed is from -6.28319 to 6.28319",
+            "robot.home: 7 for joint 'elbow_joint'; expected from -6.28319 to 6.28319",
         ),
         (
             {"limits_velocity": (1.0,) * 7},
-            f"robot.limits.velocity: 7 values; allowed is 6 values, for {JOINTS}",
+            f"robot.limits.velocity: 7 values; expected 6 values, for {JOINTS}",
         ),
         (
             {"limits_jerk": (1.0,)},
-            f"robot.limits.jerk: 1 values; allowed is 6 values, for {JOINTS}",
+            f"robot.limits.jerk: 1 values; expected 6 values, for {JOINTS}",
         ),
         (
             {"limits_position": ((1.0, -1.0),) * 6},
-            f"robot.limits.position: 1, -1 for joint 'shoulder_pan_joint'; allowed is {ORDER}",
+            f"robot.limits.position: 1, -1 for joint 'shoulder_pan_joint'; expected {ORDER}",
         ),
     ],
 )
@@ -75,7 +75,7 @@ def test_a_specification_that_does_not_match_its_model_is_refused(
 def test_a_frame_below_the_last_moving_joint_only(tmp_path: Path) -> None:
     """If the tool frame is at the wrist, the last joint does not move it."""
     spec = changed(robot("ur5e").spec, tool_frame="wrist_2")
-    allowed = "does not move the tool frame; allowed is an arm alone"
+    allowed = "does not move the tool frame; expected a model of one arm"
     assert message(spec).endswith(f"ur5e.sdf: joint 'wrist_3_joint' {allowed}")
 
 
@@ -94,7 +94,7 @@ def test_a_joint_without_a_limit_is_refused(tmp_path: Path, taken_out: str, kind
         text = text.replace('elbow_joint" type="revolute"', 'elbow_joint" type="continuous"')
     spec = ros_spec(tmp_path, text)
     assert message(spec) == (
-        f"robot.limits.{kind}: is missing for joint 'elbow_joint'; allowed is {PLACES}"
+        f"robot.limits.{kind}: is missing for joint 'elbow_joint'; expected {PLACES}"
     )
     given: Any = ((-3.0, 3.0),) * 6 if kind == "position" else (2.0,) * 6
     arm = load_robot(changed(spec, **{f"limits_{kind}": given}))
@@ -105,11 +105,11 @@ def test_a_closed_form_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     """A seventh joint, or an elbow axis that is not parallel to the shoulder axis."""
     spec = changed(robot("iiwa14").spec, ik="ur")
     expected = "robot.ik: 'ur' (iiwa14.sdf is no arm of the UR family: 7 joints)"
-    assert message(spec) == f"{expected}; allowed is 'numerical'"
+    assert message(spec) == f"{expected}; expected 'numerical'"
     skew = ros_spec(tmp_path, ros_urdf(offset=0.01))
     text = message(skew)
     assert text.startswith("robot.ik: 'ur' (ur5e.urdf is no arm of the UR family: off by 0.0")
-    assert text.endswith("; allowed is 'numerical'")
+    assert text.endswith("; expected 'numerical'")
     assert load_robot(changed(skew, ik="numerical")).ur_fit is None
 
 
@@ -118,7 +118,7 @@ def test_a_missing_mesh_is_refused(tmp_path: Path, kind: str) -> None:
     mesh = f'<{kind}><geometry><mesh filename="package://arms/tool.obj"/></geometry></{kind}>'
     text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
     spec = ros_spec(tmp_path, text)
-    expected = f"{spec.model}: mesh: 'package://arms/tool.obj' is missing; allowed is a file"
+    expected = f"{spec.model}: mesh: 'package://arms/tool.obj' is missing; expected a file"
     assert message(spec) == expected
     (tmp_path / "package.xml").write_text("<package><name>arms</name></package>")
     (tmp_path / "tool.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
@@ -129,7 +129,7 @@ def test_other_model_files_are_refused(tmp_path: Path) -> None:
     spec = ros_spec(tmp_path, "<robot")
     text = message(spec)
     assert text.startswith(f"{spec.model}: is not XML (")
-    assert text.endswith("; allowed is an SDF or URDF")
+    assert text.endswith("; expected an SDF or URDF")
     spec = ros_spec(tmp_path, '<robot name="empty"></robot>')
     assert message(changed(spec, payload=3.0)).startswith(("robot.base_link:", f"{spec.model}:"))
 
@@ -139,7 +139,7 @@ def test_an_invalid_stl_is_refused(tmp_path: Path) -> None:
     text = ros_urdf().replace('<link name="tool0">', f'<link name="tool0">{mesh}')
     spec = ros_spec(tmp_path, text)
     (tmp_path / "tool.stl").write_bytes(b"solid nothing")
-    allowed = "is no STL mesh; allowed are OBJ, glTF, VTK and STL"
+    allowed = "is not an STL mesh; expected OBJ, glTF, VTK or STL"
     assert message(spec) == f"{tmp_path / 'tool.stl'}: {allowed}"
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     (tmp_path / "tool.stl").write_text(
@@ -151,7 +151,8 @@ def test_an_invalid_stl_is_refused(tmp_path: Path) -> None:
 def test_a_gripper_in_the_file_of_the_arm_is_refused() -> None:
     spec = bullet_iiwa()
     assert message(changed(spec, tool_frame="lbr_iiwa_link_5")).endswith(
-        "model.urdf: joint 'lbr_iiwa_joint_6' does not move the tool frame; allowed is an arm alone"
+        "model.urdf: joint 'lbr_iiwa_joint_6' does not move the tool frame; expected a model of"
+        " one arm"
     )
 
 
@@ -171,12 +172,12 @@ def test_a_gripper_in_the_file_of_the_arm_is_refused() -> None:
         (
             "</robot>",
             '<link name="loose"/></robot>',
-            "link 'loose' has no parent joint; allowed is an arm alone",
+            "link 'loose' has no parent joint; expected a model of one arm",
         ),
         (
             "<limit",
             '<mimic joint="elbow_joint"/><limit',
-            "joint 'shoulder_pan_joint' mimics another; allowed are joints",
+            "joint 'shoulder_pan_joint' mimics another; expected joints",
         ),
     ],
 )
@@ -192,5 +193,5 @@ def test_an_arm_without_collision_geometry_is_refused(tmp_path: Path) -> None:
     spec = ros_spec(tmp_path, ros_urdf())
     with pytest.raises(InputError) as raised:
         validate_models(DEFAULT_CELL.model_copy(update={"robot": spec}))
-    found = f"robot.model: {spec.model!r}: no link has a shape for collisions"
-    assert str(raised.value) == f"{found}; allowed is one that can hit something"
+    found = f"robot.model: {spec.model!r}: no link has collision geometry"
+    assert str(raised.value) == f"{found}; expected a model with collision geometry"

@@ -77,7 +77,7 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set\.json: sha256"):
         load_scene_dataset(path, CATALOG)
     path.write_text(whole.replace('"version": 1', '"version": 7'))
-    with pytest.raises(InputError, match=r"set\.json: version: 7; allowed is 1"):
+    with pytest.raises(InputError, match=r"set\.json: version: 7; expected 1"):
         load_scene_dataset(path, CATALOG)
     path.write_text(whole[:-20])
     with pytest.raises(InputError, match=r"set\.json: is not a scene dataset"):

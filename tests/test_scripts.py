@@ -43,5 +43,5 @@ def test_a_misuse_is_reported_in_one_line() -> None:
     command = [sys.executable, "-m", "training.evaluate_explorers", "--only", "none"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 2
-    assert result.stderr.startswith("error --only none; allowed is")
+    assert result.stderr.startswith("error --only none; expected")
     assert result.stderr.count("\n") == 1

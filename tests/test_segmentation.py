@@ -174,7 +174,7 @@ def test_a_checkpoint_of_another_kind_is_rejected() -> None:
     student = resource_path("training/checkpoints/student.safetensors")
     with pytest.raises(
         InputError,
-        match=r"student\.safetensors: is a checkpoint of a student; allowed is one of a detector",
+        match=r"student\.safetensors: is a checkpoint of a student; expected one of a detector",
     ):
         SegmentationNetwork.load(student)
 

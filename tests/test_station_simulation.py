@@ -132,7 +132,7 @@ def test_an_arm_with_seven_joints_executes_a_plan(tmp_path: Path) -> None:
     assert frames[0].arm.q == pytest.approx(cell.robot.home, abs=0.01)
     with h5py.File(path, "a") as file:
         file.attrs["cell"] = config_yaml(CELL)
-    with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
+    with pytest.raises(InputError, match=r"move_0001\.q; expected a dataset of shape \('n', 6\)"):
         read_trajectories(path, load_catalog())
 
 
@@ -187,7 +187,7 @@ def test_fixtures_of_one_file_and_of_any_name(tmp_path: Path) -> None:
     joint = f'<link name="world"/><joint name="weld" type="fixed">{parent}</joint>'
     welded.write_text(BOARD.format(joint))
     with pytest.raises(
-        InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; allowed"
+        InputError, match=r"fixtures\.shelf\.model: .* is fixed to the world; expected"
     ):
         CollisionModel(with_board(welded, 0.3), [])
 
@@ -196,8 +196,8 @@ def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "door.urdf"
     path.write_text(BOARD.format(FLAP.format("revolute")))
     with pytest.raises(
-        InputError, match=r"fixtures\.shelf\.model: .* has parts that move; allowed"
+        InputError, match=r"fixtures\.shelf\.model: .* has movable joints; expected"
     ):
         StationSimulation(with_board(path, 0.3), SCENE)
-    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .*allowed is an SDF or URDF"):
+    with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .*expected an SDF or URDF"):
         StationSimulation(with_board(tmp_path / "none.urdf", 0.3), SCENE)

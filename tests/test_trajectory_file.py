@@ -90,16 +90,16 @@ def test_other_files_are_refused(file: Path, tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(InputError, match="cannot be read as HDF5"):
         read_trajectories(tmp_path / "text.h5", catalog)
-    with pytest.raises(InputError, match="allowed is a trajectory file") as refusal:
+    with pytest.raises(InputError, match="expected a trajectory file") as refusal:
         read_trajectories(tmp_path, catalog)
     assert "\n" not in str(refusal.value)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["x"] = 1
-    with pytest.raises(InputError, match="allowed is a trajectory file of version 1"):
+    with pytest.raises(InputError, match="expected a trajectory file of version 1"):
         read_trajectories(tmp_path / "other.h5", catalog)
     with h5py.File(file, "a") as stored:
         del stored["move_0001/q"]
-    with pytest.raises(InputError, match=r"move_0001\.q; allowed is a dataset of shape \('n', 6\)"):
+    with pytest.raises(InputError, match=r"move_0001\.q; expected a dataset of shape \('n', 6\)"):
         read_trajectories(file, catalog)
 
 

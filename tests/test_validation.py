@@ -78,58 +78,64 @@ class Room:
 
 FIELDS = "tool, lamps, shelf, name, lit, seats, level, share, height, door, steps"
 REFUSED = [
-    ("lit: 1", "lit: 1; allowed is true or false"),
-    ("lit: 'yes'", "lit: 'yes'; allowed is true or false"),
-    ("name: 3", "name: 3; allowed is a text"),
-    ("name: ''", "name: ''; allowed is a text"),
-    ("seats: 2.0", "seats: 2.0; allowed is a whole number from 1 to 8"),
-    ("seats: true", "seats: True; allowed is a whole number from 1 to 8"),
-    ("seats: 0", "seats: 0; allowed is a whole number from 1 to 8"),
-    ("level: 0.5", "level: 0.5; allowed is a whole number"),
-    ("share: 2", "share: 2; allowed is a finite number from 0 to 1"),
-    ("share: true", "share: True; allowed is a finite number from 0 to 1"),
-    ("share: '0.5'", "share: '0.5'; allowed is a finite number from 0 to 1"),
-    ("share: null", "share: None; allowed is a finite number from 0 to 1"),
-    ("share: .nan", "share: nan; allowed is a finite number from 0 to 1"),
-    ("height: .inf", "height: inf; allowed is a finite number"),
-    ("height: 1" + "0" * 400, "allowed is a finite number"),
-    ("height: 0x" + "f" * 5000, "height: a number; allowed is a finite number"),
+    ("lit: 1", "lit: 1; expected true or false"),
+    ("lit: 'yes'", "lit: 'yes'; expected true or false"),
+    ("name: 3", "name: 3; expected a text"),
+    ("name: ''", "name: ''; expected a text"),
+    ("seats: 2.0", "seats: 2.0; expected a whole number from 1 to 8"),
+    ("seats: true", "seats: True; expected a whole number from 1 to 8"),
+    ("seats: 0", "seats: 0; expected a whole number from 1 to 8"),
+    ("level: 0.5", "level: 0.5; expected a whole number"),
+    ("share: 2", "share: 2; expected a finite number from 0 to 1"),
+    ("share: true", "share: True; expected a finite number from 0 to 1"),
+    ("share: '0.5'", "share: '0.5'; expected a finite number from 0 to 1"),
+    ("share: null", "share: None; expected a finite number from 0 to 1"),
+    ("share: .nan", "share: nan; expected a finite number from 0 to 1"),
+    ("height: .inf", "height: inf; expected a finite number"),
+    ("height: 1" + "0" * 400, "expected a finite number"),
+    ("height: 0x" + "f" * 5000, "height: a number; expected a finite number"),
     (
         "lamps: {main: {power: -1}}",
-        "lamps.main.power: -1; allowed is a finite number from 0 to inf",
+        "lamps.main.power: -1; expected a finite number from 0 to inf",
     ),
-    ("door: up", "door: 'up'; allowed is one of left, right"),
-    ("door: [left]", "door: ['left']; allowed is one of left, right"),
-    ("steps: 1", "steps: 1; allowed is a list"),
-    ("steps: [1, -2]", "steps[1]: -2; allowed is a finite number from 1e-12 to inf"),
-    ("door_: up", f"door_: is unknown; allowed are {FIELDS}"),
-    ("3: up", f"[3]: is unknown; allowed are {FIELDS}"),
-    ('"a\\nb": up', f"'a\\nb': is unknown; allowed are {FIELDS}"),
-    ("tool: cup", "tool: 'cup'; allowed is a mapping"),
-    ("tool: {kind: hook}", "tool.kind: 'hook'; allowed is one of cup, jaws"),
-    ("tool: {kind: [hook]}", "tool.kind: ['hook']; allowed is one of cup, jaws"),
+    ("door: up", "door: 'up'; expected one of left, right"),
+    ("door: [left]", "door: ['left']; expected one of left, right"),
+    ("steps: 1", "steps: 1; expected a list"),
+    ("steps: [1, -2]", "steps[1]: -2; expected a finite number from 1e-12 to inf"),
+    ("door_: up", f"door_: is unknown; expected {FIELDS}"),
+    ("3: up", f"[3]: is unknown; expected {FIELDS}"),
+    ('"a\\nb": up', f"'a\\nb': is unknown; expected {FIELDS}"),
+    ("tool: cup", "tool: 'cup'; expected a mapping"),
+    ("tool: {kind: hook}", "tool.kind: 'hook'; expected one of cup, jaws"),
+    ("tool: {kind: [hook]}", "tool.kind: ['hook']; expected one of cup, jaws"),
     ("tool: {kind: jaws}", "tool.width: is missing; needed are width"),
-    ("tool: {kind: jaws, width: 1}", "tool.width: 1; allowed is a finite number from 0.01 to 0.2"),
-    ("tool: {radius: 1, color: 2}", "tool.color: is unknown; allowed are kind, radius, rims"),
-    ("tool: {rims: [[1, 2, 3], [1, 2]]}", "tool.rims[1]: [1, 2]; allowed is a list of 3 numbers"),
-    ("tool: {rims: [[1, 2, 3, 4]]}", "tool.rims[0]: [1, 2, 3, 4]; allowed is a list of 3 numbers"),
-    ("tool: {rims: [up]}", "tool.rims[0]: 'up'; allowed is a list of 3 numbers"),
-    ("tool: {rims: [[1, 2, .nan]]}", "tool.rims[0][2]: nan; allowed is a finite number"),
-    ("lamps: [1]", "lamps: [1]; allowed is a mapping"),
-    ("lamps: {main: 3}", "lamps.main: 3; allowed is a mapping with pose, power"),
-    ("lamps: {1: {}}", "lamps[1]: 1; allowed is a text"),
+    ("tool: {kind: jaws, width: 1}", "tool.width: 1; expected a finite number from 0.01 to 0.2"),
+    ("tool: {radius: 1, color: 2}", "tool.color: is unknown; expected kind, radius, rims"),
+    ("tool: {rims: [[1, 2, 3], [1, 2]]}", "tool.rims[1]: [1, 2]; expected a list of 3 numbers"),
+    ("tool: {rims: [[1, 2, 3, 4]]}", "tool.rims[0]: [1, 2, 3, 4]; expected a list of 3 numbers"),
+    ("tool: {rims: [up]}", "tool.rims[0]: 'up'; expected a list of 3 numbers"),
+    ("tool: {rims: [[1, 2, .nan]]}", "tool.rims[0][2]: nan; expected a finite number"),
+    ("lamps: [1]", "lamps: [1]; expected a mapping"),
+    ("lamps: {main: 3}", "lamps.main: 3; expected a mapping with pose, power"),
+    ("lamps: {1: {}}", "lamps[1]: 1; expected a text"),
     (
         "lamps: {main: {pose: {x: 1}}}",
-        "lamps.main.pose.x: is unknown; allowed are translation, rpy_deg",
+        "lamps.main.pose.x: is unknown; expected translation, rpy_deg",
     ),
-    ("shelf: [{}, {power: on}]", "shelf[1].power: True; allowed is a finite number from 0 to inf"),
-    ("shelf: [{}, {size: 1}]", "shelf[1].size: is unknown; allowed are pose, power"),
-    ("- 1", f"[1]; allowed is a mapping with {FIELDS}"),
-    ("room", f"'room'; allowed is a mapping with {FIELDS}"),
+    ("shelf: [{}, {power: on}]", "shelf[1].power: True; expected a finite number from 0 to inf"),
+    ("shelf: [{}, {size: 1}]", "shelf[1].size: is unknown; expected pose, power"),
+    ("- 1", f"[1]; expected a mapping with {FIELDS}"),
+    ("room", f"'room'; expected a mapping with {FIELDS}"),
     ("lit: [true", "is not YAML (line 2: did not find expected ',' or ']')"),
-    ("lit: true\nname: a\nlit: false", "is not YAML (line 3: 'lit' is there twice in a mapping)"),
-    ("lamps:\n  a: {}\n  b: {power: 1, power: 2}", "(line 3: 'power' is there twice in a mapping)"),
-    ("1e3: a\n1000.0: b", "(line 2: 1000.0 is there twice in a mapping)"),
+    (
+        "lit: true\nname: a\nlit: false",
+        "is not YAML (line 3: 'lit' is a duplicate key in a mapping)",
+    ),
+    (
+        "lamps:\n  a: {}\n  b: {power: 1, power: 2}",
+        "(line 3: 'power' is a duplicate key in a mapping)",
+    ),
+    ("1e3: a\n1000.0: b", "(line 2: 1000.0 is a duplicate key in a mapping)"),
     ("lamps: &a [*a]", "is not YAML (line 1: found unconstructable recursive node)"),
     ("lamps: &a {b: *a}", "is not YAML (line 1: found unconstructable recursive node)"),
     ("? [a]\n: b", "is not YAML (line 1: found unhashable key)"),
@@ -150,7 +156,7 @@ def test_an_error_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     line = str(refused.value)
     assert line.startswith(f"{path}: ")
     assert message in line
-    assert "allowed" in line or "needed" in line
+    assert "expected" in line or "needed" in line
     assert "\n" not in line
     assert len(line) <= len(f"{path}: ") + 300
 
@@ -181,7 +187,7 @@ def test_a_long_value_is_truncated(given: Any) -> None:
 
 def test_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"none\.yaml: cannot be read \(No such file.*allowed is a room"
+        InputError, match=r"none\.yaml: cannot be read \(No such file.*expected a room"
     ):
         read_yaml(tmp_path / "none.yaml", "a room")
     (tmp_path / "binary.yaml").write_bytes(b"\x89PNG\xff")
@@ -192,18 +198,18 @@ def test_unreadable_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("lit", "--set lit: allowed is FIELD=VALUE"),
-        ("=3", "--set =3: allowed is FIELD=VALUE"),
+        ("lit", "--set lit: expected FIELD=VALUE"),
+        ("=3", "--set =3: expected FIELD=VALUE"),
         ("steps=[1", "--set steps=[1: is not YAML (line 2: did not find"),
-        ("steps={a: 1, a: 2}", "is not YAML (line 1: 'a' is there twice in a mapping)"),
-        ("steps.1=-1", "--set steps.1=-1: steps[1]: -1; allowed is"),
-        ("steps.2=1", "steps: {'2': 1}; allowed is a list"),
+        ("steps={a: 1, a: 2}", "is not YAML (line 1: 'a' is a duplicate key in a mapping)"),
+        ("steps.1=-1", "--set steps.1=-1: steps[1]: -1; expected"),
+        ("steps.2=1", "steps: {'2': 1}; expected a list"),
         (
             "lamps.main.pose.yaw=north",
-            "lamps.main.pose.rpy_deg[2]: 'north'; allowed is a finite number",
+            "lamps.main.pose.rpy_deg[2]: 'north'; expected a finite number",
         ),
-        ("lamps.main.yaw=3", "lamps.main.yaw: is unknown; allowed are pose, power"),
-        ("door.left=1", "door: {'left': 1}; allowed is one of left, right"),
+        ("lamps.main.yaw=3", "lamps.main.yaw: is unknown; expected pose, power"),
+        ("door.left=1", "door: {'left': 1}; expected one of left, right"),
     ],
 )
 def test_an_invalid_setting(setting: str, message: str) -> None:
@@ -280,7 +286,7 @@ def test_merge_keys_may_override() -> None:
     text = "a: &a {x: 1, y: 2}\nb: &b {<<: *a, x: 3}\nc: {<<: [*b, *a], y: 4}\n"
     assert parse_yaml(text, "")["b"] == {"x": 3, "y": 2}
     assert parse_yaml(text, "")["c"] == {"x": 3, "y": 4}
-    with pytest.raises(InputError, match="line 2: 'x' is there twice"):
+    with pytest.raises(InputError, match="line 2: 'x' is a duplicate key"):
         parse_yaml("a: &a {x: 1}\nb: {x: 1, <<: *a, x: 2}", "")
 
 

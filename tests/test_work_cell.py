@@ -119,7 +119,7 @@ def test_a_camera_may_not_have_the_name_of_another_part() -> None:
     camera = "{pose: {translation: [0, 0, 1.6], rpy_deg: [180, 0, 0]}}"
     with pytest.raises(
         InputError,
-        match=r"cameras\.pedestal: a camera's name; allowed are names that differ from tray",
+        match=r"cameras\.pedestal: a camera's name; expected names that differ from tray",
     ):
         cell_with(f"cameras={{pedestal: {camera}, side: {camera}}}")
     assert cell_with(f"cameras={{camera: {camera}}}").camera == cell_with().camera

@@ -369,7 +369,7 @@ def main(
     evaluations = [e for e in EVALUATIONS if only is None or only in e.name]
     if not evaluations:
         names = ", ".join(e.name for e in EVALUATIONS)
-        raise InputError(f"--only {only}; allowed is a part of one of {names}")
+        raise InputError(f"--only {only}; expected a part of one of {names}")
     folder.mkdir(parents=True, exist_ok=True)
     results = ResultsFile(out, {}, ("name",))
     results.read()

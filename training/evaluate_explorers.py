@@ -251,10 +251,10 @@ def main(
             " give a file for others"
         )
     if fidelity not in FIDELITIES:
-        raise InputError(f"--fidelity {fidelity}; allowed are {', '.join(FIDELITIES)}")
+        raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
     names = [name for name in TABLES if only is None or only in name]
     if not names:
-        raise InputError(f"--only {only}; allowed is a part of one of {', '.join(TABLES)}")
+        raise InputError(f"--only {only}; expected a part of one of {', '.join(TABLES)}")
     folder.mkdir(parents=True, exist_ok=True)
     catalog = load_catalog()
     header = {"seed": seed, "fidelity": fidelity, "config": to_plain(ClutterConfig())}

@@ -214,7 +214,7 @@ def main(
     if len(scenes) < count:
         raise InputError(
             f"--count {count}: only {len(scenes)} of {max_generated} scenes are stable, have hidden"
-            " objects, and are no duplicates; allowed is what agent and nodes can generate"
+            " objects, and are no duplicates; expected what agent and nodes can generate"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     save_scene_dataset(out, metadata, scenes[:count], job.config.cell)

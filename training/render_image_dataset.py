@@ -337,7 +337,7 @@ def check_job(out: Path, job_fields: dict[str, Any]) -> None:
     earlier = {_EARLIER_JOB_FIELDS.get(key, key): value for key, value in earlier.items()}
     if earlier != job_fields:
         raise InputError(
-            f"--out {out}: holds images of another job; allowed is a folder that is new or of the"
+            f"--out {out}: holds images of another job; expected a folder that is new or of the"
             " same options"
         )
 

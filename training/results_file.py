@@ -67,7 +67,7 @@ class ResultsFile:
             return []
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"--out {self.path}: is no results file ({error}); allowed is one, or a new file"
+                f"--out {self.path}: is no results file ({error}); expected one, or a new file"
             ) from error
         if differing:
             raise InputError(

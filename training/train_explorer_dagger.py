@@ -58,7 +58,7 @@ def main(
     teacher, numbers = load_explorer(load_checkpoint(path), path, TEACHER)
     if numbers != environment.node_kind_ids:
         raise InputError(
-            f"teacher: {path} knows {', '.join(numbers)}; allowed is a teacher of the object"
+            f"teacher: {path} knows {', '.join(numbers)}; expected a teacher of the object"
             f" classes in {training.scenes}"
         )
     learner = BehaviorCloningLearner(

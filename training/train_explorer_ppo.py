@@ -67,7 +67,7 @@ def main(
             training.learning.width,
         ):
             raise InputError(
-                f"warm_start: {path}: has other object classes or another width; allowed is a"
+                f"warm_start: {path}: has other object classes or another width; expected a"
                 " checkpoint with the same"
             )
         learner.network.load_state_dict(network.state_dict())

@@ -159,7 +159,7 @@ def make_policy_factory(
         return lambda backend: OracleExplorer(backend, search)
     if name not in PRETRAINED_EXPLORERS and not name.endswith(".safetensors"):
         allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, ORACLE])
-        raise InputError(f"--agent {name}; allowed are {allowed}, or a .safetensors file")
+        raise InputError(f"--agent {name}; expected {allowed}, or a .safetensors file")
     path = checkpoint_path(name, PRETRAINED_EXPLORERS)
     # Imported late: needs PyTorch, which is not required for the other agents.
     from drake_clutter.agents.learned_explorer import LearnedExplorerFactory

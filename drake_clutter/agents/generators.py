@@ -146,7 +146,7 @@ def make_generation_agent(
     if temperature is not None and not (is_learned and temperature > 0):
         raise InputError(
             f"--temperature {temperature:g} for {name}; "
-            "allowed is a positive one, for a trained agent"
+            "expected a positive one, for a trained agent"
         )
     if name == "random":
         return RandomGenerator()
@@ -154,7 +154,7 @@ def make_generation_agent(
         return HillClimber(config)
     if not is_learned:
         raise InputError(
-            f"--agent {name}; allowed are random, hill-climbing, "
+            f"--agent {name}; expected random, hill-climbing, "
             f"{', '.join(PRETRAINED_GENERATORS)}, or a .safetensors file"
         )
     path = checkpoint_path(name, PRETRAINED_GENERATORS)

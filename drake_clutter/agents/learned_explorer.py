@@ -67,13 +67,13 @@ def load_explorer(
     if metadata.get("kind") not in allowed:
         raise InputError(
             f"{path}: is a checkpoint of a {metadata.get('kind')}; "
-            f"allowed is one of a {' or '.join(allowed)}"
+            f"expected one of a {' or '.join(allowed)}"
         )
     network_metadata = metadata.get("network", {})
     if "node_kinds" not in network_metadata or "width" not in network_metadata:
         raise InputError(
             f"{path.with_suffix('.json')}: network: lacks node_kinds or width; "
-            "allowed is the file as it was written"
+            "expected an unmodified file"
         )
     node_kind_ids = {
         name: number for number, name in enumerate(network_metadata["node_kinds"], start=1)
@@ -83,7 +83,7 @@ def load_explorer(
         network_metadata = {**network_metadata, key: names}
     if network_metadata != explorer_metadata(node_kind_ids, network_metadata["width"]):
         raise InputError(
-            f"{path}: was trained on other features; allowed is a checkpoint of this version"
+            f"{path}: was trained on other features; expected a checkpoint of this version"
         )
     network = ExplorerNetwork(len(node_kind_ids), network_metadata["width"])
     try:
@@ -91,7 +91,7 @@ def load_explorer(
     except RuntimeError as error:
         raise InputError(
             f"{path}: its weights do not fit {path.with_suffix('.json')}; "
-            "allowed are the files of one training"
+            "expected the files of one training"
         ) from error
     return network.eval(), node_kind_ids
 

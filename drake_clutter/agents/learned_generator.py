@@ -113,7 +113,7 @@ class LearnedGenerator:
         if metadata.get("kind") != "generator":
             raise InputError(
                 f"{path}: is a checkpoint of another kind; "
-                "allowed is one of training/train_generator.py"
+                "expected one of training/train_generator.py"
             )
         self._temperature = metadata["temperature"] if temperature is None else temperature
         task = validate(GenerationTaskConfig, metadata["config"]["task"], str(path))

@@ -299,7 +299,7 @@ class SoftQLearner:
         min_buffer_size = config.num_envs * (config.sequence_length + 1)
         if config.buffer_size < min_buffer_size:
             raise InputError(
-                f"learning.buffer_size: {config.buffer_size}; allowed is {min_buffer_size} "
+                f"learning.buffer_size: {config.buffer_size}; expected {min_buffer_size} "
                 "(num_envs * (sequence_length + 1)) or more"
             )
         self.config = config
@@ -340,7 +340,7 @@ class SoftQLearner:
         """
         if network.q_head.in_features != self.network.q_head.in_features:
             raise InputError(
-                f"learning.width: {self.config.width}; allowed is that of the warm start"
+                f"learning.width: {self.config.width}; expected that of the warm start"
             )
         self.network.load_state_dict(network.state_dict())
         self._target.load_state_dict(network.state_dict())

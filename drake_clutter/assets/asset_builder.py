@@ -253,7 +253,7 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
         if foreign_files:
             raise InputError(
                 f"{target}: holds {sorted(foreign_files)[0]}; "
-                "allowed is a folder that only `assets build` fills"
+                "expected a folder that only `assets build` fills"
             )
     files = _make_asset_files(object_class)
     staging = folder / f".{object_class.name}.{secrets.token_hex(4)}"
@@ -290,8 +290,7 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
     unknown = sorted(set(names or ()) - set(own_classes))
     if unknown:
         raise InputError(
-            f"{catalog_path(folder)}: classes: no {unknown[0]}; "
-            f"allowed are {', '.join(own_classes)}"
+            f"{catalog_path(folder)}: classes: no {unknown[0]}; expected {', '.join(own_classes)}"
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")

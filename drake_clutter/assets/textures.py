@@ -357,13 +357,13 @@ def _check_label(object_class: ObjectClass) -> tuple[LabelDesign, str]:
     for field in ("base", "accent"):
         if not re.fullmatch(r"#[0-9a-fA-F]{6}", getattr(label, field)):
             raise InputError(
-                f'{where}.{field}: {getattr(label, field)!r}; allowed is a color such as "#c8102e"'
+                f'{where}.{field}: {getattr(label, field)!r}; expected a color such as "#c8102e"'
             )
     if label.motif not in MOTIFS:
-        raise InputError(f"{where}.motif: {label.motif!r}; allowed are {', '.join(MOTIFS)}")
+        raise InputError(f"{where}.motif: {label.motif!r}; expected {', '.join(MOTIFS)}")
     if len(label.title) > _TITLE_LENGTH:
         raise InputError(
-            f"{where}.title: {label.title!r}; allowed are at most {_TITLE_LENGTH} characters"
+            f"{where}.title: {label.title!r}; expected at most {_TITLE_LENGTH} characters"
         )
     return label, label.title.strip() or object_class.name.replace("_", " ")
 

@@ -73,7 +73,7 @@ class RobotSpec(StrictModel):
         for name, values in limits:
             if joints and values is not None and len(values) != joints:
                 found = f"{name}: {len(values)} values"
-                raise rejected_error(f"{found}; allowed are {joints}, as robot.home has")
+                raise rejected_error(f"{found}; expected {joints}, as robot.home has")
         return limits
 
     @property

@@ -62,7 +62,7 @@ class WorkCell(StrictModel):
             if fixture.name in taken:
                 others = ", ".join(taken)
                 raise rejected_error(
-                    f"{fixture.name}: is taken; allowed are names that differ, also from {others}"
+                    f"{fixture.name}: is taken; expected names that differ, also from {others}"
                 )
             taken.append(fixture.name)
         return fixtures
@@ -72,18 +72,16 @@ class WorkCell(StrictModel):
     def _check_cameras(cls, cameras: dict[str, Camera], info: ValidationInfo) -> dict[str, Camera]:
         invalid = [name for name in cameras if not name.isidentifier()]
         if invalid:
-            raise rejected_error(
-                f"{invalid[0]}: a camera's name; allowed are letters, digits and _"
-            )
+            raise rejected_error(f"{invalid[0]}: a camera's name; expected letters, digits and _")
         if taken := [name for name in cameras if name in _RESERVED_NAMES and name != "camera"]:
             reserved = ", ".join(_RESERVED_NAMES)
             raise rejected_error(
-                f"{taken[0]}: a camera's name; allowed are names that differ from {reserved}"
+                f"{taken[0]}: a camera's name; expected names that differ from {reserved}"
             )
         name, camera = next(iter(cameras.items()))
         if "support" in info.data and not camera.sees_support(info.data["support"]):
             allowed = "a pose from which its floor is in the image"
-            raise rejected_error(f"{name}: sees nothing of the support; allowed is {allowed}")
+            raise rejected_error(f"{name}: does not see the support; expected {allowed}")
         return cameras
 
     @property

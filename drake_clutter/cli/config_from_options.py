@@ -60,7 +60,7 @@ def reject_support_settings(settings: Sequence[str] | None) -> None:
         if qualify_setting(setting).startswith(_SUPPORT_FIELDS):
             raise input_error(
                 f"--set {setting}",
-                "the objects stand on their scene's support; allowed are other fields",
+                "the support is that of the scene; expected other fields",
             )
 
 

@@ -80,7 +80,7 @@ def evaluate(
     scenes_source = scenes or source
     if scenes_source is None or None not in (scenes, source):
         allowed = "a shipped scene set, a scene set file, or a folder of scene files with verdicts"
-        raise InputError(f"--scenes: give it once; allowed is {allowed}")
+        raise InputError(f"--scenes: expected once, with {allowed}")
     reject_support_settings(settings)
     evaluation_scenes = load_evaluation_scenes(scenes_source, catalog)[:max_scenes]
     scene_cell = None if cell_file else common_cell(evaluation_scenes)

@@ -33,7 +33,7 @@ def _parse_pose(option: str, text: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != 4 or not all(abs(value) <= 360 for value in values):
-        raise InputError(f"{option} {text}; allowed is X,Y,Z,YAW in m, m, m and degrees")
+        raise InputError(f"{option} {text}; expected X,Y,Z,YAW in m, m, m and degrees")
     return values
 
 

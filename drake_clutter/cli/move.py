@@ -64,9 +64,9 @@ def move(
     from drake_clutter.scenes.interfaces import Move
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
-        raise InputError("move: allowed is either --pick NAME --place NAME, or --moves FILE")
+        raise InputError("move: expected either --pick NAME --place NAME, or --moves FILE")
     if plan_only and fidelity is not Fidelity.ARM:
-        raise InputError(f"--plan-only with --fidelity {fidelity.value}; allowed is --fidelity arm")
+        raise InputError(f"--plan-only with --fidelity {fidelity.value}; expected --fidelity arm")
     requested = read_moves(moves) if moves else [Move(str(pick), str(place))]
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     prepare_output_directory(out)

@@ -129,7 +129,7 @@ def show_recording(
         try:
             write_recording(html_file, scene, frames, cell)
         except OSError as error:
-            problem = f"cannot be written ({error.strerror}); allowed is a writable path"
+            problem = f"cannot be written ({error.strerror}); expected a writable path"
             raise InputError(f"--html {html_file}: {problem}") from error
         out_console.print(f"Wrote {html_file}.")
         return

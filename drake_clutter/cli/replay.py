@@ -27,7 +27,7 @@ def replay(
 
     scene, cell, moves = read_trajectories(file, load_catalog(catalog))
     if not moves:
-        raise InputError(f"{file}: holds no motion; allowed is a file with at least one move")
+        raise InputError(f"{file}: holds no motion; expected a file with at least one move")
     for number, (move, motion) in enumerate(moves, start=1):
         out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
     recording = concatenate_motions([motion for _, motion in moves])

@@ -69,7 +69,7 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
         }
         if source not in sets:
             allowed = f"a folder, a file, and {', '.join(sorted(sets))}"
-            raise InputError(f"--scenes {source}: is not there; allowed are {allowed}")
+            raise InputError(f"--scenes {source}: does not exist; expected {allowed}")
         scenes = sets[source]
     if scenes.is_file():
         scene_set = load_scene_dataset(scenes, catalog)
@@ -92,7 +92,7 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
             evaluation_scenes.append(EvaluationScene(path, None, names, file.cell))
     if not evaluation_scenes:
         raise InputError(
-            f"{scenes}: none of {len(paths)} scenes is stable and has hidden objects; allowed are "
+            f"{scenes}: none of {len(paths)} scenes is stable and has hidden objects; expected "
             "scenes that `generate` judged so"
         )
     return evaluation_scenes
@@ -108,7 +108,7 @@ def common_cell(scenes: Sequence[EvaluationScene]) -> WorkCell:
     for scene in scenes:
         if scene.cell.with_support(first.cell.support) != first.cell:
             found = f"{scene.file.name} was made in another cell than {first.file.name}"
-            raise InputError(f"--scenes: {found}; allowed are scenes of one cell, or --cell")
+            raise InputError(f"--scenes: {found}; expected scenes of one cell, or --cell")
     return first.cell
 
 
@@ -151,7 +151,8 @@ def evaluate_explorers(
     """
     if out is not None and (out.is_dir() or not out.parent.is_dir()):
         raise InputError(
-            f"--out {out}: is a folder, or in none; allowed is a file in a folder that exists"
+            f"--out {out}: is a folder, or its folder does not exist; expected a file in an"
+            " existing folder"
         )
     agents = list(dict.fromkeys(agents))
     classes = frozenset[str]().union(*(scene.classes for scene in scenes))
@@ -168,7 +169,7 @@ def evaluate_explorers(
     if not results:
         raise InputError(
             f"--scenes: none of {len(scenes)} scenes has objects that are hidden from the "
-            "configured camera; allowed are scenes with hidden objects"
+            "configured camera; expected scenes with hidden objects"
         )
     rows = [
         {"agent": agent}

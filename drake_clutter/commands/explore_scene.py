@@ -44,7 +44,7 @@ def settle_scene(scene: Scene, config: ClutterConfig, seed: int) -> Scene:
     verdict = DrakeJudge(config).judge(scene, item_rng(seed))
     if verdict.instability is not None:
         raise InputError(
-            f"the scene is not stable: {verdict.instability}; allowed is a scene that is at rest "
+            f"the scene is not stable: {verdict.instability}; expected a scene that is at rest "
             "when Drake simulates it"
         )
     return scene.with_poses(verdict.settled)
@@ -97,7 +97,7 @@ def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene
             if name in (*scene.names, TRAY):
                 problem = "is not in view, or the picked object itself"
             raise InputError(
-                f"move {index + 1}, {role}: {name!r} {problem}; allowed are {', '.join(allowed)}"
+                f"move {index + 1}, {role}: {name!r} {problem}; expected {', '.join(allowed)}"
             )
 
 
@@ -195,7 +195,7 @@ def read_moves(path: Path) -> list[Move]:
     content = f"a list of {{pick: NAME, place: NAME or {TRAY}}}"
     entries = validate(tuple[_MoveEntry, ...], read_yaml(path, content), str(path))
     if not entries:
-        raise input_error(str(path), f"holds no moves; allowed is {content}")
+        raise input_error(str(path), f"holds no moves; expected {content}")
     return [Move(entry.pick, entry.place) for entry in entries]
 
 

@@ -154,7 +154,7 @@ def check_unique_names(source: str, files: Sequence[Path]) -> None:
     """
     counts = Counter(path.stem for path in files)
     if duplicates := [name for name, count in counts.items() if count > 1]:
-        raise InputError(f"{source}: {duplicates[0]} is there twice; allowed are unique file names")
+        raise InputError(f"{source}: {duplicates[0]} occurs twice; expected unique file names")
 
 
 def make_setups(

@@ -78,7 +78,7 @@ def generate_scenes(
             cluster at the address.
     """
     if count < 1:
-        raise InputError(f"--count {count}; allowed is 1 or more")
+        raise InputError(f"--count {count}; expected 1 or more")
     NodeBudget(job.nodes)
     make_generation_agent(job.agent, job.config, job.temperature)
     catalog = load_catalog(job.catalog_folder)

@@ -58,7 +58,7 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
         if not _VALID_NAME.fullmatch(name) or _RESERVED_NAME.fullmatch(name):
             reserved = _RESERVED_NAME.pattern.replace("|", ", ")
             raise InputError(
-                f"object {name!r} cannot be exported by this name; allowed are letters, digits, _, "
+                f"object {name!r} cannot be exported by this name; expected letters, digits, _, "
                 "and . - or blanks between them, "
                 f"and no name that a format reserves ({reserved})"
             )

@@ -66,22 +66,22 @@ class ClutterGraph:
                 reached from the tray, or an `end` node has children.
         """
         if [node for node, kind in nodes.items() if kind == TRAY] != [cls.TRAY_NODE]:
-            raise ValueError("nodes: allowed is exactly one tray, with id 0")
+            raise ValueError("nodes: expected exactly one tray, as node 0")
         graph = cls()
         for node, kind in nodes.items():
             graph.nx.add_node(node, kind=kind)
         for (parent, child), edge_kind in edges.items():
             if parent not in nodes or child not in nodes:
-                raise ValueError(f"edges: {parent} -> {child} joins a node that is not there")
+                raise ValueError(f"edges: {parent} -> {child} refers to a node that does not exist")
             graph.nx.add_edge(parent, child, kind=edge_kind)
         if len(graph.breadth_first_order()) != len(nodes) or not nx.is_directed_acyclic_graph(
             graph.nx
         ):
             raise ValueError(
-                "edges: allowed is an acyclic graph in which the tray leads to every node"
+                "edges: expected an acyclic graph in which every node is reachable from the tray"
             )
         if any(graph.kind(node) == END and graph.children(node) for node in nodes):
-            raise ValueError("edges: nothing may stand on an end")
+            raise ValueError("edges: an `end` node must not have children")
         return graph
 
     def __len__(self) -> int:

@@ -35,7 +35,7 @@ class NodeBudget:
     def __post_init__(self) -> None:
         if self.nodes < MIN_NODES:
             raise InputError(
-                f"nodes: {self.nodes}; allowed is {MIN_NODES} (tray, one object, end) or more"
+                f"nodes: {self.nodes}; expected {MIN_NODES} (tray, one object, end) or more"
             )
 
 

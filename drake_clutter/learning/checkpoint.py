@@ -74,7 +74,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except (OSError, SafetensorError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); "
-            "allowed is a checkpoint, .safetensors with a .json beside it"
+            "expected a checkpoint, .safetensors with a .json beside it"
         ) from error
     except ValueError as error:
         raise InputError(f"{path.with_suffix('.json')}: is not JSON ({error})") from error

@@ -48,5 +48,5 @@ def checkpoint_sha256(name: str, pretrained: Mapping[str, str]) -> str:
         return file_sha256(path)
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); allowed is a checkpoint"
+            f"{path}: cannot be read ({error.strerror}); expected a checkpoint"
         ) from error

@@ -194,9 +194,9 @@ def resolve_device(name: str) -> torch.device:
         InputError: The name is unknown, or the device is not available.
     """
     if name not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {name}; allowed are auto, cpu, cuda")
+        raise InputError(f"--device {name}; expected auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: PyTorch finds none; allowed here are auto, cpu")
+        raise InputError("--device cuda: PyTorch finds none; expected auto or cpu")
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     return torch.device(name)

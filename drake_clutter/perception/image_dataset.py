@@ -234,7 +234,7 @@ class ImageDataset:
         if not self._files:
             raise InputError(
                 f"{folder}: holds no images; "
-                "allowed is a folder that training/render_image_dataset.py wrote"
+                "expected a folder that training/render_image_dataset.py wrote"
             )
         categories = json.loads((scenes[0] / COCO_FILE).read_text(encoding="utf-8"))["categories"]
         self._class_names = {category["id"]: category["name"] for category in categories}

@@ -152,13 +152,11 @@ class PoseFitter:
             ValueError: The class is a mesh, or an image does not have the camera's size.
         """
         if object_class.shape is Shape.MESH:
-            raise ValueError(
-                f"class {object_class.name} is a mesh; allowed are boxes and cylinders"
-            )
+            raise ValueError(f"class {object_class.name} is a mesh; expected boxes and cylinders")
         size = (self.camera.height, self.camera.width)
         if mask.shape != size or depth.shape != size:
             raise ValueError(
-                f"mask {mask.shape} and depth {depth.shape}; allowed is the camera's size, {size}"
+                f"mask {mask.shape} and depth {depth.shape}; expected the camera's size, {size}"
             )
         guess = np.ascontiguousarray(p_TO_guess, float)
         window = self._mask_bounds(object_class, mask, guess)

@@ -275,7 +275,7 @@ class SegmentationNetwork(nn.Module):
         kind = metadata.get("kind")
         if kind != CHECKPOINT_KIND:
             raise InputError(
-                f"{path}: is a checkpoint of a {kind}; allowed is one of a {CHECKPOINT_KIND}"
+                f"{path}: is a checkpoint of a {kind}; expected one of a {CHECKPOINT_KIND}"
             )
         network = SegmentationNetwork(metadata["classes"], metadata["use_color"])
         weights = {_current_name(name): value for name, value in checkpoint.weights.items()}

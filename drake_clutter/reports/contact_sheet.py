@@ -46,7 +46,7 @@ def write_contact_sheet(path: Path, entries: Sequence[tuple[NDArray[np.uint8], s
         ValueError: There are no entries, or more than `MAX_THUMBNAILS`.
     """
     if not 1 <= len(entries) <= MAX_THUMBNAILS:
-        raise ValueError(f"{len(entries)} thumbnails; allowed are 1 to {MAX_THUMBNAILS}")
+        raise ValueError(f"{len(entries)} thumbnails; expected 1 to {MAX_THUMBNAILS}")
     columns = min(8, math.ceil(math.sqrt(1.4 * len(entries))))
     rows = math.ceil(len(entries) / columns)
     sheet = Image.new(

@@ -34,7 +34,7 @@ def resolve_model_path(model: str, field: str = "robot.model") -> Path:
     is_shipped = model.startswith(prefix)
     path = resource_path("models") / model.removeprefix(prefix) if is_shipped else Path(model)
     if not path.is_file() or path.suffix not in (".sdf", ".urdf"):
-        raise InputError(f"{field}: {model!r}; allowed is an SDF or URDF file, or {prefix}FILE")
+        raise InputError(f"{field}: {model!r}; expected an SDF or URDF file, or {prefix}FILE")
     return path
 
 
@@ -98,7 +98,7 @@ def _read_xml(path: Path) -> ElementTree.Element:
             text = re.sub(r"<(robot|sdf)\b", rf'<\1 xmlns:drake="{_DRAKE}"', text, count=1)
         return ElementTree.fromstring(text)
     except (OSError, ValueError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: is not XML ({error}); allowed is an SDF or URDF") from error
+        raise InputError(f"{path}: is not XML ({error}); expected an SDF or URDF") from error
 
 
 def _resolve_mesh(path: Path, uri: str, packages: PackageMap) -> Path:
@@ -110,7 +110,7 @@ def _resolve_mesh(path: Path, uri: str, packages: PackageMap) -> Path:
     else:
         file = Path(rest) if scheme == "file" else path.parent / uri
     if not file.is_file():
-        raise InputError(f"{path}: mesh: {uri!r} is missing; allowed is a file")
+        raise InputError(f"{path}: mesh: {uri!r} is missing; expected a file")
     file = file.resolve()
     return convert_stl_to_obj(file) if file.suffix.lower() == ".stl" else file
 
@@ -141,9 +141,9 @@ def parse_model(
         instances = parser.AddModelsFromString(text, path.suffix.removeprefix("."))
     except (RuntimeError, ValueError, SystemExit) as error:  # SystemExit: assertions of Drake
         words = " ".join(str(error).split())
-        raise InputError(f"{path}: {words}; allowed is a model that Drake reads") from error
+        raise InputError(f"{path}: {words}; expected a model that Drake reads") from error
     if len(instances) != 1:
-        raise InputError(f"{path}: holds {len(instances)} models; allowed is one")
+        raise InputError(f"{path}: holds {len(instances)} models; expected one")
     return instances[0]
 
 

@@ -109,19 +109,23 @@ def parse_arm(spec: RobotSpec) -> ParsedArm:
     roots = [body.name() for body in bodies if body.name() not in parent_joints]
     if spec.base_link not in roots:
         known = ", ".join(roots) or "a link that is not fixed to the world"
-        raise InputError(f"robot.base_link: {spec.base_link!r}; allowed in {path.name} is {known}")
+        raise InputError(f"robot.base_link: {spec.base_link!r}; expected in {path.name}: {known}")
     if loose := [name for name in roots if name != spec.base_link]:
-        raise InputError(f"{path}: link {loose[0]!r} has no parent joint; allowed is an arm alone")
+        raise InputError(
+            f"{path}: link {loose[0]!r} has no parent joint; expected a model of one arm"
+        )
     if not plant.HasFrameNamed(spec.tool_frame, instance):
         frames = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
         known = ", ".join(name for name in frames if not name.endswith(_DRAKE_FRAME_SUFFIXES))
         given = f"robot.tool_frame: {spec.tool_frame!r}"
-        raise InputError(f"{given}; allowed in {path.name} are {known}")
+        raise InputError(f"{given}; expected in {path.name}: {known}")
     base = plant.GetFrameByName(spec.base_link, instance)
     flange = plant.GetFrameByName(spec.tool_frame, instance)
     moving = _movable_joints(_joints_to_base(flange.body(), parent_joints))
     if not moving:
-        raise InputError(f"robot.tool_frame: {spec.tool_frame!r}; allowed is one that joints move")
+        raise InputError(
+            f"robot.tool_frame: {spec.tool_frame!r}; expected a frame that joints move"
+        )
     _check_serial(path, _joints(plant, instance), moving)
     plant.WeldFrames(plant.world_frame(), base)
     plant.Finalize()
@@ -153,10 +157,10 @@ def _check_serial(path: Path, joints: list[Joint], moving: list[Joint]) -> None:
     for joint in _movable_joints(joints):
         what = f"{path}: joint {joint.name()!r}"
         if joint not in moving:
-            raise InputError(f"{what} does not move the tool frame; allowed is an arm alone")
+            raise InputError(f"{what} does not move the tool frame; expected a model of one arm")
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             kinds = "revolute, continuous and prismatic joints"
-            raise InputError(f"{what} is of type {joint.type_name()}; allowed are {kinds}")
+            raise InputError(f"{what} is of type {joint.type_name()}; expected {kinds}")
     if (mimic := find_mimic_joint(path)) is not None:
         allowed = "joints that move by themselves"
-        raise InputError(f"{path}: joint {mimic!r} mimics another; allowed are {allowed}")
+        raise InputError(f"{path}: joint {mimic!r} mimics another; expected {allowed}")

@@ -159,7 +159,7 @@ def _home(spec: RobotSpec, arm: ParsedArm, joints: JointRange) -> Floats:
     for joint, q, (lower, upper) in zip(arm.joints, home, joints.limits, strict=True):
         if not lower <= q <= upper:
             bounds = f"from {lower:g} to {upper:g}"
-            raise InputError(f"robot.home: {q:g} for joint {joint.name()!r}; allowed is {bounds}")
+            raise InputError(f"robot.home: {q:g} for joint {joint.name()!r}; expected {bounds}")
     return home
 
 
@@ -174,7 +174,7 @@ def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
             raise _missing_limit("position", joint.name())
         if not lower < upper:
             given = f"robot.limits.position: {lower:g}, {upper:g} for joint {joint.name()!r}"
-            raise InputError(f"{given}; allowed is the lower, then the upper limit")
+            raise InputError(f"{given}; expected the lower, then the upper limit")
     return limits
 
 
@@ -198,12 +198,12 @@ def _check_length(field: str, length: int, arm: ParsedArm) -> None:
     if length != len(arm.joints):
         names = ", ".join(joint.name() for joint in arm.joints)
         allowed = f"{len(arm.joints)} values, for {names}"
-        raise InputError(f"robot.{field}: {length} values; allowed is {allowed}")
+        raise InputError(f"robot.{field}: {length} values; expected {allowed}")
 
 
 def _missing_limit(kind: str, joint: str) -> InputError:
     allowed = "a value for each joint, here or in the model file"
-    return InputError(f"robot.limits.{kind}: is missing for joint {joint!r}; allowed is {allowed}")
+    return InputError(f"robot.limits.{kind}: is missing for joint {joint!r}; expected {allowed}")
 
 
 def _fit_ur_arm(arm: ParsedArm) -> UrFit:
@@ -212,7 +212,7 @@ def _fit_ur_arm(arm: ParsedArm) -> UrFit:
     if fit is None or not fit.error < _MAX_FIT_ERROR:
         off = f"{len(arm.joints)} joints" if fit is None else f"off by {fit.error:.2g} m"
         what = f"{arm.path.name} is no arm of the UR family: {off}"
-        raise InputError(f"robot.ik: 'ur' ({what}); allowed is 'numerical'")
+        raise InputError(f"robot.ik: 'ur' ({what}); expected 'numerical'")
     return fit
 
 

@@ -30,7 +30,7 @@ def convert_stl_to_obj(path: Path) -> Path:
     except Exception:  # trimesh raises exceptions of many types for invalid files
         is_empty = True
     if is_empty:
-        raise InputError(f"{path}: is no STL mesh; allowed are OBJ, glTF, VTK and STL")
+        raise InputError(f"{path}: is not an STL mesh; expected OBJ, glTF, VTK or STL")
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(obj_path) as temporary:
         mesh.export(temporary, file_type="obj")

@@ -367,7 +367,7 @@ def resolve_placement(
         ValueError: The move puts an object on itself.
     """
     if move.place == move.pick:
-        raise ValueError(f"move {move}: allowed is to put an object on another one or on {TRAY}")
+        raise ValueError(f"move {move}: expected another object, or {TRAY}, as the place")
     placements = find_free_placements(observation, move, config)
     if placements is None:
         return None

@@ -87,7 +87,7 @@ class SceneDataset:
         poses = self.scenes[index].settled_poses
         if poses is None:
             raise InputError(
-                f"{self.name}: holds graphs without poses; allowed is a dataset with settled poses"
+                f"{self.name}: holds graphs without poses; expected a dataset with settled poses"
             )
         world = replace(config, cell=config.cell.with_support(self.cell.support))
         scene = relayout(
@@ -109,8 +109,8 @@ def relayout(
         if not isinstance(scene, LayoutFailure):
             return scene
     raise InputError(
-        f"a graph found no room on the tray, {_LAYOUT_TRIES} times in a row; "
-        "allowed is a layout that has room for it"
+        f"a graph did not fit on the tray in {_LAYOUT_TRIES} attempts; "
+        "expected a layout that has room for it"
     )
 
 
@@ -172,14 +172,14 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: is not a scene dataset ({error}); "
-            "allowed is a file that training/generate_scene_dataset.py wrote"
+            "expected a file that training/generate_scene_dataset.py wrote"
         ) from error
     if version != VERSION:
-        raise InputError(f"{path}: version: {version}; allowed is {VERSION}")
+        raise InputError(f"{path}: version: {version}; expected {VERSION}")
     if was_changed:
         raise InputError(
             f"{path}: sha256: does not match the scenes, which were changed; "
-            "allowed is the file as it was written"
+            "expected an unmodified file"
         )
     # A dataset of version 0.1 has no cell.
     given = document.pop("cell", None)

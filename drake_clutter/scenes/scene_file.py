@@ -213,7 +213,7 @@ def _build_scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
     depth, first, second = max_penetration(objects)
     if depth > MAX_PENETRATION:
         problem = f"objects: {first} and {second} overlap by {1000 * depth:.1f} mm"
-        raise input_error(path, f"{problem}; allowed is {1000 * MAX_PENETRATION:g} mm")
+        raise input_error(path, f"{problem}; expected at most {1000 * MAX_PENETRATION:g} mm")
     graph = None if document.graph is None else _build_graph(document.graph, objects, path)
     cell = document.work_cell
     scene = Scene(objects, cell.support, graph, document.derivation, document.seed)
@@ -223,7 +223,7 @@ def _build_scene_file(given: Any, path: str, catalog: Catalog) -> SceneFile:
 
 def _value_error(path: str, field: str, value: Any, what: str) -> InputError:
     """Return the error for a field with a value that is not allowed."""
-    return input_error(path, f"{field}: {format_value(value)}; allowed is {what}")
+    return input_error(path, f"{field}: {format_value(value)}; expected {what}")
 
 
 def _build_objects(
@@ -238,7 +238,7 @@ def _build_objects(
             raise _value_error(path, f"objects[{k}].class", entry.object_class, allowed_classes)
         if entry.name in objects:
             problem = f"objects[{k}].name: {format_value(entry.name)} is used twice"
-            raise input_error(path, f"{problem}; allowed are names without repeats")
+            raise input_error(path, f"{problem}; expected names without repeats")
         objects[entry.name] = SceneObject(entry.name, object_class, entry.X_TO.pose, entry.node)
     return list(objects.values())
 
@@ -269,10 +269,10 @@ def _build_graph(entry: _GraphEntry, objects: Sequence[SceneObject], path: str) 
     for o in objects:
         if o.node is not None and nodes.get(o.node) != o.object_class.name:
             problem = f"graph.nodes: the node of {o.name}, {o.node}, is missing or of another kind"
-            raise input_error(path, f"{problem}; allowed is {o.object_class.name}")
+            raise input_error(path, f"{problem}; expected {o.object_class.name}")
     if not graph.is_terminal:
         problem = "graph: holds slots or edges without orientation"
-        raise input_error(path, f"{problem}; allowed is a terminal graph")
+        raise input_error(path, f"{problem}; expected a terminal graph")
     return graph
 
 
@@ -280,7 +280,7 @@ def _build_verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     """Return the verdict of a scene file, if it fits the scene."""
     failure = entry.instability
     if entry.stable == (failure is not None):
-        what = "allowed is one for an unstable scene, and none for a stable one"
+        what = "expected one for an unstable scene, and none for a stable one"
         raise input_error(path, f"verdict.instability: {what}")
     names_by_field = {
         "settled": set(entry.settled),
@@ -293,11 +293,11 @@ def _build_verdict(entry: _VerdictEntry, scene: Scene, path: str) -> Verdict:
     for field, names in names_by_field.items():
         if unknown_names := sorted(names - set(scene.names)):
             problem = f"verdict.{field}: {format_value(unknown_names[0])} is no object"
-            raise input_error(path, f"{problem}; allowed are {', '.join(scene.names)}")
+            raise input_error(path, f"{problem}; expected {', '.join(scene.names)}")
     for field in ("settled", "visible_fractions") if entry.stable else ("settled",):
         if missing := sorted(set(scene.names) - names_by_field[field]):
             problem = f"verdict.{field}: {missing[0]} is missing"
-            raise input_error(path, f"{problem}; allowed is an entry for every object")
+            raise input_error(path, f"{problem}; expected an entry for every object")
     instability = None
     if failure is not None:
         instability = Instability(

@@ -78,8 +78,8 @@ def add_work_cell(
     model = load_robot(cell.robot)
     robot = add_robot(plant, model, visuals=visuals)
     if not any(plant.GetCollisionGeometriesForBody(body) for body in _bodies(plant, robot)):
-        problem = f"robot.model: {cell.robot.model!r}: no link has a shape for collisions"
-        raise InputError(f"{problem}; allowed is one that can hit something")
+        problem = f"robot.model: {cell.robot.model!r}: no link has collision geometry"
+        raise InputError(f"{problem}; expected a model with collision geometry")
     (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=compliant), "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
@@ -150,7 +150,7 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if any(joint.parent_body().index() == plant.world_body().index() for joint in joints):
         problem = f"{field}: {fixture.model!r} is fixed to the world"
-        raise InputError(f"{problem}; allowed is a model that its pose fixes there")
+        raise InputError(f"{problem}; expected a model without joints to the world")
     has_model_frame = plant.HasFrameNamed("__model__", instance)
     frame = (
         plant.GetFrameByName("__model__", instance) if has_model_frame else bodies[0].body_frame()
@@ -158,9 +158,7 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     plant.WeldFrames(plant.world_frame(), frame, fixture.pose.transform)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if len(joints) != len(bodies) or any(joint.num_positions() for joint in joints):
-        raise InputError(
-            f"{field}: {fixture.model!r} has parts that move; allowed is a rigid model"
-        )
+        raise InputError(f"{field}: {fixture.model!r} has movable joints; expected a rigid model")
     return bodies
 
 

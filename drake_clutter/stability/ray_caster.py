@@ -330,7 +330,7 @@ class RayCaster:
         scene[name]
         if len(scene.objects) > _MAX_OCCLUDERS:
             raise ValueError(
-                f"the scene has {len(scene.objects)} objects; allowed are {_MAX_OCCLUDERS} at most"
+                f"the scene has {len(scene.objects)} objects; expected at most {_MAX_OCCLUDERS}"
             )
         shapes, p_T = self._shapes.rows_and_positions(scene.objects)
         arguments = (self._shapes.arrays, shapes, p_T, self._pinhole, scene.names.index(name))

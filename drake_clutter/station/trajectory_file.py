@@ -115,12 +115,12 @@ def read_trajectories(
         file = h5py.File(path)
     except OSError as error:
         raise input_error(
-            str(path), f"cannot be read as HDF5; allowed is a trajectory file ({error})"
+            str(path), f"cannot be read as HDF5; expected a trajectory file ({error})"
         ) from error
     with file:
         if int(file.attrs.get("version", 0)) != FORMAT_VERSION or "scene" not in file.attrs:
             found = f"{path}: version {file.attrs.get('version')}"
-            raise InputError(f"{found}; allowed is a trajectory file of version {FORMAT_VERSION}")
+            raise InputError(f"{found}; expected a trajectory file of version {FORMAT_VERSION}")
         scene = scene_from_yaml(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _read_cell(path, file.attrs).with_support(scene.support)
         num_joints = load_robot(cell.robot).num_joints
@@ -152,13 +152,11 @@ def _read_move(
             or len(dataset.shape) == 0
             or dataset.shape[1:] != shape
         ):
-            raise InputError(
-                f"{path}:{name}.{field}; allowed is a dataset of shape {('n', *shape)}"
-            )
+            raise InputError(f"{path}:{name}.{field}; expected a dataset of shape {('n', *shape)}")
         arrays[field] = dataset[()]
     lengths = {field: len(values) for field, values in arrays.items()}
     if len(set(lengths.values())) != 1:
-        raise InputError(f"{path}:{name}: lengths {lengths}; allowed are equal lengths")
+        raise InputError(f"{path}:{name}: lengths {lengths}; expected equal lengths")
     samples = []
     for k, time in enumerate(arrays["time"].tolist()):
         q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM_DATASETS)

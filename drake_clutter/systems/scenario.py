@@ -73,7 +73,7 @@ def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None
     is_checkpoint = scenario.perception.endswith(".safetensors")
     if scenario.perception not in PRETRAINED_DETECTORS and not is_checkpoint:
         allowed = f"labels, {', '.join(PRETRAINED_DETECTORS)}, or a .safetensors file"
-        raise InputError(f"perception: {scenario.perception}; allowed are {allowed}")
+        raise InputError(f"perception: {scenario.perception}; expected {allowed}")
     path = checkpoint_path(scenario.perception, PRETRAINED_DETECTORS)
     # These imports need PyTorch.
     from drake_clutter.perception.learned_detector import LearnedDetector
@@ -107,4 +107,4 @@ def make_policy(name: str, config: ClutterConfig) -> Policy:
         if isinstance(factory, LearnedExplorerFactory) and not factory.privileged:
             return factory()
     allowed = f"a student, or one of {', '.join(BASELINE_POLICIES)}"
-    raise InputError(f"agent: {name} uses the true state of the scene; allowed is {allowed}")
+    raise InputError(f"agent: {name} uses the true state of the scene; expected {allowed}")

@@ -120,7 +120,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             return self._reset_to_random_scene(), {}
         if not 0 <= index < len(self.scenes.scenes):
             raise InputError(
-                f"scene: {index}; allowed is 0 to {len(self.scenes.scenes) - 1}, "
+                f"scene: {index}; expected 0 to {len(self.scenes.scenes) - 1}, "
                 f"as {self.scenes.name} has them"
             )
         scene = self.scenes.settled_scene(index, self.grammar, self._config)

@@ -282,5 +282,5 @@ def make_teleport_backend_factory(
             detector = LabelDetector(config.cell.camera)
         case _:
             allowed = ", ".join(TELEPORT_FIDELITIES)
-            raise InputError(f"fidelity: {fidelity!r}; allowed are {allowed}")
+            raise InputError(f"fidelity: {fidelity!r}; expected {allowed}")
     return partial(SteppedBackend, executor, detector, config.exploration)

@@ -125,7 +125,7 @@ class ExplorationTask:
                 continue.
         """
         if self.termination is TerminationReason.COLLAPSED:
-            raise ValueError("the scene has collapsed; allowed is a move in a scene that stands")
+            raise ValueError("the scene has collapsed; expected a stable scene")
         has_collapsed = attempt.outcome.result is MoveResult.COLLAPSED
         self.scene = attempt.outcome.scene
         self.perception = attempt.next_perception

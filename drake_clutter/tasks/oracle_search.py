@@ -149,7 +149,7 @@ class OracleSearch:
         """
         if len(scene.objects) > MAX_OBJECTS:
             raise InputError(
-                f"objects: {len(scene.objects)}; allowed are {MAX_OBJECTS} at most, "
+                f"objects: {len(scene.objects)}; expected at most {MAX_OBJECTS}, "
                 "for an oracle search"
             )
         self._invalid_first_moves = invalid_moves

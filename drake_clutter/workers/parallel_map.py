@@ -46,7 +46,7 @@ def map_ordered(
         InputError: Ray is not installed, or there is no cluster at the address.
     """
     if workers < 1:
-        raise ValueError(f"workers: {workers}; allowed is 1 or more")
+        raise ValueError(f"workers: {workers}; expected 1 or more")
     if ray_address is not None:
         from drake_clutter.workers.ray_pool import map_on_ray
 

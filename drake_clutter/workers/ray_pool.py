@@ -116,7 +116,7 @@ def _ray_session(address: str) -> Iterator[Any]:
         ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise InputError(
-            f"--ray {address}: no cluster to work with ({error}); allowed is auto, for the "
+            f"--ray {address}: cannot connect to a cluster ({error}); expected auto, for the "
             "cluster on this machine, or HOST:PORT as `ray start --head` prints it (set "
             "RAY_AUTH_MODE=token if the cluster requires a token)"
         ) from error
