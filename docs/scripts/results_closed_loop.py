@@ -14,7 +14,7 @@ FAILURES = {
     "what is left lies behind what no cup holds": "remaining objects unreachable by suction"
 }
 """Current wording of reasons in results files of version 0.1."""
-_SETUP = ["scene set", "perception", "motion", "episodes"]
+_SETUP = ["dataset", "perception", "motion", "episodes"]
 
 
 def _setup(row: dict[str, Any]) -> list[str]:

@@ -45,7 +45,7 @@ PAPER: dict[str, dict[str, tuple[float, float | None]]] = {
     },
     "sg_14": {"random": (0.03, None), "largest-first": (0.56, None), "student-14": (0.64, 5.33)},
 }
-"""Success rate and objects found by scene set and policy (Kumar et al. 2022, Tables II and III).
+"""Success rate and objects found by dataset and policy (Kumar et al. 2022, Tables II and III).
 
 The paper's scenes with 25 nodes hide as many objects as those of `paper_hardness`.
 """
@@ -55,7 +55,7 @@ PAIRS = (
     ("sg_star_25", "student-dagger", "student-rg"),
     ("sg_star_40", "student", "student-rg"),
 )
-"""Scene set and two policies that are compared scene by scene."""
+"""Scene dataset and two policies that are compared scene by scene."""
 _NAMES = (
     ("RE", "random", "uniform choice among the legal moves (paper)"),
     ("LF", "largest-first", "largest visible object, to the tray (paper)"),
@@ -67,9 +67,9 @@ _NAMES = (
     ("oracle", "full-knowledge", "search with full state"),
 )
 """Short name, name on the command line and description of each policy."""
-_SUCCESS = ["scene set", "policy", "episodes", "success in 10", "paper", "success in 20"]
+_SUCCESS = ["dataset", "policy", "episodes", "success in 10", "paper", "success in 20"]
 _SUCCESS += ["of the solvable", "collapsed"]
-_FOUND = ["scene set", "policy", "hidden", "found in 10", "paper", "found in 20"]
+_FOUND = ["dataset", "policy", "hidden", "found in 10", "paper", "found in 20"]
 _FOUND += ["fraction found", "moves", "moves / oracle", "moves / LF-clear"]
 
 
@@ -118,7 +118,7 @@ def _policies() -> str:
     rows.sort(key=lambda row: str(row["set"]))
     text = section(
         "Success rates",
-        "Policies on frozen scene sets with perfect detections; Drake settles every move. "
+        "Policies on frozen scene datasets with perfect detections; Drake settles every move. "
         "*Success*: every object detected within 10 or 20 moves. *Of the solvable*: success in 20 "
         "moves on the scenes that the oracle search solves. *Paper*: Tables II and III of Kumar "
         "et al. 2022. Intervals are 95 %.",
@@ -155,7 +155,7 @@ def _pairs() -> str:
             p_value = binomtest(counts[0], sum(counts)).pvalue if sum(counts) else 1.0
             cells = [name, str(limit), policy_name(first), policy_name(second)]
             rows.append([*cells, *(str(count) for count in counts), f"{p_value:.1g}"])
-    head = ["scene set", "moves", "first", "second", "first alone", "second alone", "p"]
+    head = ["dataset", "moves", "first", "second", "first alone", "second alone", "p"]
     return text + table(head, rows)
 
 
@@ -193,7 +193,7 @@ def _static_and_drake() -> str:
             others.append(_static_row(static))
         else:
             compared.append(_comparison(static, drake))
-    head = ["scene set", "policy", "scenes", "success in 10", "success in 20", "fraction found"]
+    head = ["dataset", "policy", "scenes", "success in 10", "success in 20", "fraction found"]
     text += table([*head, "collapsed", "moves"], compared)
     text += (
         "\n### Further policies\n\n"
@@ -275,7 +275,7 @@ def _action_filter() -> str:
         other = without.get((row["set"], row["agent"], row["episodes"]))
         if other is not None and row["agent"] != "largest-clear":
             body.append(_comparison(other, row))
-    head = ["scene set", "policy", "scenes", "success in 10", "success in 20", "fraction found"]
+    head = ["dataset", "policy", "scenes", "success in 10", "success in 20", "fraction found"]
     return text + table([*head, "collapsed", "moves"], body)
 
 
@@ -331,7 +331,7 @@ def _environment() -> str:
 
 def page() -> str:
     """Return the page."""
-    intro = "# Exploration\n\nExploration policies compared on frozen scene sets.\n\n" + table(
+    intro = "# Exploration\n\nExploration policies compared on frozen scene datasets.\n\n" + table(
         ["name", "`--agent`", "policy"],
         [[name, f"`{agent}`" if agent else "", text] for name, agent, text in _NAMES],
     )

@@ -33,7 +33,7 @@ SCENE_SETS = {
     "sg_star_40": "SG*, 40 nodes",
     "sg_14": "SG-14, 14 object classes, 25 nodes",
 }
-"""Titles of the panels of objects found, by scene set."""
+"""Titles of the panels of objects found, by scene dataset."""
 POLICIES = {
     "full-knowledge": ("oracle", "black"),
     "student": ("SE*", "C0"),
@@ -72,7 +72,7 @@ TIMED = {
 MAX_MOVES = 20
 """Moves on the horizontal axis."""
 MIN_EPISODES = 100
-"""Fewest episodes of a policy on a scene set for it to be drawn."""
+"""Fewest episodes of a policy on a scene dataset for it to be drawn."""
 
 
 def draw_learning_curves(
@@ -196,7 +196,7 @@ def draw_times(path: Path) -> None:
 
 
 def draw_objects_found(path: Path) -> None:
-    """Draw the fraction of the hidden objects found over the moves, one panel per scene set."""
+    """Draw the fraction of the hidden objects found over the moves, one panel per dataset."""
     plt.rcParams.update({"font.size": 18, "lines.linewidth": 2.5})
     figure, panels = plt.subplots(
         2, 2, figsize=(18, 12), layout="constrained", sharex=True, sharey=True

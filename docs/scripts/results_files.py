@@ -1,4 +1,4 @@
-"""Readers of results files, and names of policies, generators and scene sets on results pages."""
+"""Readers of results files, and names of policies and generators on results pages."""
 
 import json
 from pathlib import Path
