@@ -3,8 +3,10 @@
 # ruff: noqa: I001 - in the order of the documentation
 
 from .files import InputError as InputError
+from .resources import resource_path as resource_path
 
 # Objects, scenes and files of scenes.
+from .assets.asset_builder import build_assets as build_assets
 from .catalog import (
     Catalog as Catalog,
     ObjectClass as ObjectClass,

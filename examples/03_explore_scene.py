@@ -10,9 +10,9 @@ from drake_clutter import (
     load_scene_dataset,
     make_backend_factory,
     make_policy_factory,
+    resource_path,
     run_episode,
 )
-from drake_clutter.resources import resource_path
 
 
 def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:

@@ -13,8 +13,8 @@ from drake_clutter import (
     PlannerConfig,
     load_catalog,
     load_scene_dataset,
+    resource_path,
 )
-from drake_clutter.resources import resource_path
 
 BASES = (-0.75, -1.25)
 """Positions of the base along x, from the center of the support [m]."""

@@ -11,12 +11,12 @@ from drake_clutter import (
     LayoutFailure,
     NodeBudget,
     SceneGrammar,
+    build_assets,
     lay_out,
     load_catalog,
     make_generation_agent,
     save_scene,
 )
-from drake_clutter.assets import build_assets
 
 
 def main(folder: Path, object_set: str, nodes: int, out: Path) -> None:
