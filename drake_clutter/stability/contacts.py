@@ -1,4 +1,7 @@
-"""Level contacts between convex objects, as polygons."""
+"""Horizontal contact polygons between convex objects.
+
+Frame T is that of the support: its origin is at the center of the floor, and z points up.
+"""
 
 import numpy as np
 from numba import njit
@@ -11,10 +14,10 @@ MAX_OVERLAP = 0.0015
 The overlap counts both in height and seen from above.
 """
 MAX_MISS_DISTANCE = 0.060
-"""Largest distance at which an object counts as placed beside its support [m].
+"""Largest horizontal distance at which an object counts as placed beside another one [m].
 
-Such an object begins at the height at which another one ends and misses it. The distance exceeds
-the gap of a standing pair (50 mm).
+Such an object is `UNSUPPORTED`: its bottom is at the height of the other object's top, but not
+above it. The distance exceeds the gap of a standing pair (`LayoutConfig.standing_gap`, 50 mm).
 """
 # Faults that `find_contacts` returns; `InconclusiveReason` explains them.
 NO_FAULT, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
@@ -35,33 +38,41 @@ def _clip(polygon, count, x, y, nx, ny, margin):  # type: ignore[no-untyped-def]
         ny: Outward unit normal of the line.
         margin: Distance by which the half-plane extends beyond the line [m].
     """
-    kept = np.empty_like(polygon)
-    num_kept = 0
+    clipped = np.empty_like(polygon)
+    num_clipped = 0
     for k in range(count):
-        after = (k + 1) % count
-        here = (polygon[k, 0] - x) * nx + (polygon[k, 1] - y) * ny - margin
-        there = (polygon[after, 0] - x) * nx + (polygon[after, 1] - y) * ny - margin
-        if here <= 0 and num_kept < len(kept):
-            kept[num_kept, 0], kept[num_kept, 1] = polygon[k, 0], polygon[k, 1]
-            num_kept += 1
-        if (here < 0 < there or there < 0 < here) and num_kept < len(kept):
-            fraction = here / (here - there)
+        successor = (k + 1) % count
+        distance = (polygon[k, 0] - x) * nx + (polygon[k, 1] - y) * ny - margin
+        next_distance = (polygon[successor, 0] - x) * nx + (polygon[successor, 1] - y) * ny - margin
+        if distance <= 0 and num_clipped < len(clipped):
+            clipped[num_clipped, 0], clipped[num_clipped, 1] = polygon[k, 0], polygon[k, 1]
+            num_clipped += 1
+        if (distance < 0 < next_distance or next_distance < 0 < distance) and num_clipped < len(
+            clipped
+        ):
+            fraction = distance / (distance - next_distance)
             for axis in range(2):
-                kept[num_kept, axis] = polygon[k, axis] + fraction * (
-                    polygon[after, axis] - polygon[k, axis]
+                clipped[num_clipped, axis] = polygon[k, axis] + fraction * (
+                    polygon[successor, axis] - polygon[k, axis]
                 )
-            num_kept += 1
-    for k in range(num_kept):
-        polygon[k, 0], polygon[k, 1] = kept[k, 0], kept[k, 1]
-    return num_kept
+            num_clipped += 1
+    for k in range(num_clipped):
+        polygon[k, 0], polygon[k, 1] = clipped[k, 0], clipped[k, 1]
+    return num_clipped
 
 
 @njit(cache=True)
 def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignore[no-untyped-def]
     """Clip a polygon in place to another one, and return its number of corners.
 
-    The other polygon is translated by (dx, dy) and shrunk by the margin [m]. A segment of two
-    points counts as a polygon without width.
+    Args:
+        polygon: Corners, of which the first `count` are used [m]. Shape (V, 2).
+        count: Number of corners.
+        other: Corners of the convex polygon to clip to, counter-clockwise [m]. Shape (W, 2).
+        other_count: Number of its corners; 2 for a segment, which is a polygon without width.
+        dx: Translation of the other polygon [m].
+        dy: Translation of the other polygon [m].
+        margin: Width by which the other polygon is shrunk [m].
     """
     if other_count == 2:
         ex, ey = other[1, 0] - other[0, 0], other[1, 1] - other[0, 1]
@@ -72,8 +83,8 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
         count = _clip(polygon, count, other[0, 0] + dx, other[0, 1] + dy, -ey, ex, 1e-9)
         return _clip(polygon, count, other[0, 0] + dx, other[0, 1] + dy, ey, -ex, 1e-9)
     for k in range(other_count):
-        after = (k + 1) % other_count
-        ex, ey = other[after, 0] - other[k, 0], other[after, 1] - other[k, 1]
+        successor = (k + 1) % other_count
+        ex, ey = other[successor, 0] - other[k, 0], other[successor, 1] - other[k, 1]
         length = np.hypot(ex, ey)
         count = _clip(
             polygon, count, other[k, 0] + dx, other[k, 1] + dy, ey / length, -ex / length, -margin
@@ -84,116 +95,116 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
 
 
 @njit(cache=True)
-def contact_polygon(records, lower_shape, upper_shape, lower_p, upper_p, margin):  # type: ignore[no-untyped-def]
-    """Return the corners of the contact below an object in T, shrunk by a margin.
+def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
+    """Return the contact polygon of an upper and a lower object in T, shrunk by a margin.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         lower_shape: Row of the lower object's shape; -1 for the support's floor.
         upper_shape: Row of the upper object's shape.
-        lower_p: Origin of the lower object in T [m]. Shape (3,).
-        upper_p: Origin of the upper object in T [m]. Shape (3,).
+        p_lower: Origin of the lower object in T [m]. Shape (3,).
+        p_upper: Origin of the upper object in T [m]. Shape (3,).
         margin: Width by which the contact is shrunk [m].
 
     Returns:
         Corners [m]. Shape (V, 2), V may be 0.
     """
     polygon = np.empty((48, 2))
-    bottom, corners = records[upper_shape].bottom, records[upper_shape].bottom_count
+    bottom, num_corners = table[upper_shape].bottom, table[upper_shape].bottom_count
     # Start with a square larger than the bottom, so that a negative margin can extend the contact.
-    reach = 0.1
-    for k in range(corners):
-        reach = max(reach, 0.1 + abs(bottom[k, 0]), 0.1 + abs(bottom[k, 1]))
+    half_side = 0.1
+    for k in range(num_corners):
+        half_side = max(half_side, 0.1 + abs(bottom[k, 0]), 0.1 + abs(bottom[k, 1]))
     for k in range(4):
-        polygon[k, 0] = upper_p[0] + (reach if k in (1, 2) else -reach)
-        polygon[k, 1] = upper_p[1] + (reach if k in (2, 3) else -reach)
-    count = _clip_to(polygon, 4, bottom, corners, upper_p[0], upper_p[1], margin)
+        polygon[k, 0] = p_upper[0] + (half_side if k in (1, 2) else -half_side)
+        polygon[k, 1] = p_upper[1] + (half_side if k in (2, 3) else -half_side)
+    count = _clip_to(polygon, 4, bottom, num_corners, p_upper[0], p_upper[1], margin)
     if lower_shape >= 0:
-        top, corners = records[lower_shape].top, records[lower_shape].top_count
+        top, num_corners = table[lower_shape].top, table[lower_shape].top_count
         count = (
-            _clip_to(polygon, count, top, corners, lower_p[0], lower_p[1], margin)
-            if corners > 0
+            _clip_to(polygon, count, top, num_corners, p_lower[0], p_lower[1], margin)
+            if num_corners > 0
             else 0
         )
     return polygon[:count]
 
 
 @njit(cache=True)
-def _overlap(records, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-def]
-    """Return how deep two footprints overlap seen from above [m], by separating axes.
+def _overlap(table, i, j, p_i, p_j, measure_gap):  # type: ignore[no-untyped-def]
+    """Return the overlap of two footprints by the separating-axis test [m].
 
     The result is not positive if they do not overlap. With `measure_gap`, a negative result is a
     lower bound of their distance.
     """
     gap = (
         np.hypot(p_i[0] - p_j[0], p_i[1] - p_j[1])
-        - records[i].footprint_radius
-        - records[j].footprint_radius
+        - table[i].footprint_radius
+        - table[j].footprint_radius
     )
     if gap > (MAX_MISS_DISTANCE if measure_gap else 0.0):
         return -gap
-    least = np.inf
+    min_overlap = np.inf
     for a, b, p_a, p_b in ((i, j, p_i, p_j), (j, i, p_j, p_i)):
         dx, dy = p_b[0] - p_a[0], p_b[1] - p_a[1]
-        sides = records[a].sides
-        corners = records[b].footprint
-        for k in range(records[a].footprint_count):
-            nx, ny, out = sides[k, 0], sides[k, 1], sides[k, 2]
-            nearest = np.inf
-            for m in range(records[b].footprint_count):
-                nearest = min(nearest, corners[m, 0] * nx + corners[m, 1] * ny)
-            least = min(least, out - nearest - dx * nx - dy * ny)
-            if least <= 0 and not measure_gap:
-                return least
-    return least
+        sides = table[a].sides
+        corners = table[b].footprint
+        for k in range(table[a].footprint_count):
+            nx, ny, offset = sides[k, 0], sides[k, 1], sides[k, 2]
+            min_projection = np.inf
+            for m in range(table[b].footprint_count):
+                min_projection = min(min_projection, corners[m, 0] * nx + corners[m, 1] * ny)
+            min_overlap = min(min_overlap, offset - min_projection - dx * nx - dy * ny)
+            if min_overlap <= 0 and not measure_gap:
+                return min_overlap
+    return min_overlap
 
 
 @njit(cache=True)
-def uncovered_top(records, shape, above, p_T, above_p, margin):  # type: ignore[no-untyped-def]
+def uncovered_top(table, lower, upper, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
     """Return the parts of an object's top that another object does not cover.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
-        shape: Row of the lower object's shape.
-        above: Row of the upper object's shape.
-        p_T: Origin of the lower object in T [m]. Shape (3,).
-        above_p: Origin of the upper object in T [m]. Shape (3,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        lower: Row of the lower object's shape.
+        upper: Row of the upper object's shape.
+        p_lower: Origin of the lower object in T [m]. Shape (3,).
+        p_upper: Origin of the upper object in T [m]. Shape (3,).
         margin: Distance to keep from the upper object [m].
 
     Returns:
         Corners of all parts in T [m]. Shape (V, 2).
     """
-    top, count = records[shape].top, records[shape].top_count
-    outline, outline_count = records[above].footprint, records[above].footprint_count
+    top, count = table[lower].top, table[lower].top_count
+    outline, outline_count = table[upper].footprint, table[upper].footprint_count
     corners = np.empty((0, 2))
     for k in range(outline_count):  # add the part of the top beyond each side of the outline
-        after = (k + 1) % outline_count
-        ex, ey = outline[after, 0] - outline[k, 0], outline[after, 1] - outline[k, 1]
+        successor = (k + 1) % outline_count
+        ex, ey = outline[successor, 0] - outline[k, 0], outline[successor, 1] - outline[k, 1]
         length = np.hypot(ex, ey)
         polygon = np.zeros((48, 2))
-        polygon[:count] = top[:count] + p_T[:2]
-        beyond = _clip(
+        polygon[:count] = top[:count] + p_lower[:2]
+        num_corners = _clip(
             polygon,
             count,
-            outline[k, 0] + above_p[0],
-            outline[k, 1] + above_p[1],
+            outline[k, 0] + p_upper[0],
+            outline[k, 1] + p_upper[1],
             -ey / length,
             ex / length,
             -margin,
         )
-        corners = np.vstack((corners, polygon[:beyond]))
+        corners = np.vstack((corners, polygon[:num_corners]))
     return corners
 
 
 @njit(cache=True)
-def connected_objects(records, shapes, p_T, row, margin):  # type: ignore[no-untyped-def]
+def connected_objects(table, shapes, p_T, index, margin):  # type: ignore[no-untyped-def]
     """Return which objects may touch an object, directly or through others.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
-        row: Index of the object.
+        index: Index of the object.
         margin: Largest gap between the axis-aligned boxes of touching objects [m].
 
     Returns:
@@ -203,29 +214,29 @@ def connected_objects(records, shapes, p_T, row, margin):  # type: ignore[no-unt
     lower, upper = np.empty((n, 3)), np.empty((n, 3))
     for i in range(n):
         for axis in range(3):
-            lower[i, axis] = p_T[i, axis] + records[shapes[i]].lower[axis]
-            upper[i, axis] = p_T[i, axis] + records[shapes[i]].upper[axis]
+            lower[i, axis] = p_T[i, axis] + table[shapes[i]].lower[axis]
+            upper[i, axis] = p_T[i, axis] + table[shapes[i]].upper[axis]
     reached = np.zeros(n, np.bool_)
-    reached[row] = True
-    waiting = [row]
-    while len(waiting) > 0:
-        i = waiting.pop()
+    reached[index] = True
+    pending = [index]
+    while len(pending) > 0:
+        i = pending.pop()
         for j in range(n):
             gap = -np.inf
             for axis in range(3):
                 gap = max(gap, lower[i, axis] - upper[j, axis], lower[j, axis] - upper[i, axis])
             if gap <= margin and not reached[j]:
                 reached[j] = True
-                waiting.append(j)
+                pending.append(j)
     return reached
 
 
 @njit(cache=True)
-def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-def]
-    """Find which object stands on which.
+def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def]
+    """Find the contacts between objects, and the first fault.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         half_size: Half extents of the support's floor [m]. Shape (2,).
@@ -240,16 +251,16 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
     count = 0
     stack = np.arange(n)
     fault = NO_FAULT
-    faulty = 0
+    faulty_object = 0
     for j in range(n):
         shape = shapes[j]
-        if records[shape].fault != 0:
-            return LEANING if records[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
+        if table[shape].fault != 0:  # The values are those of `shape_table.Fault`.
+            return LEANING if table[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
         for axis in range(2):
             beyond = (
                 max(
-                    records[shape].upper[axis] + p_T[j, axis],
-                    -records[shape].lower[axis] - p_T[j, axis],
+                    table[shape].upper[axis] + p_T[j, axis],
+                    -table[shape].lower[axis] - p_T[j, axis],
                 )
                 - half_size[axis]
             )
@@ -257,7 +268,7 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
                 return OUTSIDE, j, pairs[:0], stack
     for j in range(n):
         upper = shapes[j]
-        bottom_z = p_T[j, 2] + records[upper].bottom_z
+        bottom_z = p_T[j, 2] + table[upper].bottom_z
         supported = False
         if bottom_z < -MAX_CONTACT_GAP:
             return OVERLAPPING, j, pairs[:0], stack
@@ -265,40 +276,40 @@ def find_contacts(records, shapes, p_T, half_size):  # type: ignore[no-untyped-d
             pairs[count, 0], pairs[count, 1] = GROUND, j
             count += 1
             supported = True
-        # Whether another object ends at the height of this one's bottom, near it or below it.
+        # Whether the top of another object at the height of this bottom is beside it, or below it.
         is_near = False
         is_above = False
         for i in range(n):
             if i == j:
                 continue
             lower = shapes[i]
-            top_z = p_T[i, 2] + records[lower].top_z
-            level = abs(bottom_z - top_z) < MAX_CONTACT_GAP
-            height_overlap = min(p_T[j, 2] + records[upper].top_z, top_z) - max(
-                bottom_z, p_T[i, 2] + records[lower].bottom_z
+            top_z = p_T[i, 2] + table[lower].top_z
+            same_height = abs(bottom_z - top_z) < MAX_CONTACT_GAP
+            height_overlap = min(p_T[j, 2] + table[upper].top_z, top_z) - max(
+                bottom_z, p_T[i, 2] + table[lower].bottom_z
             )
-            if not level and height_overlap <= MAX_OVERLAP:
+            if not same_height and height_overlap <= MAX_OVERLAP:
                 continue
-            overlap = _overlap(records, upper, lower, p_T[j], p_T[i], level)
-            if not level:
+            overlap = _overlap(table, upper, lower, p_T[j], p_T[i], same_height)
+            if not same_height:
                 if overlap > MAX_OVERLAP and fault == NO_FAULT:
-                    fault, faulty = OVERLAPPING, j
+                    fault, faulty_object = OVERLAPPING, j
                 continue
             is_near |= overlap > -MAX_MISS_DISTANCE
             is_above |= overlap > 0
             if overlap <= 0:
                 continue
             # Faces as large as the footprints are in contact where the footprints overlap.
-            both_flat = records[upper].flat and records[lower].flat
-            if both_flat or len(contact_polygon(records, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
+            both_flat = table[upper].flat and table[lower].flat
+            if both_flat or len(contact_polygon(table, lower, upper, p_T[i], p_T[j], 0.0)) > 0:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
                 supported = True
-                old, new = stack[j], stack[i]
+                old_stack, new_stack = stack[j], stack[i]
                 for k in range(n):
-                    if stack[k] == old:
-                        stack[k] = new
+                    if stack[k] == old_stack:
+                        stack[k] = new_stack
         if not supported and fault == NO_FAULT:
-            faulty = j
+            faulty_object = j
             fault = EDGE if is_above else UNSUPPORTED if is_near else FLOATING
-    return fault, faulty, pairs[:count], stack
+    return fault, faulty_object, pairs[:count], stack

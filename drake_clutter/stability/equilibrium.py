@@ -22,11 +22,11 @@ NO_LOADS = np.empty((0, 4))
 
 
 @njit(cache=True)
-def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, friction, loads):  # type: ignore[no-untyped-def]
+def equilibrium_residuals(table, shapes, p_T, pairs, margins, com_offsets, friction, loads):  # type: ignore[no-untyped-def]
     """Return the weight and moment of each object that contacts cannot balance.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
@@ -52,28 +52,28 @@ def equilibrium_residuals(records, shapes, p_T, pairs, margins, com_offsets, fri
         lower, upper = pairs[c]
         lower_shape, lower_p = (shapes[lower], p_T[lower]) if lower >= 0 else (-1, p_T[upper])
         polygon = contact_polygon(
-            records, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper]
+            table, lower_shape, shapes[upper], lower_p, p_T[upper], margins[upper]
         )
         for k in range(len(polygon)):
             points[count, 0], points[count, 1] = polygon[k, 0], polygon[k, 1]
-            points[count, 2] = p_T[upper, 2] + records[shapes[upper]].bottom_z
+            points[count, 2] = p_T[upper, 2] + table[shapes[upper]].bottom_z
             ends[count, 0], ends[count, 1] = upper, lower
             count += 1
     total = 0.0
     for i in range(n):
-        total += records[shapes[i]].mass
+        total += table[shapes[i]].mass
     rows, sides = (6, 4) if friction > 0 else (3, 1)
     A = np.zeros((sides * count, rows * n))  # transposed: a row is a column of the problem
     b = np.zeros(rows * n)
     for i in range(n):
-        b[rows * i] = records[shapes[i]].mass / total
+        b[rows * i] = table[shapes[i]].mass / total
     for k in range(count):
         for end in range(2):
             i = ends[k, end]
             if i < 0:
                 continue
             sign = 1.0 - 2.0 * end
-            com = records[shapes[i]].com
+            com = table[shapes[i]].com
             x = (points[k, 0] - p_T[i, 0] - com[0] - com_offsets[i, 0]) / _MOMENT_ARM
             y = (points[k, 1] - p_T[i, 1] - com[1] - com_offsets[i, 1]) / _MOMENT_ARM
             z = (points[k, 2] - p_T[i, 2] - com[2]) / _MOMENT_ARM
@@ -113,7 +113,7 @@ def _contains(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
+def _is_stable_tower(table, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
     """Return whether a stack stands in which each object has one contact below.
 
     Then the loads add up from the top. The result is also False if an object has several contacts
@@ -122,23 +122,23 @@ def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-un
     n = len(shapes)
     below = np.full(n, -2)
     for lower, upper in pairs:
-        if below[upper] != -2 or (lower >= 0 and records[shapes[lower]].rolls):
+        if below[upper] != -2 or (lower >= 0 and table[shapes[lower]].rolls):
             return False
         below[upper] = lower
     force, moment = np.empty(n), np.empty((n, 2))  # of the object and all that it carries
     for i in range(n):
-        force[i] = records[shapes[i]].mass
+        force[i] = table[shapes[i]].mass
         for axis in range(2):
-            moment[i, axis] = force[i] * (p_T[i, axis] + records[shapes[i]].com[axis])
+            moment[i, axis] = force[i] * (p_T[i, axis] + table[shapes[i]].com[axis])
     for i in np.argsort(p_T[:, 2])[::-1]:
         x, y = moment[i, 0] / force[i], moment[i, 1] / force[i]
         shape, lower = shapes[i], below[i]
-        if not _contains(records[shape].bottom, records[shape].bottom_count, p_T[i], x, y, margin):
+        if not _contains(table[shape].bottom, table[shape].bottom_count, p_T[i], x, y, margin):
             return False
         if lower >= 0:
             carrier = shapes[lower]
             if not _contains(
-                records[carrier].top, records[carrier].top_count, p_T[lower], x, y, margin
+                table[carrier].top, table[carrier].top_count, p_T[lower], x, y, margin
             ):
                 return False
             force[lower] += force[i]
@@ -148,7 +148,7 @@ def _is_stable_tower(records, shapes, p_T, pairs, margin):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
+def least_stable_object(table, shapes, p_T, pairs, margin, friction):  # type: ignore[no-untyped-def]
     """Return the object farthest from equilibrium, or -1, and whether it rolls.
 
     Vertical forces are tried first, then forces with friction, which hold for example an arch of
@@ -157,39 +157,37 @@ def least_stable_object(records, shapes, p_T, pairs, margin, friction):  # type:
     mass moved by the margin to either side of the line.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
         margin: Width by which contacts are shrunk [m].
         friction: Coefficient of friction.
     """
-    if _is_stable_tower(records, shapes, p_T, pairs, margin):
+    if _is_stable_tower(table, shapes, p_T, pairs, margin):
         return -1, False
     n = len(shapes)
     margins = np.full(n, margin)
     com_offsets = np.zeros((n, 2))
-    residual = equilibrium_residuals(
-        records, shapes, p_T, pairs, margins, com_offsets, 0.0, NO_LOADS
-    )
+    residual = equilibrium_residuals(table, shapes, p_T, pairs, margins, com_offsets, 0.0, NO_LOADS)
     needed_friction = 0.0
     if residual.max() > 0:
         needed_friction = friction
         with_friction = equilibrium_residuals(
-            records, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
+            table, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
         )
         if with_friction.max() > 0:
             # The tolerance makes the first of identical objects the result, despite rounding.
             largest = np.nonzero(residual > residual.max() - 1e-9)[0]
             return largest[0], False
     for lower, upper in pairs:
-        if lower >= 0 and records[shapes[lower]].rolls:
-            line = records[shapes[lower]].top[1] - records[shapes[lower]].top[0]
+        if lower >= 0 and table[shapes[lower]].rolls:
+            line = table[shapes[lower]].top[1] - table[shapes[lower]].top[0]
             for sign in (-1.0, 1.0):
                 com_offsets[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
                 com_offsets[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
                 residual = equilibrium_residuals(
-                    records, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
+                    table, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
                 )
                 if residual.max() > 0:
                     return upper, True
@@ -255,11 +253,11 @@ def canonical_order(shapes, p_T, stack, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, margin, friction):  # type: ignore[no-untyped-def]
+def least_stable_objects(table, shapes, p_T, pairs, order, first, selected, margin, friction):  # type: ignore[no-untyped-def]
     """Return the results of `least_stable_object` for several stacks.
 
     Args:
-        records: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
@@ -287,6 +285,6 @@ def least_stable_objects(records, shapes, p_T, pairs, order, first, selected, ma
                 within[contacts, 0], within[contacts, 1] = position[lower], position[upper]
                 contacts += 1
         results[k, 0], results[k, 1] = least_stable_object(
-            records, shapes[rows], p_T[rows], within[:contacts], margin, friction
+            table, shapes[rows], p_T[rows], within[:contacts], margin, friction
         )
     return results

@@ -43,11 +43,11 @@ def _inverse_depth(camera, nx, ny, nz, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
+def _cast_object(arrays, shape, p_TO, camera, label, nearest, hit):  # type: ignore[no-untyped-def]
     """Cast all rays that may meet an object, and record those that meet it first.
 
     Args:
-        table: `ShapeArrays` of the shapes.
+        arrays: `ShapeArrays` of the shapes.
         shape: Row of the object's shape.
         p_TO: Origin of the object in T [m]. Shape (3,).
         camera: `Pinhole` of the camera.
@@ -66,10 +66,10 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
     begin = np.zeros(height, np.int64)
     end = np.zeros(height, np.int64)
     rays = 0
-    for face in range(table.records[shape].first_face, table.records[shape].last_face):
-        first, last = table.first_corner[face], table.first_corner[face + 1]
-        nx, ny, nz = table.normal[face, 0], table.normal[face, 1], table.normal[face, 2]
-        corner = table.corner[first]
+    for face in range(arrays.table[shape].first_face, arrays.table[shape].last_face):
+        first, last = arrays.first_corner[face], arrays.first_corner[face + 1]
+        nx, ny, nz = arrays.normal[face, 0], arrays.normal[face, 1], arrays.normal[face, 2]
+        corner = arrays.corner[first]
         k = (
             nx * (corner[0] + p_TO[0] - p_TC[0])
             + ny * (corner[1] + p_TO[1] - p_TC[1])
@@ -84,9 +84,9 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
         for c in range(count):
             x, y, z = point_to_camera(
                 camera,
-                table.corner[first + c, 0],
-                table.corner[first + c, 1],
-                table.corner[first + c, 2],
+                arrays.corner[first + c, 0],
+                arrays.corner[first + c, 1],
+                arrays.corner[first + c, 2],
             )
             u[c], v[c] = project(camera, x + p_x, y + p_y, z + p_z)
             top, bottom = min(top, v[c]), max(bottom, v[c])
@@ -126,7 +126,7 @@ def _cast_object(table, shape, p_TO, camera, label, nearest, hit):  # type: igno
 
 
 @njit(cache=True)
-def _window(records, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
+def _window(shape, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
     """Return the window of the image that contains an object's bounding box.
 
     Returns:
@@ -138,9 +138,9 @@ def _window(records, p_TO, camera, image_shape):  # type: ignore[no-untyped-def]
     for corner in range(8):
         x, y, z = point_to_camera(
             camera,
-            records.upper[0] if corner & 1 else records.lower[0],
-            records.upper[1] if corner & 2 else records.lower[1],
-            records.upper[2] if corner & 4 else records.lower[2],
+            shape.upper[0] if corner & 1 else shape.lower[0],
+            shape.upper[1] if corner & 2 else shape.lower[1],
+            shape.upper[2] if corner & 4 else shape.lower[2],
         )
         if z + p_z < MIN_DEPTH:
             return 0, 0, 0, 0
@@ -164,11 +164,11 @@ def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible):  # type: ignore[no-untyped-def]
+def _cast_scene(arrays, shapes, p_T, camera, nearest, hit, unoccluded, visible):  # type: ignore[no-untyped-def]
     """Find the first object that each ray meets, and count rays.
 
     Args:
-        table: `ShapeArrays` of the shapes.
+        arrays: `ShapeArrays` of the shapes.
         shapes: Row of each object's shape. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         camera: `Pinhole` of the camera.
@@ -184,7 +184,7 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
     windows = np.zeros((len(shapes), 4), np.int64)
     row_begin, row_end, column_begin, column_end = hit.shape[0], 0, hit.shape[1], 0
     for i in range(len(shapes)):
-        window = _window(table.records[shapes[i]], p_T[i], camera, hit.shape)
+        window = _window(arrays.table[shapes[i]], p_T[i], camera, hit.shape)
         windows[i, 0], windows[i, 1], windows[i, 2], windows[i, 3] = window
         if window[1] > 0:
             row_begin, row_end = min(row_begin, window[0]), max(row_end, window[1])
@@ -199,7 +199,7 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
     for i in range(len(shapes)):
         if windows[i, 1] > 0:
             unoccluded[i] = _cast_object(
-                table, shapes[i], p_T[i], camera, np.int16(i), nearest, hit
+                arrays, shapes[i], p_T[i], camera, np.int16(i), nearest, hit
             )
     for i in range(len(shapes)):
         label = np.int16(i)
@@ -215,13 +215,13 @@ def _cast_scene(table, shapes, p_T, camera, nearest, hit, unoccluded, visible): 
 
 
 @njit(cache=True)
-def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
+def _occluders_by_ray(arrays, shapes, p_T, camera, target, nearest, hit):  # type: ignore[no-untyped-def]
     """Return the objects in front of a target as bits, for each ray of the target."""
-    window = _window(table.records[shapes[target]], p_T[target], camera, hit.shape)
+    window = _window(arrays.table[shapes[target]], p_T[target], camera, hit.shape)
     nearest[window[0] : window[1], window[2] : window[3]] = 0
     hit[window[0] : window[1], window[2] : window[3]] = -1
     if window[1] > 0:
-        _cast_object(table, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
+        _cast_object(arrays, shapes[target], p_T[target], camera, np.int16(0), nearest, hit)
     rows, columns = np.nonzero(hit[window[0] : window[1], window[2] : window[3]] == 0)
     rows = rows + window[0]
     columns = columns + window[2]
@@ -230,7 +230,7 @@ def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type
     for k in range(len(rows)):
         own[k] = nearest[rows[k], columns[k]]
     for i in range(len(shapes)):
-        other = _window(table.records[shapes[i]], p_T[i], camera, hit.shape)
+        other = _window(arrays.table[shapes[i]], p_T[i], camera, hit.shape)
         is_apart = (
             other[0] >= window[1]
             or window[0] >= other[1]
@@ -239,7 +239,7 @@ def _occluders_by_ray(table, shapes, p_T, camera, target, nearest, hit):  # type
         )
         if i == target or is_apart:
             continue
-        _cast_object(table, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
+        _cast_object(arrays, shapes[i], p_T[i], camera, np.int16(1), nearest, hit)
         for k in range(len(rows)):
             if hit[rows[k], columns[k]] == 1:
                 occluders[k] |= np.uint64(1) << np.uint64(i)
@@ -296,7 +296,7 @@ class RayCaster:
         """Return the visible fractions of shapes, see `visible_fractions`.
 
         Args:
-            shapes: Rows of the shapes in the table. Shape (n,).
+            shapes: Rows of the shapes in the arrays. Shape (n,).
             p_T: Origins of the objects in T [m]. Shape (n, 3).
         """
         return self._cast(shapes, p_T)[0]

@@ -253,13 +253,13 @@ class ShapeArrays(NamedTuple):
     Few arrays keep the overhead of calls to compiled functions small.
 
     Attributes:
-        records: The shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        table: The shapes, of type `SHAPE_DTYPE`. Shape (N,).
         first_corner: Index of each face's first corner, and the end. Shape (F + 1,).
         normal: Outward normals of the faces. Shape (F, 3).
         corner: Corners of the faces [m]. Shape (V, 3).
     """
 
-    records: NDArray[np.void]
+    table: NDArray[np.void]
     first_corner: Ints
     normal: Floats
     corner: Floats
@@ -320,25 +320,25 @@ class ShapeTable:
         """Add the shape of an object as a new row."""
         shape = orient_shape(scene_object.object_class, scene_object.X_TO.quaternion)
         row = len(self._row_by_shape)
-        face = int(self.arrays.records["last_face"].max())
+        face = int(self.arrays.table["last_face"].max())
         corner = self.arrays.first_corner[face]
         last_face = face + len(shape.surface.counts)
         last_corner = corner + len(shape.surface.corner)
         if (
-            row >= len(self.arrays.records)
+            row >= len(self.arrays.table)
             or last_face >= len(self.arrays.normal)
             or last_corner > len(self.arrays.corner)
         ):
             old = self.arrays
             self.arrays = _allocate(
-                2 * len(old.records),
+                2 * len(old.table),
                 2 * max(last_face + 1, len(old.normal)),
                 2 * max(last_corner, len(old.corner)),
             )
             for array, earlier in zip(self.arrays, old, strict=True):
                 array[: len(earlier)] = earlier
         table = self.arrays
-        record = table.records[row]
+        record = table.table[row]
         record["fault"] = shape.fault
         record["rolls"] = shape.rolls
         record["com"] = shape.com

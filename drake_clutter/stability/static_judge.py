@@ -166,7 +166,7 @@ class StaticStabilityJudge:
         scene[name]
         shapes, p_T = self._arrays(scene.objects)
         reached = contacts.connected_objects(
-            self._shapes.arrays.records, shapes, p_T, scene.names.index(name), _TOUCHING_MARGIN
+            self._shapes.arrays.table, shapes, p_T, scene.names.index(name), _TOUCHING_MARGIN
         )
         return replace(scene, objects=tuple(itertools.compress(scene.objects, reached)))
 
@@ -232,7 +232,7 @@ class StaticStabilityJudge:
                 margin[own] = (low + high) / 2
                 com_offsets = np.zeros((len(rows), 2))
                 residuals = equilibrium.equilibrium_residuals(
-                    self._shapes.arrays.records,
+                    self._shapes.arrays.table,
                     shapes[rows],
                     p_T[rows],
                     members,
@@ -327,7 +327,7 @@ class StaticStabilityJudge:
         rest = sorted(stack - {removed})
         if not rest:
             return True
-        records = self._shapes.arrays.records
+        table = self._shapes.arrays.table
         # An object that is not fixed holds like the ground while it is present.
         number = {row: k for k, row in enumerate(rest)}
         held_pairs = [
@@ -336,14 +336,14 @@ class StaticStabilityJudge:
             if b in number and a != removed
         ]
         loads = [
-            (x, y, p_T[row, 2] + records[shapes[row]]["top_z"], number[row])
+            (x, y, p_T[row, 2] + table[shapes[row]]["top_z"], number[row])
             for row in rest
             for x, y in contacts.uncovered_top(
-                records, shapes[row], shapes[removed], p_T[row], p_T[removed], self._margin
+                table, shapes[row], shapes[removed], p_T[row], p_T[removed], self._margin
             )
         ]
         residuals = equilibrium.equilibrium_residuals(
-            records,
+            table,
             shapes[rest],
             p_T[rest],
             np.array(held_pairs, dtype=np.int64).reshape(-1, 2),
@@ -359,7 +359,7 @@ class StaticStabilityJudge:
     ) -> _ContactGraph | InconclusiveVerdict:
         """Return the contacts of a scene, or why the model does not cover it."""
         fault, faulty, pairs, stack = contacts.find_contacts(
-            self._shapes.arrays.records, shapes, p_T, scene.support.half_size
+            self._shapes.arrays.table, shapes, p_T, scene.support.half_size
         )
         if fault != contacts.NO_FAULT:
             return InconclusiveVerdict(_INCONCLUSIVE_REASONS[fault], scene.objects[faulty].name)
@@ -395,10 +395,10 @@ class StaticStabilityJudge:
         ]
         unknown = [k for k, key in enumerate(keys) if key not in self._cache]
         if unknown:
-            records = self._shapes.arrays.records
+            table = self._shapes.arrays.table
             options = (self._margin, self._friction)
             solved = equilibrium.least_stable_objects(
-                records, *graph[:3], order, first, np.array(unknown), *options
+                table, *graph[:3], order, first, np.array(unknown), *options
             )
             self._cache.update(
                 zip((keys[k] for k in unknown), map(tuple, solved.tolist()), strict=True)
