@@ -154,7 +154,7 @@ def _run_closed_loop(case: Case, perception: str) -> list[Line]:
         scene,
         perceive=make_perception(scenario, scene.support),
         seed=scenario.seed,
-        world=scenario.world,
+        config=scenario.world,
         record_motion=True,
     )
     policy = make_policy(scenario.agent, scenario.world)
@@ -178,7 +178,7 @@ def images(case: Case) -> list[Line]:
     scene = _scene(case)
     perceive = make_perception(scenario, scene.support)
     assert perceive is not None
-    backend = ImageBackend(scene, perceive, seed=scenario.seed, world=scenario.world)
+    backend = ImageBackend(scene, perceive, seed=scenario.seed, config=scenario.world)
     policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(backend, policy, max_moves=scenario.max_moves)
     return _trace(task, backend.belief.objects)
@@ -196,7 +196,7 @@ def generation(case: Case) -> list[Line]:
     rng = item_rng(0, case.number)
     scene, failures = generator.lay_out(rng)
     assert scene.graph is not None
-    graph = scene.graph.nx
+    graph = scene.graph.digraph
     nodes = [f"{node} {kind}" for node, kind in graph.nodes(data="kind")]
     # The kind of an edge is an orientation, which has a name, or a text.
     edges = [f"{a} {b} {getattr(kind, 'name', kind)}" for a, b, kind in graph.edges(data="kind")]

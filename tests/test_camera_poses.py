@@ -229,8 +229,10 @@ def test_poses_are_fitted_to_images_of_a_tilted_camera(name: str, tilted: LabelD
     assert p_error < 0.003
     assert angle < math.radians(2.0)
     explained = evaluate_pose(true.object_class, true.X_TO, depth, CAMERA)
-    assert (explained.mask(depth.shape) != (label == 0)).sum() <= 0.02 * explained.unoccluded_pixels
-    assert explained.free_space_violations <= 0.02 * explained.unoccluded_pixels
+    assert (
+        explained.mask(depth.shape) != (label == 0)
+    ).sum() <= 0.02 * explained.num_unoccluded_pixels
+    assert explained.num_free_space_violations <= 0.02 * explained.num_unoccluded_pixels
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DEFAULT_CELL.camera], ids=["tilted", "vertical"])

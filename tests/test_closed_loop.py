@@ -210,7 +210,7 @@ def test_each_request_is_planned_once(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator.AdvanceTo(1.5)
     found: PlanResponse = response.Eval(context)
     assert isinstance(found.plan, PlanningFailure)
-    assert (found.number, found.plan.reason) == (3, PlanningFailureReason.NO_FREE_SPOT)
+    assert (found.number, found.plan.reason) == (3, PlanningFailureReason.NO_FREE_PLACEMENT)
 
 
 def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
             return Decision(Move("large_marker"))
         return largest_clear(belief, observation, rng)
 
-    loop = ClosedLoop(scene, seed=0, world=config, record_motion=True)
+    loop = ClosedLoop(scene, seed=0, config=config, record_motion=True)
     task = run_episode(loop, marker_first, max_moves=4)
     timing = loop.timing
     results = [step.outcome.result for step in task.transitions]
@@ -262,7 +262,7 @@ def test_a_closed_loop_episode_with_another_arm(
     robot: str, joints: int, config: ClutterConfig
 ) -> None:
     cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
-    loop = ClosedLoop(COVERED, seed=0, world=replace(config, cell=cell), record_motion=True)
+    loop = ClosedLoop(COVERED, seed=0, config=replace(config, cell=cell), record_motion=True)
     task = run_episode(loop, largest_clear, max_moves=1)
     (step,) = task.transitions
     assert (step.outcome.result, task.termination) == (
@@ -324,7 +324,7 @@ def test_without_a_guarded_descent_objects_are_released_at_the_placement_pose(
         "GUARDED_PLANNER_CONFIG",
         PlannerConfig(max_guarded_descent=descent, descent_start_offset=0.007),
     )
-    loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, world=config)
+    loop = ClosedLoop(COVERED, perceive=lambda *_: BEFORE, seed=0, config=config)
     loop.policy_system.policy = first_valid_move
     request = loop.policy_system.after_observation(PolicyState(), BEFORE).request
     assert request.command is not None
@@ -348,7 +348,7 @@ def test_infeasible_moves_are_invalid_for_the_policy(config: ClutterConfig) -> N
         resting("large_marker", xy=(-0.1, 0.0), floor=box.top_height),
         resting("tomato_soup_can", xy=(0.2, 0.2)),
     )
-    loop = ClosedLoop(scene_of(box, marker, can), seed=0, world=config)
+    loop = ClosedLoop(scene_of(box, marker, can), seed=0, config=config)
     loop.policy_system.policy = policy
     observation = loop.perception.observation
     assert (

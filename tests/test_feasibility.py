@@ -305,7 +305,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert set(setups) == set(names)
     for found in setups.values():
         assert found["planned"] > 0
-        assert set(found["results"]) <= {PLANNED, PlanningFailureReason.NO_FREE_SPOT.value}
+        assert set(found["results"]) <= {PLANNED, PlanningFailureReason.NO_FREE_PLACEMENT.value}
     reach = table(out / "reach.csv")
     for name in names:
         of_setup = [row for row in reach if row["setup"] == name]

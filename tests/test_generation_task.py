@@ -41,9 +41,11 @@ def finished_stacks(graph: ClutterGraph) -> set[int]:
     """Return the object nodes of the stacks whose attributes are all terminal."""
     found = set()
     for bottom in graph.stack_bases():
-        members = set(bottom).union(*(nx.descendants(graph.nx, node) for node in bottom))
+        members = set(bottom).union(*(nx.descendants(graph.digraph, node) for node in bottom))
         edges = [
-            e for e in graph.nx.edges(data="kind") if e[1] in members and graph.kind(e[1]) != END
+            e
+            for e in graph.digraph.edges(data="kind")
+            if e[1] in members and graph.kind(e[1]) != END
         ]
         if all(graph.kind(node) not in NON_TERMINAL_KINDS for node in members) and all(
             kind != PRIMITIVE for *_, kind in edges
@@ -73,8 +75,8 @@ def test_the_observation_represents_the_graph(objects: str) -> None:
         while not terminated:
             graph = environment.partial.graph
             observed = graph_of(observation, environment)
-            assert [observed.kind(k) for k in observed.nx] == graph.kinds()
-            assert dict(observed.nx.edges) == dict(graph.nx.edges)
+            assert [observed.kind(k) for k in observed.digraph] == graph.kinds()
+            assert dict(observed.digraph.edges) == dict(graph.digraph.edges)
             assert (info["action_mask"] == grammar.feasible_rules(graph, NodeBudget(14))).all()
             assert (observation["node_mask"] == (observation["node_kind"] > 0)).all()
             assert (observation["edge_mask"] == (observation["edge_kind"] > 0)).all()
@@ -106,23 +108,23 @@ def test_the_flags_mark_the_nodes_that_rules_rewrite() -> None:
             marked = (
                 np.flatnonzero(
                     observation["node_flags"][
-                        :, 1 + ["top", "slot", "child"].index(rule.left.rewritten)
+                        :, 1 + ["top", "slot", "child"].index(rule.left.target)
                     ]
                 )
-                if (rule.left.rewritten != "tray")
+                if (rule.left.target != "tray")
                 else np.array([0])
             )
             observation, _, terminated, _, info = environment.step(action)
             after = environment.partial.graph
-            changed = {n for n in before.nx if before.kind(n) != after.kind(n)}
+            changed = {n for n in before.digraph if before.kind(n) != after.kind(n)}
             changed |= {
                 child
-                for _, child in set(before.nx.edges) & set(after.nx.edges)
+                for _, child in set(before.digraph.edges) & set(after.digraph.edges)
                 if any(
                     before.edge_kind(p, child) != after.edge_kind(p, child)
-                    for p in before.nx.predecessors(child)
+                    for p in before.digraph.predecessors(child)
                 )
-                and rule.left.rewritten == "child"
+                and rule.left.target == "child"
             }
             if changed:
                 changed_kinds += 1
@@ -244,7 +246,7 @@ def test_graphs_of_hundreds_of_nodes_are_observed() -> None:
     observation, info = environment.reset(seed=0)
     structure = np.array(
         [
-            rule.left.rewritten in ("tray", "top") and rule.name != "end"
+            rule.left.target in ("tray", "top") and rule.name != "end"
             for rule in environment.grammar.rules
         ]
     )
@@ -252,7 +254,7 @@ def test_graphs_of_hundreds_of_nodes_are_observed() -> None:
         observation, *_, info = environment.step(random_action(mask, generator))
     graph = graph_of(observation, environment)
     assert len(graph) > 290
-    assert dict(graph.nx.edges) == dict(environment.partial.graph.nx.edges)
+    assert dict(graph.digraph.edges) == dict(environment.partial.graph.digraph.edges)
 
 
 def test_the_maximum_number_of_edges() -> None:
@@ -272,5 +274,5 @@ def test_the_maximum_number_of_edges() -> None:
 
         for _ in range(10):
             graph = grammar.derive(NodeBudget(nodes), choose).graph
-            most = max(most, graph.nx.number_of_edges())
+            most = max(most, graph.digraph.number_of_edges())
         assert most <= max_edges(nodes)

@@ -54,7 +54,7 @@ EXAMPLE = (
 
 def ordered(graph: ClutterGraph) -> tuple[Nodes, Edges]:
     """Return nodes and edges with their kinds, in order."""
-    return list(graph.nx.nodes(data="kind")), list(graph.nx.edges(data="kind"))
+    return list(graph.digraph.nodes(data="kind")), list(graph.digraph.edges(data="kind"))
 
 
 # --- The rule sheet ---
@@ -357,7 +357,7 @@ def matches_by_networkx(graph: ClutterGraph, rule: ProductionRule) -> bool:
         pattern.add_node(name, kinds=kinds)
     pattern.add_edges_from(rule.left.edges)
     matcher = DiGraphMatcher(
-        graph.nx,
+        graph.digraph,
         pattern,
         lambda host, left: host["kind"] in left["kinds"],
         lambda host, _: host["kind"] == PRIMITIVE,

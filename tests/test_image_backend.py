@@ -49,7 +49,7 @@ def test_the_true_object_nearest_to_the_detection_is_picked(
         names.extend(o.name for o in belief.objects)
         return largest_clear(belief, observation, rng)
 
-    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, world=config)
+    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, config=config)
     task = run_episode(backend, policy, max_moves=3)
     known = backend.belief.objects
     (step,) = task.transitions
@@ -65,7 +65,7 @@ def test_the_true_object_nearest_to_the_detection_is_picked(
 
 def test_an_episode_ends_without_a_move(config: ClutterConfig) -> None:
     observation = shifted_observation(COVERED, config, 0.0)
-    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, world=config)
+    backend = ImageBackend(COVERED, lambda *_: observation, seed=0, config=config)
     task = run_episode(backend, lambda *_: Decision(None), max_moves=3)
     assert (task.transitions, task.termination) == ([], None)
 

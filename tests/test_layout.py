@@ -48,19 +48,19 @@ def carriers(graph: ClutterGraph, node: int) -> list[int]:
 
     It is empty for objects on the tray.
     """
-    (parent, *_) = graph.nx.predecessors(node)
+    (parent, *_) = graph.digraph.predecessors(node)
     if parent == ClutterGraph.TRAY_NODE:
         return []
-    return list(graph.nx.predecessors(parent)) if graph.kind(parent) == DUMMY else [parent]
+    return list(graph.digraph.predecessors(parent)) if graph.kind(parent) == DUMMY else [parent]
 
 
 def twins(graph: ClutterGraph) -> list[tuple[int, int]]:
     """Return the two objects of every pair."""
     return [
         (one, other)
-        for node, kind in graph.nx.nodes(data="kind")
+        for node, kind in graph.digraph.nodes(data="kind")
         if kind == DUMMY
-        for one, other in [graph.nx.predecessors(node)]
+        for one, other in [graph.digraph.predecessors(node)]
     ]
 
 

@@ -39,7 +39,9 @@ def test_evidence_agrees_with_the_label_image() -> None:
         mask[e.window] = e.consistent
         either = np.count_nonzero(mask | by_name[o.name])
         assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * either
-    assert e.unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), "nothing occludes the can"
+    assert e.num_unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), (
+        "nothing occludes the can"
+    )
 
 
 def test_an_object_with_two_hypotheses_is_selected_once() -> None:

@@ -45,7 +45,7 @@ def test_what_is_written_is_read(frozen: bool, tmp_path: Path) -> None:
     for number, scene in enumerate(SCENES):
         assert scene.graph is not None
         derivation = held.derivation(number, held.grammar)
-        assert dict(derivation.graph.nx.edges) == dict(scene.graph.nx.edges)
+        assert dict(derivation.graph.digraph.edges) == dict(scene.graph.digraph.edges)
         if frozen:
             settled = held.settled_scene(number, held.grammar, WORLD)
             assert settled.names == scene.names

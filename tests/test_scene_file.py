@@ -69,8 +69,12 @@ def assert_same(one: Scene, other: Scene) -> None:
     assert (one.support, one.derivation, one.seed) == (other.support, other.derivation, other.seed)
     assert (one.graph is None) == (other.graph is None)
     if one.graph is not None and other.graph is not None:
-        assert list(one.graph.nx.nodes(data="kind")) == list(other.graph.nx.nodes(data="kind"))
-        assert list(one.graph.nx.edges(data="kind")) == list(other.graph.nx.edges(data="kind"))
+        assert list(one.graph.digraph.nodes(data="kind")) == list(
+            other.graph.digraph.nodes(data="kind")
+        )
+        assert list(one.graph.digraph.edges(data="kind")) == list(
+            other.graph.digraph.edges(data="kind")
+        )
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -148,7 +148,7 @@ def test_extracted_segments_match_the_true_masks() -> None:
     found = extract_segments(
         plain.class_map, votes, (0.02, 0.02), CLASSES, WINDOW, image.depth.shape, min_votes=4
     )
-    assert [segment.name for segment in found] == list(CLASSES)
+    assert [segment.class_name for segment in found] == list(CLASSES)
     for k, segment in enumerate(found):
         true = image.label == k
         assert (segment.mask & true).sum() / (segment.mask | true).sum() > 0.8

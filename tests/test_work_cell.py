@@ -85,8 +85,8 @@ def test_cells_differ_in_the_order_of_their_cameras() -> None:
 
 
 def test_a_camera_must_be_near_enough_to_see_the_support() -> None:
-    assert Camera.overhead(9.9, fov_y_deg=10.0).sees_support(TRAY)
-    assert not Camera.overhead(10.1, fov_y_deg=10.0).sees_support(TRAY)
+    assert Camera.overhead(9.9, fov_y_deg=10.0).is_support_visible(TRAY)
+    assert not Camera.overhead(10.1, fov_y_deg=10.0).is_support_visible(TRAY)
 
 
 def test_depth_beyond_the_range_of_16_bits_is_zero(tmp_path: Path) -> None:

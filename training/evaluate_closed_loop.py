@@ -171,10 +171,12 @@ class EpisodeRunner:
         policy = self._make_policy(scenario.agent)
         backend: ClosedLoop | ImageBackend
         if motion == "arm":
-            backend = ClosedLoop(scene, perceive=perceive, seed=scenario.seed, world=scenario.world)
+            backend = ClosedLoop(
+                scene, perceive=perceive, seed=scenario.seed, config=scenario.world
+            )
         else:
             assert perceive is not None, "no row has perfect perception and teleported moves"
-            backend = ImageBackend(scene, perceive, seed=scenario.seed, world=scenario.world)
+            backend = ImageBackend(scene, perceive, seed=scenario.seed, config=scenario.world)
         task = run_episode(backend, policy, max_moves=scenario.max_moves)
         robot_time = backend.timing.simulated if isinstance(backend, ClosedLoop) else 0.0
         return task, backend.belief.objects, robot_time

@@ -26,7 +26,7 @@ _TEXTURE_SIDE = 512
 _OVERSAMPLING = 3
 _MAX_PIXELS_PER_MM = 6.0
 _PALETTE_SIZE = 96
-_TITLE_LENGTH = 24
+_MAX_TITLE_LENGTH = 24
 _METAL_COLOR, _DARK_METAL_COLOR, _LIGHT_METAL_COLOR = "#b4b8bd", "#8d9298", "#d6d9dc"
 _INK_COLOR = "#1c1c1c"
 
@@ -361,9 +361,9 @@ def _check_label(object_class: ObjectClass) -> tuple[LabelDesign, str]:
             )
     if label.motif not in MOTIFS:
         raise InputError(f"{where}.motif: {label.motif!r}; expected {', '.join(MOTIFS)}")
-    if len(label.title) > _TITLE_LENGTH:
+    if len(label.title) > _MAX_TITLE_LENGTH:
         raise InputError(
-            f"{where}.title: {label.title!r}; expected at most {_TITLE_LENGTH} characters"
+            f"{where}.title: {label.title!r}; expected at most {_MAX_TITLE_LENGTH} characters"
         )
     return label, label.title.strip() or object_class.name.replace("_", " ")
 

@@ -177,7 +177,7 @@ class Camera(StrictModel):
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         return (low + high) / 2, float((high - low).max())
 
-    def sees_support(self, support: Support) -> bool:
+    def is_support_visible(self, support: Support) -> bool:
         """Return whether a part of the support's floor is in the image and within range."""
         x, y = (np.linspace(-half, half, 41) for half in support.half_size)
         p_T = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)

@@ -79,7 +79,7 @@ class WorkCell(StrictModel):
                 f"{taken[0]}: a camera's name; expected names that differ from {reserved}"
             )
         name, camera = next(iter(cameras.items()))
-        if "support" in info.data and not camera.sees_support(info.data["support"]):
+        if "support" in info.data and not camera.is_support_visible(info.data["support"]):
             allowed = "a pose from which its floor is in the image"
             raise rejected_error(f"{name}: does not see the support; expected {allowed}")
         return cameras

@@ -169,7 +169,7 @@ def plan_moves(
         _check_move(moves, index, [d.name for d in perception.observation.detections], scene)
         command = resolve_placement(move, perception.observation, config.exploration, rng)
         plan = (
-            PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, move.place)
+            PlanningFailure(PlanningFailureReason.NO_FREE_PLACEMENT, move.place)
             if command is None
             else executor.plan(scene, command)
         )

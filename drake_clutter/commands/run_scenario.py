@@ -85,7 +85,7 @@ def run_closed_loop(
         scene,
         perceive=perceive,
         seed=scenario.seed,
-        world=scenario.world,
+        config=scenario.world,
         record_motion=True,
     )
     task = run_episode(

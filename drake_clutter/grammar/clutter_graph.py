@@ -41,15 +41,15 @@ class ClutterGraph:
     terminal.
 
     Attributes:
-        nx: The networkx graph, with attributes `kind` of nodes and edges.
+        digraph: The networkx graph, with attributes `kind` of nodes and edges.
     """
 
     TRAY_NODE = 0
 
     def __init__(self) -> None:
         """Create the start graph S: one tray."""
-        self.nx = nx.DiGraph()
-        self.nx.add_node(self.TRAY_NODE, kind=TRAY)
+        self.digraph = nx.DiGraph()
+        self.digraph.add_node(self.TRAY_NODE, kind=TRAY)
 
     @classmethod
     def from_parts(
@@ -69,13 +69,13 @@ class ClutterGraph:
             raise ValueError("nodes: expected exactly one tray, as node 0")
         graph = cls()
         for node, kind in nodes.items():
-            graph.nx.add_node(node, kind=kind)
+            graph.digraph.add_node(node, kind=kind)
         for (parent, child), edge_kind in edges.items():
             if parent not in nodes or child not in nodes:
                 raise ValueError(f"edges: {parent} -> {child} refers to a node that does not exist")
-            graph.nx.add_edge(parent, child, kind=edge_kind)
+            graph.digraph.add_edge(parent, child, kind=edge_kind)
         if len(graph.breadth_first_order()) != len(nodes) or not nx.is_directed_acyclic_graph(
-            graph.nx
+            graph.digraph
         ):
             raise ValueError(
                 "edges: expected an acyclic graph in which every node is reachable from the tray"
@@ -86,35 +86,35 @@ class ClutterGraph:
 
     def __len__(self) -> int:
         """Return the number of nodes of all kinds."""
-        return len(self.nx)
+        return len(self.digraph)
 
     def copy(self) -> "ClutterGraph":
         """Return an independent copy with the same order of nodes and edges."""
         copied = ClutterGraph.__new__(ClutterGraph)
-        copied.nx = self.nx.copy()
+        copied.digraph = self.digraph.copy()
         return copied
 
     def kind(self, node: int) -> str:
         """Return the kind of a node."""
-        return str(self.nx.nodes[node]["kind"])
+        return str(self.digraph.nodes[node]["kind"])
 
     def kinds(self) -> list[str]:
         """Return the kinds of all nodes, in order of creation."""
-        return [node["kind"] for node in self.nx._node.values()]
+        return [node["kind"] for node in self.digraph._node.values()]
 
     def edge_kind(self, parent: int, child: int) -> EdgeKind:
         """Return the kind of an edge."""
-        kind: EdgeKind = self.nx.edges[parent, child]["kind"]
+        kind: EdgeKind = self.digraph.edges[parent, child]["kind"]
         return kind
 
     def children(self, node: int) -> list[int]:
         """Return the nodes that a node carries, in order."""
-        return list(self.nx.successors(node))
+        return list(self.digraph.successors(node))
 
     def breadth_first_order(self) -> list[int]:
         """Return all nodes reachable from the tray, breadth first, siblings in order."""
         # networkx's own traversal takes several times as long, and this runs for every rule.
-        edges = self.nx._adj
+        edges = self.digraph._adj
         order = [self.TRAY_NODE]
         reached = {self.TRAY_NODE}
         for node in order:
@@ -136,7 +136,7 @@ class ClutterGraph:
         """Return the object nodes of every stack, in the order of the stacks."""
         stacks = []
         for bottom in self.stack_bases():
-            members = set(bottom).union(*(nx.descendants(self.nx, node) for node in bottom))
+            members = set(bottom).union(*(nx.descendants(self.digraph, node) for node in bottom))
             stacks.append(
                 [node for node in sorted(members) if self.kind(node) not in STRUCTURE_KINDS]
             )
@@ -150,17 +150,19 @@ class ClutterGraph:
     def objects(self) -> Iterator[tuple[int, str]]:
         """Return (node, class name) of every object node, in order of creation."""
         return (
-            (node, kind) for node, kind in self.nx.nodes(data="kind") if kind not in STRUCTURE_KINDS
+            (node, kind)
+            for node, kind in self.digraph.nodes(data="kind")
+            if kind not in STRUCTURE_KINDS
         )
 
     @property
     def is_terminal(self) -> bool:
         """Whether all attributes are terminal, so that the graph can become a scene."""
         return not any(
-            kind in NON_TERMINAL_KINDS for _, kind in self.nx.nodes(data="kind")
+            kind in NON_TERMINAL_KINDS for _, kind in self.digraph.nodes(data="kind")
         ) and not any(
             kind == PRIMITIVE and self.kind(child) != END
-            for _, child, kind in self.nx.edges(data="kind")
+            for _, child, kind in self.digraph.edges(data="kind")
         )
 
 
@@ -175,7 +177,7 @@ def canonical_form(graph: ClutterGraph, classes: Mapping[str, ObjectClass]) -> s
         classes: Object classes by name.
     """
     digests: dict[int, str] = {}
-    for node in reversed(list(nx.topological_sort(graph.nx))):
+    for node in reversed(list(nx.topological_sort(graph.digraph))):
         children = []
         for child in graph.children(node):
             edge = graph.edge_kind(node, child)

@@ -38,12 +38,12 @@ class Pattern:
         nodes: Kinds that match, by the node's name in the rule.
         edges: (parent, child), all primitive. The parent of each edge is the root or an earlier
             child.
-        rewritten: The node that the rules replace or orient, or on which they put something.
+        target: The node that the rules replace or orient, or on which they put something.
     """
 
     nodes: Mapping[str, frozenset[str]]
     edges: tuple[tuple[str, str], ...]
-    rewritten: str
+    target: str
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,11 @@ def make_production_rules(classes: Sequence[ObjectClass]) -> tuple[ProductionRul
     """
     names = frozenset(object_class.name for object_class in classes)
     terminal_parents = names | {TRAY, DUMMY}
-    tray = Pattern({"tray": frozenset({TRAY})}, (), rewritten="tray")
+    tray = Pattern({"tray": frozenset({TRAY})}, (), target="tray")
     slot_below_open = Pattern(
         {"slot": frozenset({OBJECT_SLOT}), "top": frozenset({OPEN_SLOT})},
         (("slot", "top"),),
-        rewritten="top",
+        target="top",
     )
     slot = Pattern(
         {
@@ -97,10 +97,10 @@ def make_production_rules(classes: Sequence[ObjectClass]) -> tuple[ProductionRul
             "child": frozenset({OBJECT_SLOT, END}),
         },
         (("parent", "slot"), ("slot", "child")),
-        rewritten="slot",
+        target="slot",
     )
     unoriented = Pattern(
-        {"parent": terminal_parents, "child": names}, (("parent", "child"),), rewritten="child"
+        {"parent": terminal_parents, "child": names}, (("parent", "child"),), target="child"
     )
 
     rules = [

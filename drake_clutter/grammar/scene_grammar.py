@@ -137,16 +137,16 @@ class SceneGrammar:
         nodes = dict(match)
         for parent, child in rule.left.edges:
             if (parent, child) not in rule.right_edges:
-                graph.nx.remove_edge(nodes[parent], nodes[child])
-        next_node = max(graph.nx) + 1
+                graph.digraph.remove_edge(nodes[parent], nodes[child])
+        next_node = max(graph.digraph) + 1
         for name, kind in rule.right_nodes.items():
             if name not in nodes:
                 nodes[name] = next_node
                 next_node += 1
             if kind != KEEP:
-                graph.nx.add_node(nodes[name], kind=kind)
+                graph.digraph.add_node(nodes[name], kind=kind)
         for (parent, child), edge_kind in rule.right_edges.items():
-            graph.nx.add_edge(nodes[parent], nodes[child], kind=edge_kind)
+            graph.digraph.add_edge(nodes[parent], nodes[child], kind=edge_kind)
 
     def replay(self, rules: Sequence[str]) -> ClutterGraph:
         """Return the graph that a sequence of rules derives from the start graph.
@@ -202,8 +202,8 @@ def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Ma
         roots: Candidates for the root, in order.
     """
     # networkx's views would take longer than the matching itself.
-    nodes = graph.nx._node
-    edges = graph.nx._adj
+    nodes = graph.digraph._node
+    edges = graph.digraph._adj
     root_name, root_kinds = next(iter(left.nodes.items()))
 
     def extend(match: Match, pattern_edges: tuple[tuple[str, str], ...]) -> Match | None:

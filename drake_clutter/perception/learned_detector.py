@@ -99,7 +99,7 @@ class _CellPredictions(NamedTuple):
 def _may_be_two_objects(evidence: PoseEvidence) -> bool:
     """Return whether two smaller objects side by side may explain the pixels of a pose better."""
     num_consistent = int(np.count_nonzero(evidence.consistent))
-    return evidence.free_space_violations > SPLIT_FREE_SPACE_RATIO * num_consistent
+    return evidence.num_free_space_violations > SPLIT_FREE_SPACE_RATIO * num_consistent
 
 
 def _is_confident(
@@ -317,7 +317,7 @@ class LearnedDetector:
 
     def _fit(self, segments: Sequence[Segment], depth: NDArray[np.float32]) -> list[_Candidate]:
         """Fit the poses of segments, and return those with a sufficient score."""
-        classes = [self._classes[segment.name] for segment in segments]
+        classes = [self._classes[segment.class_name] for segment in segments]
         poses = self._executor.map(
             lambda s, c: self._fitter.fit(c, s.mask, depth, s.p_TO), segments, classes
         )

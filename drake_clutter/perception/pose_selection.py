@@ -50,16 +50,16 @@ class PoseEvidence:
         left: First column of the window.
         consistent: Whether the measured depth agrees with the pose. Shape (rows, columns).
         rendered_depth: Depth of the object [m]; 0 where it is not. Shape (rows, columns).
-        free_space_violations: Number of pixels at which the camera sees through the object.
-        unoccluded_pixels: Number of pixels that the object covers if nothing occludes it.
+        num_free_space_violations: Number of pixels at which the camera sees through the object.
+        num_unoccluded_pixels: Number of pixels that the object covers if nothing occludes it.
     """
 
     top: int
     left: int
     consistent: NDArray[np.bool_]
     rendered_depth: NDArray[np.float32]
-    free_space_violations: int
-    unoccluded_pixels: int
+    num_free_space_violations: int
+    num_unoccluded_pixels: int
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -210,7 +210,7 @@ def _select_greedily(
         best = first if first in bounds else max(bounds, key=lambda k: (bounds[k], -k))
         e = evidence[best]
         num_unclaimed = int(np.count_nonzero(e.consistent & ~claimed[e.window]))
-        gain = num_unclaimed - e.free_space_violations
+        gain = num_unclaimed - e.num_free_space_violations
         min_gain = MIN_UNCLAIMED_FRACTION * np.count_nonzero(e.consistent)
         if gain < max(MIN_UNCLAIMED_PIXELS, min_gain):
             del bounds[best]
@@ -229,7 +229,7 @@ def _select_greedily(
 
 def _is_plausible(e: PoseEvidence, min_visible_fraction: float) -> bool:
     num_consistent = int(np.count_nonzero(e.consistent))
-    num_conclusive = num_consistent + e.free_space_violations
-    enough = max(1.0, min_visible_fraction * e.unoccluded_pixels)
+    num_conclusive = num_consistent + e.num_free_space_violations
+    enough = max(1.0, min_visible_fraction * e.num_unoccluded_pixels)
     is_visible = num_consistent >= enough
-    return is_visible and e.free_space_violations <= MAX_FREE_SPACE_FRACTION * num_conclusive
+    return is_visible and e.num_free_space_violations <= MAX_FREE_SPACE_FRACTION * num_conclusive

@@ -403,12 +403,12 @@ class Segment:
     """Pixels of one object.
 
     Attributes:
-        name: Name of its class.
+        class_name: Name of its class.
         mask: Pixels of the object. Shape (H, W).
         p_TO: Estimated position of the object's center [m]. Shape (3,).
     """
 
-    name: str
+    class_name: str
     mask: NDArray[np.bool_]
     p_TO: NDArray[np.float64]
 
@@ -417,7 +417,7 @@ def extract_segments(
     class_map: NDArray[np.int64],
     votes_T: NDArray[np.float32],
     radii: Sequence[float],
-    names: Sequence[str],
+    class_names: Sequence[str],
     window: ImageWindow,
     image_shape: tuple[int, int],
     min_votes: int,
@@ -429,14 +429,14 @@ def extract_segments(
         votes_T: Predicted position of the object's center [m]; NaN where no depth was measured.
             Shape (h, w, 3).
         radii: Radius of each class's clusters of votes [m].
-        names: Name of each class.
+        class_names: Name of each class.
         window: Part of the image that the cells cover.
         image_shape: Height and width of the image.
         min_votes: Smallest number of votes of an object.
     """
     segments = []
     is_measured = np.isfinite(votes_T).all(axis=2)
-    for k, (name, radius) in enumerate(zip(names, radii, strict=True), start=1):
+    for k, (name, radius) in enumerate(zip(class_names, radii, strict=True), start=1):
         rows, columns = np.nonzero((class_map == k) & is_measured)
         if len(rows) < min_votes:
             continue

@@ -26,7 +26,7 @@ DESCENT_SPEED = 0.02
 class PlanningFailureReason(Enum):
     """Reasons why the planner returns no plan."""
 
-    NO_FREE_SPOT = "no free spot"
+    NO_FREE_PLACEMENT = "no free spot"
     NO_SEAL = "no seal"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"

@@ -133,5 +133,5 @@ def _box_intersection(center: np.ndarray, direction: np.ndarray, offset: np.ndar
 
 
 if __name__ == "__main__":
-    empty = ClosedLoop(Scene((), default_cell().support), seed=0, world=ClutterConfig())
+    empty = ClosedLoop(Scene((), default_cell().support), seed=0, config=ClutterConfig())
     draw_diagram(empty.simulation.diagram, Path(sys.argv[1]))

@@ -17,7 +17,7 @@ MAX_PENETRATION = 0.001
 Settled objects overlap by about 0.01 mm.
 """
 
-_PARALLEL = 1e-9
+_MIN_CROSS_LENGTH = 1e-9
 """Cross products of unit edges shorter than this give no separating axis."""
 
 
@@ -79,7 +79,7 @@ def _piece_penetration(
     edges_b = b.edges @ R_b.T
     crosses = np.cross(edges_a[:, None], edges_b[None]).reshape(-1, 3)
     lengths = np.linalg.norm(crosses, axis=1)
-    crosses = crosses[lengths > _PARALLEL] / lengths[lengths > _PARALLEL, None]
+    crosses = crosses[lengths > _MIN_CROSS_LENGTH] / lengths[lengths > _MIN_CROSS_LENGTH, None]
     axes = np.vstack([a.normals @ R_a.T, b.normals @ R_b.T, crosses])
     extent_a = first.X_TO.apply(a.corners) @ axes.T
     extent_b = second.X_TO.apply(b.corners) @ axes.T
@@ -152,22 +152,22 @@ def transport_pose(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
 
 
 def objects_resting_on(
-    picked: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004
+    carrier: SceneObject, objects: Sequence[SceneObject], margin: float = 0.004
 ) -> tuple[str, ...]:
     """Return the names of the objects that stand or lean on an object.
 
     Their bounding boxes begin where the object's ends, and overlap it seen from above.
 
     Args:
-        picked: The object that may carry others.
+        carrier: The object that may carry others.
         objects: Objects of the scene.
         margin: Tolerance of the height, and smallest overlap that counts [m].
     """
     names = []
     for other in objects:
-        if other is picked:
+        if other is carrier:
             continue
-        (lower, upper), (other_lower, other_upper) = picked.bounds_T, other.bounds_T
+        (lower, upper), (other_lower, other_upper) = carrier.bounds_T, other.bounds_T
         overlap = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
         if overlap.min() > margin and abs(other_lower[2] - upper[2]) < margin:
             names.append(other.name)

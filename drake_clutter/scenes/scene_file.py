@@ -331,10 +331,10 @@ def scene_to_dict(scene: Scene, cell: WorkCell, verdict: Verdict | None = None) 
             entry["node"] = o.node
         document["objects"].append(entry)
     if scene.graph is not None:
-        edges = scene.graph.nx.edges(data="kind")
+        edges = scene.graph.digraph.edges(data="kind")
         document["graph"] = {
             "nodes": [
-                {"id": node, "kind": kind} for node, kind in scene.graph.nx.nodes(data="kind")
+                {"id": node, "kind": kind} for node, kind in scene.graph.digraph.nodes(data="kind")
             ],
             "edges": [
                 {

@@ -85,7 +85,7 @@ class ClosedLoop:
         *,
         perceive: PerceptionFn | None = None,
         seed: int,
-        world: ClutterConfig,
+        config: ClutterConfig,
         record_motion: bool = False,
     ) -> None:
         """Build the diagram around a scene at rest.
@@ -94,19 +94,19 @@ class ClosedLoop:
             scene: Objects at rest.
             perceive: Detector; None: ground truth.
             seed: Seed of all random numbers.
-            world: Config of the cell, the simulation and the task.
+            config: Config of the cell, the simulation and the task.
             record_motion: Whether outcomes include the motion of the arm and the objects.
         """
         self.scene = scene
         self._record_motion = record_motion
         self._perceive = perceive
-        world = replace(world, cell=world.cell.with_support(scene.support))
-        self._world = world if perceive is None else with_min_release_height(world)
-        self._detector = LabelDetector(world.cell.camera)
+        config = replace(config, cell=config.cell.with_support(scene.support))
+        self._config = config if perceive is None else with_min_release_height(config)
+        self._detector = LabelDetector(config.cell.camera)
         self.perception = self._detector.perceive(scene)
         planner_config = PlannerConfig() if perceive is None else GUARDED_PLANNER_CONFIG
-        self._planner = PickPlacePlanner(world.cell, planner_config)
-        empty_depth = render_empty_depth(world.cell)
+        self._planner = PickPlacePlanner(config.cell, planner_config)
+        empty_depth = render_empty_depth(config.cell)
         self.policy_system = PolicySystem(
             config=self.config,
             seed=seed,
@@ -119,7 +119,7 @@ class ClosedLoop:
             latency=OBSERVATION_TO_PLAN_LATENCY,
         )
         self.simulation = StationSimulation(
-            world.cell, scene, visuals=True, add_systems=self._add_systems
+            config.cell, scene, visuals=True, add_systems=self._add_systems
         )
         self.simulation.diagram.set_name("closed_loop")
         self._planning_time = 0.0
@@ -133,7 +133,7 @@ class ClosedLoop:
         self, builder: DiagramBuilder, station: ClutterStation, executor: PickPlaceExecutor
     ) -> None:
         camera = add_overhead_camera(builder, station)
-        perceive = self._perceive or LabelPerception(self.scene, station, self._world)
+        perceive = self._perceive or LabelPerception(self.scene, station, self._config)
         perception = PerceptionSystem.AddToBuilder(
             builder, perceive=perceive, camera=station.cell.camera
         )
@@ -154,7 +154,7 @@ class ClosedLoop:
     @property
     def config(self) -> ExplorationConfig:
         """Config of the task."""
-        return self._world.exploration
+        return self._config.exploration
 
     @property
     def _state(self) -> PolicyState:
@@ -214,7 +214,7 @@ class ClosedLoop:
             known = state.request.objects
             decision = to_ground_truth_names(decision, known, observation, before.objects)
         if isinstance(plan, PlanningFailure):
-            is_full = plan.reason is PlanningFailureReason.NO_FREE_SPOT
+            is_full = plan.reason is PlanningFailureReason.NO_FREE_PLACEMENT
             result = MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if is_full else str(plan))
             return MoveAttempt(decision, outcome, self.perception)
@@ -241,7 +241,7 @@ class ClosedLoop:
         X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered_distance))
         came_off = not grasp.has_held or grasp.lost_object
-        outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._world.settle)
+        outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._config.settle)
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
         result = "came off the cup" if came_off else "placed"
         detail = f"{result} with a horizontal error of {1000 * error:.1f} mm"

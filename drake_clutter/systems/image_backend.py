@@ -39,7 +39,7 @@ class ImageBackend(SteppedBackend):
         perceive: PerceptionFn,
         *,
         seed: int,
-        world: ClutterConfig,
+        config: ClutterConfig,
     ) -> None:
         """Start an episode on a scene at rest, and observe the scene.
 
@@ -47,21 +47,21 @@ class ImageBackend(SteppedBackend):
             scene: Objects at rest.
             perceive: Detector.
             seed: Seed of all random numbers.
-            world: Config of the cell, the simulation and the task.
+            config: Config of the cell, the simulation and the task.
         """
-        world = with_min_release_height(world)
+        config = with_min_release_height(config)
         self._perceive = perceive
         self._seed = seed
-        self._camera = CameraRenderer(world.cell.camera)
+        self._camera = CameraRenderer(config.cell.camera)
         empty_depth = self._camera.render(replace(scene, objects=())).depth
         super().__init__(
-            SettleExecutor(world, simulate_collapse=False),
-            LabelDetector(world.cell.camera),
-            world.exploration,
+            SettleExecutor(config, simulate_collapse=False),
+            LabelDetector(config.cell.camera),
+            config.exploration,
             scene,
             item_rng(seed),
             tracker=associate_detections,
-            action_filter=InfeasibleMoveFilter(_unloaded_objects, empty_depth, world.exploration),
+            action_filter=InfeasibleMoveFilter(_unloaded_objects, empty_depth, config.exploration),
         )
 
     @property
@@ -70,8 +70,8 @@ class ImageBackend(SteppedBackend):
         return item_rng(self._seed, len(self.belief.history) + 1)
 
     @property
-    def world_rng(self) -> np.random.Generator:
-        """Random generator of the next outcome; see `SteppedBackend.world_rng`."""
+    def outcome_rng(self) -> np.random.Generator:
+        """Random generator of the next outcome; see `SteppedBackend.outcome_rng`."""
         return item_rng(self._seed, len(self.belief.history) + 1, 1)
 
     def observe(self) -> Observation:

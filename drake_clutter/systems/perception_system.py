@@ -46,10 +46,10 @@ far pushes stacks over.
 """
 
 
-def with_min_release_height(world: ClutterConfig) -> ClutterConfig:
+def with_min_release_height(config: ClutterConfig) -> ClutterConfig:
     """Return a config whose release height is sufficient for poses from images."""
-    release_height = max(world.exploration.release_height, MIN_RELEASE_HEIGHT)
-    return replace(world, exploration=replace(world.exploration, release_height=release_height))
+    release_height = max(config.exploration.release_height, MIN_RELEASE_HEIGHT)
+    return replace(config, exploration=replace(config.exploration, release_height=release_height))
 
 
 class PerceptionSystem(LeafSystem):
@@ -147,16 +147,16 @@ class LabelPerception:
     object are removed from its mask.
     """
 
-    def __init__(self, scene: Scene, station: ClutterStation, world: ClutterConfig) -> None:
+    def __init__(self, scene: Scene, station: ClutterStation, config: ClutterConfig) -> None:
         """Make a detector.
 
         Args:
             scene: Scene whose objects are detected.
             station: Station that simulates the scene.
-            world: Config with the cell.
+            config: Config with the cell.
         """
         self._scene = scene
-        self._detector = LabelDetector(world.cell.camera)
+        self._detector = LabelDetector(config.cell.camera)
         self._body_indices = {
             o.name: int(station.scene_plant.bodies[o.name].index()) for o in scene.objects
         }

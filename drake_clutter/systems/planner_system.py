@@ -92,7 +92,7 @@ class PlannerSystem(LeafSystem):
         assert request.move is not None
         assert request.observation is not None
         if request.command is None:
-            return PlanningFailure(PlanningFailureReason.NO_FREE_SPOT, request.move.place)
+            return PlanningFailure(PlanningFailureReason.NO_FREE_PLACEMENT, request.move.place)
         occluded = occluded_boxes(request.objects, request.observation, self._empty_depth)
         X_TO_place = request.command.X_TO_place
         return self._planner.plan(request.objects, request.move.pick, X_TO_place, occluded)

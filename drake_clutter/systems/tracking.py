@@ -111,8 +111,8 @@ def _restore_missed_objects(known: Sequence[SceneObject], observation: Observati
             continue
         e = evaluate_pose(o.object_class, o.X_TO, observation.depth, observation.camera)
         num_consistent = np.count_nonzero(e.consistent)
-        num_conclusive = num_consistent + e.free_space_violations
-        min_consistent = max(1, observation.camera.visibility_threshold * e.unoccluded_pixels)
+        num_conclusive = num_consistent + e.num_free_space_violations
+        min_consistent = max(1, observation.camera.visibility_threshold * e.num_unoccluded_pixels)
         if num_consistent >= min_consistent and num_consistent >= SUPPORT_FRACTION * num_conclusive:
             missed[o.name] = Detection(o.name, o.object_class, o.X_TO, e.mask(shape))
     explained = np.any([np.zeros(shape, bool), *(d.mask for d in missed.values())], axis=0)
@@ -221,12 +221,12 @@ def _is_gone(known: SceneObject, observation: Observation) -> bool:
     """
     e = evaluate_pose(known.object_class, known.X_TO, observation.depth, observation.camera)
     num_consistent = np.count_nonzero(e.consistent)
-    num_conclusive = e.free_space_violations + num_consistent
-    if e.free_space_violations > MAX_SEE_THROUGH_FRACTION * num_conclusive:
+    num_conclusive = e.num_free_space_violations + num_consistent
+    if e.num_free_space_violations > MAX_SEE_THROUGH_FRACTION * num_conclusive:
         return True
     detected = np.zeros(observation.depth.shape, bool)
     for detection in observation.detections:
         detected |= detection.mask
     num_reassigned = np.count_nonzero(e.consistent & detected[e.window])
-    is_visible = num_consistent >= observation.camera.visibility_threshold * e.unoccluded_pixels
+    is_visible = num_consistent >= observation.camera.visibility_threshold * e.num_unoccluded_pixels
     return bool(num_reassigned > REASSIGNED_FRACTION * num_consistent and is_visible)

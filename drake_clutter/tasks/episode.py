@@ -153,7 +153,7 @@ class SteppedBackend:
         return self._rng
 
     @property
-    def world_rng(self) -> np.random.Generator:
+    def outcome_rng(self) -> np.random.Generator:
         """Random generator of the placement and the outcome of the next move."""
         return self._rng
 
@@ -193,7 +193,7 @@ class SteppedBackend:
             KeyError: The move names an object that is not in view.
             ValueError: The move places an object on itself.
         """
-        rng = self.world_rng
+        rng = self.outcome_rng
         command = resolve_placement(move, self.observation, self.config, rng)
         if command is None:
             outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene)

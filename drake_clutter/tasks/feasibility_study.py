@@ -89,7 +89,7 @@ class MoveRecord:
     place_x: float = math.nan
     place_y: float = math.nan
     place_z: float = math.nan
-    result: str = PlanningFailureReason.NO_FREE_SPOT.value
+    result: str = PlanningFailureReason.NO_FREE_PLACEMENT.value
     detail: str = ""
     failure_value: float = math.nan
     planning_s: float = 0.0

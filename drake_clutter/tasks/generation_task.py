@@ -170,7 +170,7 @@ class PartialScene:
         assert match is not None, f"rule {rule.name} is not feasible"
         self._grammar.rewrite_in_place(self.graph, rule, match)
         self.rules.append(rule.name)
-        changed_node = match[rule.left.rewritten]
+        changed_node = match[rule.left.target]
         if changed_node != ClutterGraph.TRAY_NODE:
             bottom = self._finished_stack_bottom(changed_node)
             if bottom:
@@ -186,8 +186,8 @@ class PartialScene:
             The nodes that rest on the tray; empty if the stack is not finished.
         """
         # The adjacency dictionaries of networkx; its views are too slow for the inner loop.
-        successors = self.graph.nx._adj
-        predecessors = self.graph.nx._pred
+        successors = self.graph.digraph._adj
+        predecessors = self.graph.digraph._pred
         while True:
             parent = next(iter(predecessors[node]))
             if parent == ClutterGraph.TRAY_NODE:
@@ -269,11 +269,11 @@ class PartialScene:
         ):
             # The first pattern always rewrites the tray, which needs no flag.
             if match is not None and column > 0:
-                node_flags[match[pattern.rewritten], column] = 1
+                node_flags[match[pattern.target], column] = 1
         edge_links = np.zeros((num_edges, 2), np.int16)
         edge_kind = np.zeros(num_edges, np.int8)
         e = 0
-        for parent, children in self.graph.nx._adj.items():
+        for parent, children in self.graph.digraph._adj.items():
             for child, edge in children.items():
                 edge_links[e] = parent, child
                 edge_kind[e] = self._edge_kind_ids[edge["kind"]]
